@@ -1,16 +1,17 @@
-//! The compressed model: Gaussians that stay, proxies that replace merged clusters, and parameter deltas.
+//! The compressed model: survivors (Gaussians that are not removed), proxies (Gaussians that each replace a merged
+//! cluster), and parameter deltas (what refinement adds to stored values).
 
 use serde::{Deserialize, Serialize};
 
 use crate::model::{AttributeValues, Attributes, Gaussians, NO_SH_LIMIT, StoredParams};
 use crate::recipe::{MergeParams, Precision};
 
-/// Frame at which Gaussians are compared, and the extent of the scene at this frame.
+/// Reference frame, at which Gaussians are compared for merging, and the extent of the scene at this frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Reference {
-    /// Frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
+    /// Index of the frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
     pub frame: usize,
-    /// Robust extent of the positions at this frame, scene units.
+    /// Longest side of the box between the 1st and the 99th percentile of the positions at this frame, scene units.
     pub extent: f64,
 }
 
@@ -19,47 +20,48 @@ pub struct Reference {
 pub struct Cluster {
     /// Index of the proxy in the output.
     pub output: u32,
-    /// Id of the cluster's leader.
+    /// Id of the leader, the member to which the others were joined.
     pub leader: u32,
-    /// Ids of all members in increasing order, including the leader, with weights that sum to 1.
+    /// Ids of all members in increasing order, including the leader, each with its weight in the proxy. Weights sum to
+    /// 1.
     pub members: Vec<(u32, f64)>,
 }
 
-/// Parameters of the proxies and the result of solving for them, known before anything is written.
+/// Proxies (Gaussians that each replace a merged cluster), computed before anything is written.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Proxies {
-    /// Raw parameters, one row per cluster, for model formats that store proxies as rows. `None` where a proxy is
-    /// computed from its members frame by frame.
+    /// Stored parameters of the proxies, one row per cluster, for model formats that store a proxy like any other
+    /// Gaussian. `None` if each proxy is computed from its members frame by frame.
     pub raw: Option<StoredParams>,
-    /// Increasing indices of clusters that no proxy represents well enough. Their leaders stay unmerged.
+    /// Indices of the clusters that no proxy represents well enough, increasing. Their leaders stay unmerged.
     pub refused: Vec<usize>,
-    /// Largest distance between a proxy and its position among its members over sampled frames, scene units. `None`
-    /// where a proxy cannot deviate.
+    /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units.
+    /// `None` if a proxy follows its members exactly.
     pub deviation: Option<f64>,
-    /// Notes for the user.
+    /// Notes for the user about the proxies.
     pub notes: Vec<String>,
 }
 
-/// Parameter delta, constant in time: values added to the stored parameters of the output's Gaussians.
+/// Parameter delta, constant in time: values that refinement adds to the stored parameters of the output's Gaussians.
 ///
-/// An attribute that changes has one row per Gaussian of the output; an attribute that does not change is empty. SH
-/// coefficients may be of a lower degree than the output's; coefficients above that degree do not change.
+/// Each changed attribute has one row per Gaussian of the output; an unchanged attribute is empty. SH coefficients may
+/// be of a lower degree than the output's; coefficients above that degree do not change.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ParamDelta(pub Gaussians);
 
 impl ParamDelta {
-    /// Returns the attributes that change.
+    /// Returns the attributes for which this delta has values.
     pub fn columns(&self) -> Attributes {
         let changes = |&column: &Attributes| !self.0.column(column).is_empty();
         Attributes::all().iter().filter(changes).collect()
     }
 
-    /// Returns whether no attribute changes.
+    /// Returns whether this delta has no values for any attribute.
     pub fn is_empty(&self) -> bool {
         self.columns().is_empty()
     }
 
-    /// Returns the delta of the Gaussians at the indices `places`, in that order.
+    /// Returns the delta of the Gaussians at the output indices `places`, in the order of `places`.
     pub fn pick(&self, places: &[u32]) -> ParamDelta {
         let mut picked = ParamDelta::default();
         for column in self.columns().iter() {
@@ -68,13 +70,13 @@ impl ParamDelta {
         picked
     }
 
-    /// Multiplies the delta by `by`.
+    /// Multiplies every value of this delta by `by`.
     pub fn scale(&mut self, by: f32) {
         self.0.columns_mut(Attributes::all()).flat_map(AttributeValues::planes_mut).for_each(|x| *x *= by);
     }
 
-    /// Returns the sum of this delta and `more`. Where both have SH coefficients, the degree of `more` must not be
-    /// lower.
+    /// Returns the sum of this delta and `more`. If both have SH coefficients, the SH degree of `more` must be at least
+    /// that of this delta.
     pub fn and(self, mut more: ParamDelta) -> ParamDelta {
         for column in self.columns().iter() {
             let (from, to) = (self.0.column(column), more.0.column_mut(column));
@@ -94,8 +96,8 @@ impl ParamDelta {
         back.and(self.clone())
     }
 
-    /// Adds the attributes `attributes` of the delta to `state`, row by row. A delta of zero leaves the bits of a value
-    /// unchanged.
+    /// Adds this delta to the values in `state`, for the attributes `attributes` only. Row i of the delta belongs to
+    /// row i of `state`. Adding 0 leaves the bits of a value unchanged.
     pub fn add_to(&self, state: &mut Gaussians, attributes: Attributes) {
         for column in (self.columns() & attributes).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
@@ -108,14 +110,15 @@ impl ParamDelta {
     }
 }
 
-/// Trajectory delta: a delta beside [`ParamDelta`] that varies in time. Keyframes are evenly spaced from the first
-/// frame to the last; the delta is linear between them. All keyframes have the same attributes. No keyframes: no delta.
+/// Trajectory delta: values, varying in time, that refinement adds beside the constant [`ParamDelta`]. Holds one delta
+/// per keyframe; keyframes are evenly spaced from the first frame to the last, with linear interpolation between them.
+/// All keyframes have the same attributes. Without keyframes nothing is added.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
 impl TrajectoryDelta {
-    /// Returns the two of `knots` keyframes (2 or more) that are interpolated at `frame` of `frames`, with their
-    /// weights.
+    /// Returns the indices of the two of `knots` keyframes (2 or more) between which frame `frame` of `frames` lies,
+    /// each with its weight in the linear interpolation.
     pub fn weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
         let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
         let first = (along as usize).min(knots - 2);
@@ -123,17 +126,17 @@ impl TrajectoryDelta {
         [(first, 1.0 - part), (first + 1, part)]
     }
 
-    /// Returns whether there are no keyframes.
+    /// Returns whether there are no keyframes, so that nothing is added.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Returns the attributes that change.
+    /// Returns the attributes for which the keyframes have values.
     pub fn columns(&self) -> Attributes {
         self.0.first().map_or(Attributes::empty(), ParamDelta::columns)
     }
 
-    /// Returns the interpolated delta at `frame` of `frames`.
+    /// Returns the delta interpolated at frame `frame` of `frames`.
     pub fn at(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
             return ParamDelta::default();
@@ -145,12 +148,13 @@ impl TrajectoryDelta {
         change.and(more)
     }
 
-    /// Returns the trajectory delta of the Gaussians at the indices `places`, in that order.
+    /// Returns the trajectory delta of the Gaussians at the output indices `places`, in the order of `places`.
     pub fn pick(&self, places: &[u32]) -> TrajectoryDelta {
         TrajectoryDelta(self.0.iter().map(|knot| knot.pick(places)).collect())
     }
 
-    /// Returns the sum of this trajectory delta and `more`. If both have keyframes, their numbers must be equal.
+    /// Returns the sum of this trajectory delta and `more`. If both have keyframes, their numbers of keyframes must be
+    /// equal.
     pub fn and(self, more: TrajectoryDelta) -> TrajectoryDelta {
         match (self.is_empty(), more.is_empty()) {
             (_, true) => self,
@@ -160,30 +164,32 @@ impl TrajectoryDelta {
     }
 }
 
-/// Compressed model: the Gaussians of the output in terms of the Gaussians of the input.
+/// Compressed model: describes every Gaussian of the output by the Gaussians of the input that it comes from.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CompressedModel {
-    /// Id of the original, or of the cluster's leader, for every Gaussian of the output; increasing.
+    /// For every Gaussian of the output, in order: id of the input Gaussian, or of the cluster's leader for a proxy.
+    /// Increasing.
     pub kept: Vec<u32>,
-    /// Merged clusters, in increasing order of their index in the output.
+    /// Clusters of input Gaussians that are merged, in increasing order of their proxy's index in the output.
     pub clusters: Vec<Cluster>,
-    /// Merge parameters by which members make up a proxy.
+    /// Merge parameters by which proxies are computed from the members of their clusters.
     pub rule: MergeParams,
-    /// Solved parameters of the proxies.
+    /// Proxies, which replace the merged clusters.
     pub proxies: Proxies,
-    /// Delta of the stored parameters, constant in time.
+    /// What refinement adds to the stored parameters, constant in time.
     pub change: ParamDelta,
-    /// Additional delta that varies in time. Used for formats with explicit frames, and only if there are no proxies.
+    /// What refinement adds beside `change`, varying in time. Used for formats with explicit frames, and only if there
+    /// are no proxies.
     pub course: TrajectoryDelta,
-    /// Precision in which the deformation field is written, if there is one.
+    /// Precision in which the deformation field is written, if the model has one.
     pub field: Precision,
-    /// Highest SH degree of the output. Coefficients above it are dropped.
+    /// Highest SH degree in the output. SH coefficients above it are dropped.
     pub sh_degree: usize,
 }
 
 impl CompressedModel {
-    /// Returns a model of the Gaussians `kept` (increasing), unchanged and unmerged, with the exact field and all SH
-    /// coefficients. `rule` is stored but unused, since nothing is merged.
+    /// Returns a model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with the exact
+    /// deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
     pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
         CompressedModel {
             kept,
@@ -197,12 +203,13 @@ impl CompressedModel {
         }
     }
 
-    /// Returns a copy of this model with the Gaussians `kept` (increasing) instead of its own.
+    /// Returns a copy of this model with `kept` (increasing ids of the input) in place of its own list of kept
+    /// Gaussians.
     pub fn with(&self, kept: Vec<u32>) -> Self {
         CompressedModel { kept, ..self.clone() }
     }
 
-    /// Sets the solved `proxies`. A refused cluster is dissolved: its leader stays unchanged, its other members are
+    /// Sets the computed `proxies`. Dissolves every refused cluster: its leader stays unchanged, its other members are
     /// removed.
     pub fn make(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
@@ -221,12 +228,13 @@ impl CompressedModel {
         self.kept.len()
     }
 
-    /// Returns whether no Gaussian is left.
+    /// Returns whether the output has no Gaussian.
     pub fn is_empty(&self) -> bool {
         self.kept.is_empty()
     }
 
-    /// Returns a model of only the Gaussians at the indices `places` (increasing). The model must have no proxies.
+    /// Returns a model of only the Gaussians at the output indices `places` (increasing). The model must have no
+    /// proxies.
     ///
     /// # Panics
     /// Panics if there is a proxy.
@@ -238,13 +246,14 @@ impl CompressedModel {
         CompressedModel { change, course, field, sh_degree, ..CompressedModel::pruned(kept, &self.rule) }
     }
 
-    /// Returns the total delta at `frame` of `frames`.
+    /// Returns the sum of the constant and the trajectory delta at frame `frame` of `frames`.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.course.at(frame, frames).and(self.change.clone())
     }
 
-    /// Returns for each of the `count` input Gaussians its index in the output, or `None` if it was removed.
+    /// Returns for each of the `count` input Gaussians its index in the output, or `None` if it was removed. All
+    /// members of a cluster have the index of the proxy that replaces it.
     pub fn index_map(&self, count: usize) -> Vec<Option<u32>> {
         let mut map = vec![None; count];
         for (place, &id) in self.kept.iter().enumerate() {

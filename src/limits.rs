@@ -1,30 +1,32 @@
-//! Memory limits of a run.
+//! Limits on the memory of a run.
 
 use std::path::Path;
 
 use crate::error::{Error, Result};
 
-/// Amounts that stages keep in memory at a time. No result depends on them.
+/// Maximum amounts that stages keep in memory at a time. They change memory and time of a run, never its result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Maximum number of frames that a reader of consecutive frames keeps of those it decodes together; at least 1.
+    /// Maximum number of frames that a reader of consecutive frames keeps, of the frames of one tile, which are decoded
+    /// together; at least 1.
     pub frames_held: usize,
-    /// Maximum number of frames whose states are in memory, ready to be rendered; at least 1.
+    /// Maximum number of frames of which the states of all Gaussians are in memory, ready to be rendered; at least 1.
     pub frames_together: usize,
-    /// Maximum number of views rendered at once; at least 1.
+    /// Maximum number of views rendered at the same time; at least 1.
     pub pictures_together: usize,
-    /// Maximum number of Gaussians of a result whose frames are in memory until they are written.
+    /// Maximum number of output Gaussians whose values at all frames are in memory until they are written.
     pub gaussians_together: usize,
-    /// Maximum number of pairs of Gaussians whose motion is compared together; at least 1.
+    /// Maximum number of pairs of Gaussians whose motion is compared at the same time; at least 1.
     pub pairs_together: usize,
-    /// Whether statistics are spilled to a scratch file once they have been scored.
+    /// Whether the statistics of the Gaussians are moved to a scratch file after scoring.
     pub rows_aside: bool,
-    /// Whether all decoded tiles of a container stay in memory.
+    /// Whether all decoded tiles of a container stay in memory. A tile holds some Gaussians and frames of one
+    /// attribute.
     pub tiles_held: bool,
 }
 
 impl Limits {
-    /// Limits that allow the fastest run.
+    /// No limits: everything stays in memory, for the fastest run.
     pub const NONE: Limits = Limits {
         frames_held: usize::MAX,
         frames_together: usize::MAX,
@@ -36,10 +38,10 @@ impl Limits {
     };
 }
 
-/// Memory that opening an input may take, without the program itself.
+/// Limit on the bytes of memory that reading an input may take, without the memory of the program itself.
 ///
-/// Readers check the limit before they allocate for a length given in a file, and during reading if the file gives
-/// none.
+/// Readers check this limit before they allocate memory for a length given in a file. If the file gives no length, they
+/// check it while they read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadLimit {
     bytes: u64,
@@ -55,20 +57,22 @@ impl ReadLimit {
     /// No limit, for tests and for programs that trust their input.
     pub const NONE: ReadLimit = ReadLimit { bytes: u64::MAX };
 
-    /// Creates a limit of `bytes` bytes.
+    /// Creates a limit of `bytes` bytes of memory.
     pub fn new(bytes: u64) -> ReadLimit {
         ReadLimit { bytes }
     }
 
-    /// Returns the number of bytes that reading may take.
+    /// Returns the maximum number of bytes of memory that reading may take.
     pub fn bytes(self) -> u64 {
         self.bytes
     }
 
-    /// Checks that `bytes` fit within the limit. `what` names their purpose, as in "the rows of the header".
+    /// Checks that `bytes` bytes of memory are within this limit. `what` names their purpose, as in "the rows of the
+    /// header".
     ///
     /// # Errors
-    /// More bytes than the limit: an input error at `place` of `path` that says what to do.
+    /// Fails if `bytes` exceeds the limit. The error names the file `path`, the place `place` in it, and the option
+    /// `--memory`.
     pub fn check(self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
         if bytes <= self.bytes {
             return Ok(());

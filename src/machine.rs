@@ -1,30 +1,31 @@
-//! Memory that this process may take, and where that limit comes from: the machine, a control group that contains the
+//! Memory limit of this process, and where the limit comes from: the machine, a control group that contains the
 //! process, a batch job, or limits of the process itself.
 //!
-//! Input: the limits that the system reports, and environment variables. Output: the smallest of them.
+//! Input: the limits that the system reports, and environment variables. Output: the smallest limit.
 
 use splat_platform::{LimitSource, MemoryLimit, MemoryLimits, UNLIMITED_BYTES, memory_limits};
 pub use splat_platform::{peak_memory_bytes, reset_peak_memory};
 
 use crate::error::ShowPath;
 
-/// Returns the number of bytes that this process may take, and a description of where that number comes from. Returns
-/// [`u64::MAX`] if the system reports no limit.
+/// Returns the bytes of memory that this process may take, and a description of where this limit comes from. Returns
+/// [`u64::MAX`] bytes if the system reports no limit.
 pub fn memory_limit() -> (u64, String) {
     least_limit(memory_limits(), |name| std::env::var(name).ok())
 }
 
-/// Returns the smallest of the system's limits and of those that the variables of a batch job state.
+/// Returns the smallest of the memory limits `system` and of the limits in the environment variables of a batch job, in
+/// bytes, with a description of its source. `variable` looks up an environment variable.
 fn least_limit(system: MemoryLimits, variable: impl Fn(&str) -> Option<String>) -> (u64, String) {
     let mut limits: Vec<(u64, String)> = system.around.into_iter().map(described).collect();
     add_job_limits(&variable, &mut limits);
     limits.extend(system.own.into_iter().map(described));
-    // The first of equal limits: the machine's own rather than that of a job that may use all of it.
+    // Of equal limits the first is taken: the machine's own rather than that of a job that may use all of the machine.
     let stated = limits.into_iter().filter(|&(bytes, _)| (1..UNLIMITED_BYTES).contains(&bytes));
     stated.min_by_key(|&(bytes, _)| bytes).unwrap_or((u64::MAX, "this system tells of no limit".to_owned()))
 }
 
-/// Returns the bytes of a limit and a description of its source.
+/// Returns the bytes of a memory limit and a description of its source for display.
 fn described(limit: MemoryLimit) -> (u64, String) {
     let origin = match limit.source {
         LimitSource::Machine => "the machine's memory".to_owned(),
@@ -38,7 +39,8 @@ fn described(limit: MemoryLimit) -> (u64, String) {
     (limit.bytes, origin)
 }
 
-/// Adds the memory that a Slurm job requested on this node. The node may enforce a lower limit, or none.
+/// Adds the memory that a Slurm batch job requested on this node to `limits`. The node may enforce a lower limit, or
+/// none.
 fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, String)>) {
     let size = |name: &str| parse_slurm_size(&variable(name)?);
     if let Some(bytes) = size("SLURM_MEM_PER_NODE") {
@@ -51,8 +53,8 @@ fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(
     }
 }
 
-/// Parses a memory size as Slurm writes it and returns bytes: a number of mebibytes, or a number followed by K, M, G or
-/// T.
+/// Parses a memory size in the form of Slurm's environment variables: a number of mebibytes, or a number followed by K,
+/// M, G or T. Returns bytes; `None` for other text.
 fn parse_slurm_size(text: &str) -> Option<u64> {
     let text = text.trim();
     let digits = text.trim_end_matches(|unit: char| unit.is_ascii_alphabetic());
@@ -75,14 +77,14 @@ mod tests {
     const GIB: u64 = 1 << 30;
     const MACHINE: MemoryLimit = MemoryLimit { bytes: 64 * GIB, source: LimitSource::Machine };
 
-    /// Returns the limit of a job with these variables on a machine of 64 GiB.
+    /// Returns the memory limit, bytes, of a batch job with these environment variables on a machine of 64 GiB.
     fn job(variables: &[(&str, &str)]) -> u64 {
         let variables: BTreeMap<_, _> = variables.iter().copied().collect();
         let system = MemoryLimits { around: vec![MACHINE], own: Vec::new() };
         least_limit(system, |name| variables.get(name).map(|&value| value.to_owned())).0
     }
 
-    /// Returns the limit of a process outside any job.
+    /// Returns the memory limit, bytes, of a process outside any batch job, and the description of its source.
     fn limit(around: &[MemoryLimit], own: &[MemoryLimit]) -> (u64, String) {
         least_limit(MemoryLimits { around: around.to_vec(), own: own.to_vec() }, |_| None)
     }
@@ -114,7 +116,7 @@ mod tests {
             4 * GIB
         );
         assert_eq!(job(&[("SLURM_MEM_PER_CPU", "1G"), ("SLURM_CPUS_PER_TASK", "2")]), 2 * GIB);
-        // All memory of the node, unknown values, and a product that overflows.
+        // Values that set no limit: 0 for all memory of the node, unknown values, and a product that overflows.
         for all in ["0", "lots", "", "9T9", "18446744073709551615T"] {
             assert_eq!(job(&[("SLURM_MEM_PER_NODE", all)]), 64 * GIB, "{all}");
         }

@@ -7,7 +7,8 @@ use std::sync::Arc;
 
 /// Receiver of the events of runs. Methods are called from any thread; default implementations ignore the event.
 pub trait EventSink: Send + Sync {
-    /// Announces a run that consists of `stages`, in order. Each stage begins with the task of its name.
+    /// Announces the start of a run of `stages`, in order. Each stage begins with [`EventSink::task_begun`] for a task
+    /// of the stage's name.
     fn run_begun(&self, stages: &[ExpectedStage]) {
         let _ = stages;
     }
@@ -15,8 +16,8 @@ pub trait EventSink: Send + Sync {
     /// Announces that the run of the last [`EventSink::run_begun`] has ended, with a result or an error.
     fn run_ended(&self) {}
 
-    /// Announces a task. Its progress goes to the returned sink, which is dropped when the task ends. Returns `None` if
-    /// progress is not wanted. A task may begin while others run.
+    /// Announces a task. Returns the sink that receives the progress of the task and is dropped when the task ends, or
+    /// `None` if progress is not wanted. A task may begin while others run.
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {
         let _ = task;
         None
@@ -30,40 +31,40 @@ pub trait EventSink: Send + Sync {
 
 /// Receiver of the progress of one task. Methods are called from any thread; the sink is dropped when the task ends.
 pub trait TaskSink: Debug + Send + Sync {
-    /// Adds `units` to the number of finished units.
+    /// Reports that `units` more units of the task are done.
     fn advanced(&self, units: u64);
 
-    /// Restarts the task from zero with `total` units.
+    /// Reports that the task starts again from zero, with `total` units.
     fn restarted(&mut self, total: u64);
 }
 
-/// Name of a stage and its expected duration in seconds.
+/// Name of a stage, and its expected duration in seconds.
 pub type ExpectedStage = (&'static str, f64);
 
-/// A task that begins.
+/// Task that begins, such as a stage or a step of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Task<'a> {
     /// Name of the task; equal to the stage name if the task is a stage.
     pub name: &'static str,
-    /// Unit of the work, in the plural ("states").
+    /// Unit in which progress is counted, in the plural, such as "states" (one state is one Gaussian at one frame).
     pub unit: &'a str,
-    /// Number of units; `None` if unknown in advance.
+    /// Number of units of the whole task; `None` if unknown in advance.
     pub total: Option<u64>,
 }
 
 /// A message about a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Message<'a> {
-    /// Part of the memory plan or of the time forecast of a run, as lines of text. Sent if
+    /// Part of the memory plan or of the time forecast of a run, as lines of text. Sent only if
     /// [`crate::memory_plan::Budget::tell`] asks for it.
     Plan(&'a str),
-    /// Something that the user should change before the run goes on, such as missing cameras.
+    /// Problem that the user should solve before the run goes on, such as missing cameras.
     Warning(&'a str),
-    /// Notice that the result of a stage is discarded.
+    /// Notice that the computed result of a stage is not used.
     Discarded {
-        /// Name of the discarded stage.
+        /// Name of the stage whose result is not used.
         stage: &'a str,
-        /// Reason.
+        /// Reason for not using the result.
         why: &'a str,
     },
 }
@@ -87,7 +88,7 @@ impl Events {
         Events(Some(Arc::new(sink)))
     }
 
-    /// Announces a run of `stages`. The run lasts as long as the returned value lives.
+    /// Announces the start of a run of `stages`. The run ends when the returned value is dropped.
     pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunOfStages {
         if let Some(sink) = &self.0 {
             sink.run_begun(stages);
@@ -95,12 +96,14 @@ impl Events {
         RunOfStages(self.clone())
     }
 
-    /// Begins the task `name` of `total` units; `unit` is plural ("states").
+    /// Begins the task `name` of `total` units and returns its progress. `unit` names the units in the plural
+    /// ("states").
     pub fn task(&self, name: &'static str, unit: &str, total: u64) -> Progress {
         self.begin(Task { name, unit, total: Some(total) })
     }
 
-    /// Begins the task `name`, whose number of units is unknown in advance.
+    /// Begins the task `name`, whose number of units is unknown in advance, and returns its progress. `unit` names the
+    /// units in the plural.
     pub fn counting_task(&self, name: &'static str, unit: &str) -> Progress {
         self.begin(Task { name, unit, total: None })
     }
@@ -109,7 +112,7 @@ impl Events {
         Progress(self.0.as_ref().and_then(|sink| sink.task_begun(task)))
     }
 
-    /// Sends a message.
+    /// Sends a message to the sink, if there is one.
     pub fn send(&self, message: Message<'_>) {
         if let Some(sink) = &self.0 {
             sink.message(message);
@@ -117,7 +120,7 @@ impl Events {
     }
 }
 
-/// Guard of an announced run; the run ends when it is dropped.
+/// Guard of an announced run. Dropping it announces the end of the run.
 #[must_use = "the run ends when this is dropped"]
 #[derive(Debug)]
 pub struct RunOfStages(Events);
@@ -130,8 +133,8 @@ impl Drop for RunOfStages {
     }
 }
 
-/// Progress of a task, for example over Gaussians × frames. Advancing is cheap and possible from any thread. The task
-/// ends when the value is dropped.
+/// Progress of a task, counted in units such as states (one Gaussian at one frame). Can be advanced cheaply from any
+/// thread. The task ends when this value is dropped.
 #[derive(Debug)]
 pub struct Progress(Option<Box<dyn TaskSink>>);
 
@@ -139,14 +142,14 @@ impl Progress {
     /// Progress that is reported to nobody.
     pub const IGNORED: Progress = Progress(None);
 
-    /// Marks `units` more units as done.
+    /// Reports that `units` more units of the task are done.
     pub fn advance(&self, units: u64) {
         if let Some(sink) = &self.0 {
             sink.advanced(units);
         }
     }
 
-    /// Restarts the task from zero with `total` units.
+    /// Reports that the task starts again from zero, with `total` units.
     pub fn restart(&mut self, total: u64) {
         if let Some(sink) = &mut self.0 {
             sink.restarted(total);

@@ -1,5 +1,5 @@
-//! Traits by which frames are read: a source opens readers over blocks of Gaussians, is told which frames they will be
-//! asked for, and counts what it reads.
+//! Traits for reading the frames of a sequence. A source opens readers for blocks of Gaussians and counts what is read;
+//! a reader is told in advance which frames it will read.
 
 use std::ops::{Add, Range, Sub};
 use std::sync::Arc;
@@ -10,12 +10,12 @@ use serde::{Deserialize, Serialize};
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 
-/// Gaussians of a sequence that a reader covers.
+/// Ids of the Gaussians that a reader reads.
 #[derive(Debug, Clone)]
 pub enum Ids<'a> {
-    /// Consecutive ids.
+    /// Ids of a range of consecutive Gaussians.
     Range(Range<usize>),
-    /// List of ids, in any order.
+    /// Ids in a list, in any order.
     List(&'a [u32]),
 }
 
@@ -43,10 +43,10 @@ impl Ids<'_> {
     }
 }
 
-/// Frames that a reader will be asked for. With this plan, frames that share a tile are decoded once, and only those
-/// that are needed are kept.
+/// Frames that a reader will be asked for. Knowing them, the reader decodes a tile (some Gaussians at consecutive
+/// frames) once and keeps only the frames that are needed.
 ///
-/// The plan is advice: reading other frames, or these in another order, gives the same values but costs more.
+/// The plan is advice: reading other frames, or reading in another order, gives the same values but takes more time.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
     /// Frames in increasing order; `None`: every frame.
@@ -55,12 +55,13 @@ pub struct ReadPlan {
 }
 
 impl ReadPlan {
-    /// Creates the plan to read every frame in order, which is the default of readers.
+    /// Creates the plan to read every frame in order. Readers without a plan assume it.
     pub fn every() -> ReadPlan {
         ReadPlan { frames: None, held: usize::MAX }
     }
 
-    /// Creates the plan to read `frames` in increasing order. Order and duplicates of the argument do not matter.
+    /// Creates the plan to read `frames` in increasing order, each once, whatever the order and repetitions in
+    /// `frames`.
     pub fn new(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
@@ -68,19 +69,19 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Limits the number of frames kept, of those that are decoded together, to `frames` (at least 1). This takes less
-    /// memory but decodes tiles repeatedly.
+    /// Sets the maximum number of frames that a reader keeps of the frames decoded together, at least 1. A small
+    /// maximum saves memory but makes the reader decode tiles repeatedly.
     pub fn holding(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
-    /// Returns the maximum number of frames to keep.
+    /// Returns the maximum number of frames that a reader keeps of the frames decoded together.
     pub fn held(&self) -> usize {
         self.held
     }
 
-    /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive). A frame that is not in the plan is
-    /// returned alone.
+    /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive), or `frame` alone if it is not in the
+    /// plan.
     pub fn between(&self, frame: usize, end: usize) -> Vec<usize> {
         match &self.frames {
             None => (frame..end).collect(),
@@ -91,7 +92,7 @@ impl ReadPlan {
         }
     }
 
-    /// Returns the first planned frame at or after `frame`.
+    /// Returns the first planned frame at or after `frame`; `None` if there is none.
     pub fn next(&self, frame: usize) -> Option<usize> {
         match &self.frames {
             None => Some(frame),
@@ -100,14 +101,14 @@ impl ReadPlan {
     }
 }
 
-/// Amounts read from a source, counted where reading happens.
+/// Amounts read from a source, counted by the code that reads.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reads {
-    /// Stored bytes of attribute values read from files.
+    /// Number of bytes of attribute values read from files, as stored there.
     pub bytes: u64,
-    /// Number of tiles decoded; 0 for sources without tiles.
+    /// Number of tiles decoded, a tile being some Gaussians at consecutive frames; 0 for sources without tiles.
     pub tiles: u64,
-    /// Number of states (one Gaussian at one frame) evaluated or returned, regardless of the columns read.
+    /// Number of states (one Gaussian at one frame) evaluated or returned, no matter how many attributes were read.
     pub states: u64,
 }
 
@@ -122,7 +123,7 @@ impl Add for Reads {
 impl Sub for Reads {
     type Output = Reads;
 
-    /// Returns the amounts read since `before`.
+    /// Returns the amounts read since `before` was counted.
     fn sub(self, before: Reads) -> Reads {
         Reads {
             bytes: self.bytes - before.bytes,
@@ -155,96 +156,101 @@ impl Clone for Count {
     }
 }
 
-/// Sequence of Gaussians that can be read block by block and frame by frame, in any order, from several threads. The
-/// same Gaussian at the same frame always has the same bits, whatever the block.
+/// Sequence of Gaussians that can be read block by block and frame by frame, in any order, from several threads. A
+/// Gaussian at a frame has the same bits whichever block it is read with.
 pub trait FrameSource: Send + Sync {
-    /// Returns the number of Gaussians, the time stamps and the varying columns.
+    /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
 
-    /// Opens a reader over the Gaussians `ids`, in that order. Work that does not depend on time is done here once.
+    /// Opens a reader for the Gaussians `ids`, which returns them in this order. Work that does not depend on time is
+    /// done here once.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
-    /// Opens a reader over all Gaussians for the frames `wanted`, if it costs less than readers of blocks; else returns
-    /// `None`. It may take more memory per Gaussian than readers of blocks.
+    /// Opens a reader for all Gaussians at the frames `_wanted`, or returns `None` if readers of blocks take less time.
+    /// The reader may take more memory per Gaussian than readers of blocks.
     fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
-    /// Returns the deformation that maps stored parameters to states, if it is more than a sum. `None` for explicit
-    /// trajectories, where a change of the stored parameters is the same change of every frame's state.
+    /// Returns the function that computes states from stored parameters. `None` for explicit trajectories, where a
+    /// change of a stored parameter changes the state at every frame by the same amount.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
 
-    /// Returns the decoder of pixel colors, if the Gaussians have features in place of colors. The colors of the states
-    /// then only approximate the renders.
+    /// Returns the decoder of pixel colors for models that store features in place of colors. For these models the
+    /// colors in a state only approximate the renders. `None` for models that store colors.
     fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
     }
 
-    /// Returns the amounts read so far by all readers; zeros if the source does not count.
+    /// Returns the amounts read so far by all readers of this source; zeros if the source does not count.
     fn reads(&self) -> Reads {
         Reads::default()
     }
 
-    /// Returns how to fetch bytes before they are read, if waiting for them costs more than asking for them early.
+    /// Returns the handle for fetching bytes before they are read. `None` if this saves no time.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }
 }
 
-/// States computed from stored parameters, which are the same for all frames, by a differentiable function.
+/// Differentiable function that computes the states of Gaussians from stored parameters, which are the same for all
+/// frames.
 pub trait Deformation: Sync {
-    /// Returns the stored parameters.
+    /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the columns of the stored parameters that have derivatives.
+    /// Returns the attributes with derivatives: those that [`Deformation::jacobian`] can differentiate.
     fn movable(&self) -> Attributes;
 
-    /// Writes the columns `want` of the state at `frame` to `out`, for Gaussians with the parameters `stored`. Resizes
-    /// these columns of `out`.
+    /// Computes the state at `frame` of Gaussians with the parameters `stored`. Writes only the attributes `want` to
+    /// `out`, and resizes these.
     fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Returns the derivatives of the columns `want` of that state with respect to the same columns of `stored`.
+    /// Returns the derivatives of the attributes `want` of the state at `frame` with respect to the same attributes of
+    /// `stored`.
     fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian>;
 }
 
 /// Decoder of features that take the place of colors. Features are blended without a background, and the decoder
 /// computes the color of each pixel from the blended features.
 pub trait FeatureDecoder: Sync {
-    /// Writes the features of all Gaussians at `frame` to `out`, one plane per feature.
+    /// Writes the features of all Gaussians at `frame` to `out`, one plane (array with a value per Gaussian) per
+    /// feature.
     fn features(&self, frame: usize, out: &mut AttributeValues) -> Result<()>;
 
-    /// Returns red, green and blue of a pixel with the blended `features`, seen from `center` along the unit vector
-    /// `ray`.
+    /// Returns the red, green and blue of a pixel with the blended `features`. The pixel is seen from the camera center
+    /// `center` along the unit vector `ray`.
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
 /// Source on a disk whose bytes can be fetched before they are used, by a thread that does nothing else.
 pub trait Prefetch: Sync {
-    /// Returns the number of frames that are fetched and decoded together. Frame blocks start at its multiples.
+    /// Returns the number of consecutive frames that are fetched and decoded together. Such a frame block starts at a
+    /// multiple of this number.
     fn frame_block(&self) -> usize;
 
-    /// Fetches the bytes of the columns `want` of `gaussians` at `frames`, and waits for them. Failures are reported
-    /// when the bytes are read.
+    /// Fetches the bytes of the attributes `want` of `gaussians` at `frames`, and waits for them. Failures are reported
+    /// later, when the bytes are read.
     fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes);
 }
 
 /// Reader of one block of Gaussians at any frame.
 pub trait BlockReader: Send {
-    /// Writes the columns `want` of the block at `frame` to `out`, and resizes these columns to the block. Leaves other
-    /// columns unchanged.
+    /// Reads the attributes `want` of the block at `frame` into `out`, which is resized in these attributes. Leaves the
+    /// other attributes of `out` unchanged.
     ///
     /// # Errors
-    /// A frame that cannot be read.
+    /// Fails if the frame cannot be read.
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Announces the frames that the reader will be asked for from now on, and how many it may keep. Readers that keep
-    /// no frames ignore it.
+    /// Announces the frames that will be read from now on, and how many of them the reader may keep. Readers that keep
+    /// no frames ignore this.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Does the work of reading `want` at `frame`, and at the frames decoded with it, except for copying, as far as the
-    /// reader may keep the result.
+    /// Decodes the attributes `_want` at `_frame`, and at the frames decoded with it, so that [`BlockReader::read`]
+    /// only has to copy. Does so only for frames that the reader may keep.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }

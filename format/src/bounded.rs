@@ -1,16 +1,17 @@
-//! Lossy tiles of columns with an error bound: encoding of values to stored bytes, and the decoder's view of these
-//! bytes (SPEC.md, "Bounded").
+//! Lossy tiles: encodes the values of a tile (one column for a block of Gaussians and frames) with an error of at most
+//! the column's bound, and decodes them (SPEC.md, "Bounded").
 //!
 //! Values are stored as integer multiples of a step. A *track* is one component of one Gaussian over the frames of the
-//! tile. A track is *static* if one multiple is within the bound of all its values; that multiple is stored once. The
-//! multiples of moving tracks are predicted from earlier frames, in integers, so that errors do not accumulate. The
-//! encoder decodes every value again; a value that is not finite, or would differ by more than the bound, is stored as
-//! an exception with its original bits.
+//! tile. A track is *static* if one multiple is within the bound of all its values; this multiple is stored once. All
+//! other tracks are *moving*: their multiples are predicted from earlier frames, in integers, so that errors do not
+//! accumulate. The encoder decodes every value again. A value that is not finite, or would differ by more than the
+//! bound, is stored as an *exception* with its original bits.
 //!
-//! Compression factor (raw bytes / stored bytes) of three trained models, zstd level 15, with bounds of .001 for
-//! positions, .005 for rotations and .01 for log scales and SH coefficients (`cargo bench --bench filters` of the
-//! program prints the table). "By frame" and "by track" is the order of the residuals; the third and fourth columns
-//! store residuals of moving tracks only; the last one also halves the step of static tracks where that is smaller:
+//! The table shows compression factors (raw bytes / stored bytes) of three trained models, with zstd level 15 and
+//! bounds of .001 for positions, .005 for rotations and .01 for log scales and SH coefficients (`cargo bench --bench
+//! filters` of the program prints the table). "All" stores prediction errors (residuals) of all tracks, "moving" those
+//! of moving tracks only, in the order "by frame" or "by track". The last column also halves the step of static tracks
+//! where the tile becomes smaller:
 //!
 //! | column | all, by frame | all, by track | moving, by frame | moving, by track | half step where smaller |
 //! |---|---|---|---|---|---|
@@ -23,20 +24,21 @@ use std::io;
 
 use crate::codec::{Stats, order_at, predict, shuffle_into, stats, zigzag};
 
-/// Legal bounds of a column. Within this range the step is a finite number above zero.
+/// Error bounds that a column may have. For all of them the quantization step is a finite number above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
-/// Length in bytes of the fields before the exceptions: step, number of exceptions, number of halvings of the step for
-/// static tracks.
+/// Length in bytes of the fields before the exceptions of a tile: step, number of exceptions, and how often the step is
+/// halved for static tracks.
 const HEAD_BYTES: usize = 16;
-/// Minimum number of values per exception; a tile with more exceptions is stored in another encoding.
+/// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
+/// in another encoding.
 const VALUES_PER_EXCEPTION: usize = 16;
-/// Upper limit of the magnitude of multiples (exclusive), so that second differences fit 32 bits.
+/// Multiples of the step are smaller than this in magnitude, so that their second differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
-/// zstd level of the trial that decides whether static tracks use half the step. Halving makes more tracks static but
-/// costs a bit more for each of them.
+/// zstd level of the trial that decides whether static tracks use half the step. Half the step makes more tracks
+/// static, but each of them takes a bit more space.
 const TRIAL_LEVEL: i32 = 1;
 
-/// Encoded tile whose values are within the bound.
+/// Encoded tile whose decoded values differ from the original ones by at most the error bound.
 pub(crate) struct BoundedTile {
     pub(crate) order: u8,
     pub(crate) constant: bool,
@@ -44,9 +46,10 @@ pub(crate) struct BoundedTile {
     pub(crate) bytes: Vec<u8>,
 }
 
-/// Encodes `values`, frames of `plane` values each, with an error of at most `max_error`.
+/// Encodes `values`, which are frames of `plane` values each, with an error of at most `max_error`. `level` is the zstd
+/// level.
 ///
-/// Returns `None` if this encoding does not pay: there are too many exceptions, or the result takes 4 bytes per value
+/// Returns `None` if this encoding does not pay: too many values are exceptions, or the result takes 4 bytes per value
 /// or more.
 pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -> io::Result<Option<BoundedTile>> {
     let step = step(values, max_error);
@@ -81,15 +84,15 @@ pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -
     Ok((bytes.len() < 4 * values).then_some(BoundedTile { order, constant, stats, bytes }))
 }
 
-/// Returns the bits of the f32 value `multiple` · `step`; `multiple` holds an i32.
+/// Returns the bits of the f32 value `multiple` · `step`. The bits of `multiple` are those of an i32.
 fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the step for an error of at most `max_error`: twice the bound, reduced by what rounding the largest value to
-/// f32 may add.
+/// Returns the quantization step for an error of at most `max_error`: twice the bound, less what rounding the largest
+/// value to f32 may add to the error.
 ///
-/// Values so large that their f32 spacing exceeds half the bound are ignored here; they may become exceptions.
+/// Values so large that their f32 spacing exceeds half the bound do not count; they may become exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -97,25 +100,25 @@ fn step(values: &[f32], max_error: f64) -> f64 {
     2.0 * max_error - spacing((f64::from(most) + max_error) as f32)
 }
 
-/// Tile quantized to multiples of its step.
+/// Values of a tile, quantized to integer multiples of a step.
 struct Multiples {
     plane: usize,
     step: f64,
     halvings: u32,
-    /// Multiples, laid out like the values of the tile. Static tracks use the step of [`static_step`].
+    /// Multiples, in the order of the tile's values. Those of static tracks are multiples of [`static_step`].
     values: Vec<u32>,
-    /// For every track whether it moves.
+    /// Whether each track (one component of one Gaussian over all frames) is moving, that is, not static.
     moves: Vec<bool>,
-    /// Exceptions: index of the value and its original bits; sorted by index.
+    /// Values stored as they are: index of the value and its original bits, in the order of the indices.
     exceptions: Vec<(u32, u32)>,
 }
 
 impl Multiples {
-    /// Quantizes `values`. Tracks are static if one multiple of the step, halved `halvings` times (0 or 1), fits all
-    /// their values.
+    /// Quantizes `values`. A track is static if one multiple of the step, halved `halvings` times (0 or 1), is within
+    /// the error bound of all its values.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);
-        // Nearest multiple of `step` to `x`, if its value is within the bound of all of `values`.
+        // Returns the multiple of `step` nearest to `x`, if it is within the error bound of all of `values`.
         let nearest = |x: f64, step: f64, values: [f32; 2]| {
             let rounded = (x / step).round();
             let multiple = (rounded.abs() < MAX_MULTIPLE).then_some(rounded as i32 as u32)?;
@@ -125,7 +128,7 @@ impl Multiples {
         let (mut least, mut most) = (values[..plane].to_vec(), values[..plane].to_vec());
         for frame in values.chunks_exact(plane).skip(1) {
             for ((least, most), &value) in least.iter_mut().zip(&mut most).zip(frame) {
-                // Keep NaN: no multiple is within the bound of it, so the track becomes a moving one.
+                // A NaN is kept: no multiple is within the bound of it, so the track becomes a moving one.
                 *least = if value < *least || value.is_nan() { value } else { *least };
                 *most = if value > *most || value.is_nan() { value } else { *most };
             }
@@ -149,19 +152,19 @@ impl Multiples {
         Multiples { plane, step, halvings, values: multiples, moves, exceptions }
     }
 
-    /// Returns the number of static tracks.
+    /// Returns the number of static tracks, whose values are all stored as one multiple.
     fn static_tracks(&self) -> usize {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Reduces the tile to its first frame.
+    /// Removes all frames but the first.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
         self
     }
 
-    /// Returns the bits of all values as a reader decodes them.
+    /// Returns the bits of all values as they are after decoding.
     fn decoded(&self) -> Vec<u32> {
         let steps = [static_step(self.step, self.halvings), self.step];
         let tracks = self.moves.iter().cycle();
@@ -172,27 +175,27 @@ impl Multiples {
         values
     }
 
-    /// Returns the zigzagged prediction error of a track at `frame`, which must not be the first one.
+    /// Returns the prediction error of track `track` at frame `frame`, zigzag-coded; `frame` must not be the first.
     fn residual(&self, order: u8, track: usize, frame: usize) -> u32 {
         let order = order_at(order, frame);
         let at = |back: usize| self.values[(frame - back) * self.plane + track];
         zigzag(at(0).wrapping_sub(predict(order, at(1), at(order.into()))))
     }
 
-    /// Returns the residuals of moving tracks after the first frame, track by track.
+    /// Returns the prediction errors of all moving tracks at all frames but the first, track by track.
     fn residuals(&self, order: u8) -> impl Iterator<Item = u32> + '_ {
         let moving = (0..self.plane).filter(|&track| self.moves[track]);
         let frames = self.values.len() / self.plane;
         moving.flat_map(move |track| (1..frames).map(move |frame| self.residual(order, track, frame)))
     }
 
-    /// Returns the order of prediction (1 or 2) whose residuals take fewer bits.
+    /// Returns the order of prediction (number of earlier frames: 1 or 2) whose prediction errors take fewer bits.
     fn order(&self) -> u8 {
         let cost = |order| self.residuals(order).map(|residual| u64::from(32 - residual.leading_zeros())).sum::<u64>();
         if cost(2) < cost(1) { 2 } else { 1 }
     }
 
-    /// Returns the bytes that are compressed by zstd: the mask of moving tracks, the first frame, the residuals.
+    /// Returns the bytes that zstd compresses: the mask of moving tracks, the first frame, and the prediction errors.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {
@@ -204,25 +207,27 @@ impl Multiples {
     }
 }
 
-/// Returns the step of static tracks.
+/// Returns the quantization step of static tracks: `step` halved `halvings` times (0 or 1).
 fn static_step(step: f64, halvings: u32) -> f64 {
     if halvings == 0 { step } else { 0.5 * step }
 }
 
-/// Decoder of a bounded tile: the fields stored before its zstd frame, and the number of moving tracks.
+/// Decoder of the lossy encoding of a tile: the fields that are stored before its zstd frame, and the number of moving
+/// tracks.
 #[derive(Debug, Default)]
 pub(crate) struct BoundedTracks {
-    /// Step of static tracks, and step of moving tracks.
+    /// Quantization steps of static tracks and of moving tracks.
     steps: [f64; 2],
     exceptions: Vec<(u32, u32)>,
     plane: usize,
     frames: usize,
-    /// Number of moving tracks.
+    /// Number of moving tracks, that is, tracks that are not stored as a single multiple.
     moving: usize,
 }
 
 impl BoundedTracks {
-    /// Reads the fields before the zstd frame and returns the bytes of that frame. The error text says what was found.
+    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame. An error says
+    /// what was found instead.
     pub(crate) fn read_head<'a>(
         &mut self,
         stored: &'a [u8],
@@ -255,13 +260,13 @@ impl BoundedTracks {
         Ok(packed)
     }
 
-    /// Returns the maximum number of bytes that the zstd frame may decompress to.
+    /// Returns the maximum number of bytes that the tile's zstd frame may decompress to.
     pub(crate) fn max_decompressed_bytes(&self) -> usize {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks from the mask in the decompressed bytes and checks the length. The error text says what
-    /// was found.
+    /// Counts the moving tracks by the mask at the start of the decompressed `bytes`, and checks the length of `bytes`.
+    /// An error says what was found.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -274,13 +279,13 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns the zigzagged multiples of the first frame.
+    /// Returns the multiples of all tracks in the first frame, zigzag-coded.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
     }
 
-    /// Returns pairs of moving track and residual at `frame`, which must not be the first one.
+    /// Returns for frame `frame`, which must not be the first, each moving track with its prediction error.
     pub(crate) fn residuals<'a>(&self, bytes: &'a [u8], frame: usize) -> impl Iterator<Item = (usize, u32)> + 'a {
         let from = self.mask_bytes() + 4 * self.plane;
         let (after_first, values) = (self.frames - 1, self.moving * (self.frames - 1));
@@ -288,12 +293,13 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the bits of the values of `frame`, which has the given multiples, to `out`.
+    /// Writes the bits of the values of frame `frame` to `out`. `multiples` holds the multiples of all tracks in this
+    /// frame, `bytes` the decompressed bytes of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);
         }
-        // Number of exceptions before a frame.
+        // Returns the number of exceptions in the frames before `frame`.
         let before =
             |frame: usize| self.exceptions.partition_point(|&(place, _)| (place as usize) < frame * self.plane);
         for &(place, bits) in &self.exceptions[before(frame)..before(frame + 1)] {
@@ -301,23 +307,24 @@ impl BoundedTracks {
         }
     }
 
-    /// Returns the heap memory of this struct in bytes.
+    /// Returns the bytes of heap memory that this value takes.
     pub(crate) fn memory(&self) -> usize {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask of moving tracks.
+    /// Returns the length in bytes of the mask that tells which tracks move (one bit per track).
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }
 }
 
-/// Returns whether `track` moves according to the mask at the start of `bytes`.
+/// Returns whether the track `track` moves, according to the mask at the start of `bytes`.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }
 
-/// Returns value `place` of an array of `values` shuffled u32: first all lowest bytes, …, last all highest bytes.
+/// Returns the value at index `place` of an array of `values` u32 stored as shuffled bytes: first the lowest bytes of
+/// all values, last their highest bytes.
 fn shuffled_value(bytes: &[u8], values: usize, place: usize) -> u32 {
     u32::from_le_bytes(std::array::from_fn(|weight| bytes[weight * values + place]))
 }
@@ -345,7 +352,8 @@ mod tests {
         Ok(values)
     }
 
-    /// Generates tiles with tracks that are constant, drift, jitter or jump, some with one value of arbitrary bits.
+    /// Generates tiles with tracks that are constant, drift, jitter or jump; some tiles have one value of arbitrary
+    /// bits.
     fn tiles() -> impl Strategy<Value = (usize, usize, Vec<f32>)> {
         let track = |frames: usize| {
             let from = prop_oneof![-3.0f32..3.0, -2e5f32..2e5, Just(0.0)];
@@ -423,7 +431,7 @@ mod tests {
         assert!(encode(&[1.0], 1, 1e-3, 1).unwrap().is_none(), "one value");
         let odd: Vec<f32> = (0..640).map(|i| if i % 15 == 0 { f32::NAN } else { 1.0 }).collect();
         assert!(encode(&odd, 64, 1e-3, 1).unwrap().is_none(), "too many exceptions");
-        // The f32 spacing at these values exceeds the bound.
+        // The distance between neighboring f32 values of this size exceeds the error bound.
         let far: Vec<f32> = (0..640).map(|i| 3e7 + 8.0 * i as f32).collect();
         assert!(encode(&far, 64, 1e-3, 1).unwrap().is_none(), "no multiple is near");
     }

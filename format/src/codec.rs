@@ -1,12 +1,14 @@
-//! Encodes tiles to stored bytes and decodes them, in memory.
+//! Encodes tiles (values of one column for a block of Gaussians and frames) to stored bytes and decodes them, in
+//! memory.
 //!
-//! The filter maps the bits of every value to an integer in numeric order, predicts it from one or two earlier frames,
-//! and replaces the value by the zigzagged difference. The bytes of equal weight are then stored together (shuffle) and
-//! compressed by zstd. All arithmetic wraps, so every bit pattern is restored exactly.
+//! The lossless filter maps the bits of every value to an integer in numeric order, predicts this integer from one or
+//! two earlier frames, and replaces the value by the zigzag-coded difference. Then the lowest bytes of all values are
+//! stored together, the next bytes together, and so on (shuffle), and are compressed by zstd. All arithmetic wraps, so
+//! every bit pattern is restored exactly.
 //!
-//! Stored size in percent of the raw size for tiles of 32 frames of three trained models, zstd level 1, by the filter
-//! before zstd (`cargo bench --bench filters` of the program prints the table by model, with the times of encoding and
-//! decoding):
+//! The table shows stored bytes in percent of the raw bytes, for tiles of 32 frames of three trained models and zstd
+//! level 1, by the filter before zstd. The order is the number of earlier frames that predict a value (`cargo bench
+//! --bench filters` of the program prints the table by model, with the times of encoding and decoding):
 //!
 //! | column | no filter | shuffle | order 1 + shuffle | order 2 + shuffle | order 2 |
 //! |---|---|---|---|---|---|
@@ -29,37 +31,37 @@ use crate::bounded::{self, BoundedTracks};
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
 
-/// Method by which [`encode_tile`] stores the values of a tile.
+/// How [`encode_tile`] stores the values of a tile.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
-    /// Raw f32 values, which readers use in place from the map.
+    /// Raw: plain f32 values, which readers use in place from the memory map.
     Raw,
-    /// Lossless filter and zstd at this level. A tile that does not shrink is stored raw.
+    /// Lossless: filter, then zstd at this level. A tile that does not become smaller is stored raw.
     Zstd(i32),
-    /// Values that differ from the original by at most `max_error`, compressed by zstd at `level`. A tile that does not
-    /// shrink this way, or has too many values that cannot be stored within the bound, is stored like
-    /// [`Compression::Zstd`].
+    /// Lossy: values differ from the original ones by at most `max_error`, and zstd compresses them at `level`. A tile
+    /// that does not become smaller this way, or has too many values that cannot be stored within the bound, is stored
+    /// like [`Compression::Zstd`].
     Bounded {
-        /// Error bound, above 0; see [`crate::ColumnSpec::max_error`].
+        /// Maximum absolute error of a value, above 0; see [`crate::ColumnSpec::max_error`].
         max_error: f64,
-        /// zstd level.
+        /// Compression level of zstd.
         level: i32,
     },
 }
 
-/// Encoding of the stored bytes of a tile.
+/// How the stored bytes of a tile encode its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
-    /// Little-endian f32.
+    /// Raw: little-endian f32.
     Raw,
-    /// Residuals of a prediction from `order` earlier frames, shuffled and compressed by zstd.
+    /// Lossless: differences from a prediction, shuffled and compressed by zstd.
     Filtered {
-        /// Number of earlier frames used by the prediction: 0, 1 or 2.
+        /// Number of earlier frames from which a value is predicted: 0, 1 or 2.
         order: u8,
     },
-    /// Multiples of a step, predicted from `order` earlier frames, shuffled track by track and compressed by zstd.
+    /// Lossy: integer multiples of a step, as differences from a prediction, shuffled and compressed by zstd.
     Bounded {
-        /// Number of earlier frames used by the prediction: 1 or 2.
+        /// Number of earlier frames from which a multiple is predicted: 1 or 2.
         order: u8,
     },
 }
@@ -74,14 +76,14 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Statistics of the stored values of a tile; for a constant tile those of its one frame.
+/// Statistics of the stored values of a tile; of a constant tile (all frames equal), those of its one stored frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stats {
-    /// Minimum of the finite values, with −0 counted as +0; +∞ if no value is finite.
+    /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
     pub min: f32,
-    /// Maximum of the finite values, with −0 counted as +0; −∞ if no value is finite.
+    /// Largest finite value, with −0 counted as +0; −∞ if no value is finite.
     pub max: f32,
-    /// Number of NaN and infinite values.
+    /// Number of values that are NaN or infinite.
     pub non_finite: u32,
 }
 
@@ -100,7 +102,7 @@ pub struct EncodedTile {
     pub(crate) len: u32,
     pub(crate) constant: bool,
     pub(crate) encoding: Encoding,
-    /// Maximum absolute error of the values; 0 if exact.
+    /// Maximum absolute error of the decoded values; 0 if they are exact.
     pub(crate) max_error: f64,
     pub(crate) stats: Stats,
     pub(crate) checksum: u64,
@@ -108,31 +110,32 @@ pub struct EncodedTile {
 }
 
 impl EncodedTile {
-    /// Returns the number of bytes the tile takes in the file, without its 64-byte record header.
+    /// Returns the number of bytes that the tile takes in the file, without its 64-byte record header.
     pub fn stored_bytes(&self) -> usize {
         self.bytes.len()
     }
 
-    /// Returns whether every frame has the same bits. Only one frame is stored then, and the tile may be written to
+    /// Returns whether all frames have the same bits. Then only one frame is stored, and the tile may be written to
     /// frame blocks of any length.
     pub fn is_constant(&self) -> bool {
         self.constant
     }
 
-    /// Returns the minimum, maximum and number of non-finite values.
+    /// Returns minimum, maximum and number of non-finite values of the tile.
     pub fn stats(&self) -> Stats {
         self.stats
     }
 }
 
-/// Encodes `values`, laid out as `[frames][width][len]`: `width` components of `len` Gaussians.
+/// Encodes `values`, laid out as `[frames][width][len]`: `width` components of `len` Gaussians at `frames` frames.
 ///
-/// Deterministic and callable from any number of threads. Takes about twice the size of `values` as memory while it
-/// runs, three times with a bound. A tile with the same bits in every frame stores one frame. To encode a column that
-/// never changes, pass its one frame with `frames` = 1 and write the result to every frame block.
+/// The result depends on the arguments only; any number of threads may encode at a time. Memory: about twice the size
+/// of `values` while it runs, three times with an error bound. If all frames have the same bits, one frame is stored.
+/// To encode a column that never changes, pass its one frame with `frames` = 1 and write the result to every frame
+/// block.
 ///
 /// Fails if `values` is empty, has another shape or is larger than [`MAX_TILE_BYTES`], if zstd does not have this
-/// level, or if the bound is not legal.
+/// level, or if the error bound is not legal.
 pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compression: Compression) -> Result<EncodedTile> {
     let count = [frames, width, len].into_iter().try_fold(1u64, |product, n| product.checked_mul(n.into()));
     if values.is_empty() || count != Some(values.len() as u64) || 4 * values.len() as u64 > MAX_TILE_BYTES {
@@ -186,26 +189,26 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
     Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
 }
 
-/// Decoder of one filtered or bounded tile, frame by frame.
+/// Decoder of one tile that is not raw (lossless or lossy encoding), frame by frame.
 ///
-/// Memory: a filtered tile takes its decompressed bytes, as many as its values, and two frames. A bounded tile takes
-/// 1/8 byte per value of one frame more, and up to 1/2 byte per value of the tile for exceptions (if every 16th value
-/// is one). A raw tile takes nothing.
+/// Memory: a lossless tile takes its decompressed bytes, as many as its values, and two frames. A lossy tile takes in
+/// addition 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th
+/// value is one). A raw tile takes nothing.
 #[derive(Debug, Default)]
 pub(crate) struct TileDecoder {
     order: u8,
-    /// Decompressed bytes: of a filtered tile four planes, each with one byte of every value; of a bounded tile as in
-    /// SPEC.md.
+    /// Decompressed bytes of the tile: in the lossless encoding the lowest bytes of all values, then the next bytes,
+    /// and so on; in the lossy encoding as SPEC.md describes under "Bounded".
     shuffled: Vec<u8>,
-    /// Frame before `next`, and the frame before that; of filtered tiles as [`ordered`] integers, of bounded ones as
-    /// multiples.
+    /// The frame before `next`, and the frame before that: as [`ordered`] integers in the lossless encoding, as
+    /// multiples of the step in the lossy one.
     recent: [Vec<u32>; 2],
     next: usize,
     bounded: bool,
     tracks: BoundedTracks,
 }
 
-/// Stored bytes of a tile with the parameters needed to decode them.
+/// Stored bytes of a tile, and the parameters needed to decode them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct StoredTile<'a> {
     pub(crate) bytes: &'a [u8],
@@ -213,13 +216,13 @@ pub(crate) struct StoredTile<'a> {
     pub(crate) frames: usize,
     /// Number of values per frame.
     pub(crate) plane: usize,
-    /// Error bound of the column.
+    /// Error bound of the tile's column; 0 if its values are exact.
     pub(crate) max_error: f64,
 }
 
 impl TileDecoder {
-    /// Decompresses a tile that is not raw, to be decoded by [`TileDecoder::frame`]. The error text says what was found
-    /// instead of the values.
+    /// Decompresses a tile that is not raw, so that [`TileDecoder::frame`] can decode its frames. An error says what
+    /// was found instead of the values.
     pub(crate) fn load(
         &mut self,
         stored: StoredTile<'_>,
@@ -242,7 +245,8 @@ impl TileDecoder {
             Encoding::Raw => return Err("raw values".to_owned()),
         };
         self.shuffled.resize(max_bytes, 0);
-        // The target has a fixed size, so a zstd frame that decompresses to more is refused, whatever size it declares.
+        // The buffer has a fixed size, so a zstd frame that decompresses to more bytes is refused, whatever size it
+        // declares.
         match zstd.decompress_to_buffer(packed, self.shuffled.as_mut_slice()) {
             Ok(len) if self.bounded => self.tracks.read_mask(&self.shuffled[..len]),
             Ok(len) if len == max_bytes => Ok(()),
@@ -251,8 +255,9 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes frame `frame` into `out`, which has the length of a plane. Decoding a later frame than the last one
-    /// decodes the frames in between; decoding any other frame starts at the first frame.
+    /// Decodes frame `frame` into `out`, which has one element for each value of a frame. For a later frame than the
+    /// last one decoded, the frames in between are decoded too; for any other frame, decoding starts again at the
+    /// first.
     pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
         if self.order == 0 || frame < self.next {
             self.next = if self.order == 0 { frame } else { 0 };
@@ -270,13 +275,13 @@ impl TileDecoder {
         }
     }
 
-    /// Returns the memory held, in bytes.
+    /// Returns the bytes of memory that the decoder takes.
     pub(crate) fn memory(&self) -> usize {
         let [a, b] = &self.recent;
         self.shuffled.capacity() + 4 * (a.capacity() + b.capacity()) + self.tracks.memory()
     }
 
-    /// Decodes frame `next` of a filtered tile.
+    /// Decodes the next frame of a tile in the lossless encoding into `out`.
     fn step(&mut self, out: &mut [u32]) {
         let plane = out.len();
         let [b0, b1, b2, b3]: [&[u8]; 4] = std::array::from_fn(|weight| {
@@ -303,7 +308,7 @@ impl TileDecoder {
             _ => {
                 for i in 0..plane {
                     let rank = unzigzag(stored(i)).wrapping_add(predict(2, before[i], second_before[i]));
-                    // Becomes the previous frame in the swap below.
+                    // This value becomes that of the previous frame by the swap below.
                     second_before[i] = rank;
                     out[i] = unordered(rank);
                 }
@@ -312,8 +317,8 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes the multiples of frame `next` of a bounded tile. Those of static tracks do not change after the first
-    /// frame.
+    /// Decodes the multiples of the next frame of a tile in the lossy encoding. Those of static tracks do not change
+    /// after the first frame.
     fn step_multiples(&mut self) {
         let [before, second_before] = &mut self.recent;
         if self.next == 0 {
@@ -331,40 +336,41 @@ impl TileDecoder {
     }
 }
 
-/// Returns the little-endian bytes of `bits`.
+/// Returns the values `bits` as little-endian bytes.
 fn raw_bytes(bits: &[u32]) -> Vec<u8> {
     bits.iter().flat_map(|bits| bits.to_le_bytes()).collect()
 }
 
-/// Appends four planes of bytes to `out`, each with one byte of every value; the plane of the lowest bytes comes first.
+/// Appends the bytes of `values` to `out` in shuffled order: the lowest bytes of all values first, their highest bytes
+/// last.
 pub(crate) fn shuffle_into(values: &[u32], out: &mut Vec<u8>) {
     for weight in 0..4 {
         out.extend(values.iter().map(|value| (value >> (8 * weight)) as u8));
     }
 }
 
-/// Maps the bits of an f32 to an integer that grows with its value. Bijective on all bit patterns.
+/// Maps the bits of an f32 to an integer that grows with the f32's value. Different bits give different integers.
 fn ordered(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Maps an integer back to the bits of an f32. Inverse of [`ordered`].
+/// Maps an integer back to the bits of an f32; the inverse of [`ordered`].
 fn unordered(rank: u32) -> u32 {
     rank ^ (!((rank as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Maps a signed difference to an unsigned integer, so that the high bytes of small differences of either sign are
-/// zero.
+/// Zigzag code: maps a signed difference to an unsigned integer, so that small differences of either sign have high
+/// bytes of zero.
 pub(crate) fn zigzag(difference: u32) -> u32 {
     (difference << 1) ^ ((difference as i32) >> 31) as u32
 }
 
-/// Maps an unsigned integer back to a signed difference. Inverse of [`zigzag`].
+/// Maps a zigzag code back to a signed difference; the inverse of [`zigzag`].
 fn unzigzag(code: u32) -> u32 {
     (code >> 1) ^ (code & 1).wrapping_neg()
 }
 
-/// Predicts a value from the two frames before it: order 1 repeats the last one, order 2 extends the line through both.
+/// Predicts a value from the two frames before it: order 1 repeats `before`, order 2 continues the line through both.
 /// Values are [`ordered`] integers or multiples of a step.
 pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     match order {
@@ -373,15 +379,15 @@ pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     }
 }
 
-/// Returns the number of earlier frames that predict `frame`: `order`, but fewer for the first frames.
+/// Returns how many earlier frames predict frame `frame`: `order`, or fewer for the first frames.
 pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
-/// Returns the order of prediction with the shorter residuals.
+/// Returns the order of prediction (number of earlier frames) whose differences take fewer bits.
 ///
-/// Compares every fourth value only: comparing all would cost as much as the filter itself, and tiles with close
-/// results gain nothing from either choice.
+/// Compares every fourth value only: comparing all would take as long as the filter itself, and where the results are
+/// close, either order is good.
 fn best_order(bits: &[u32], plane: usize) -> u8 {
     let frames = bits.len() / plane;
     if frames < 3 {
@@ -402,7 +408,8 @@ fn best_order(bits: &[u32], plane: usize) -> u8 {
     if cost(1) < cost(2) { 1 } else { 2 }
 }
 
-/// Returns the shuffled residuals of all values: first the lowest bytes of all, last the highest bytes.
+/// Applies the lossless filter to values given as bits, in frames of `plane` values. Returns the differences from the
+/// prediction as bytes in shuffled order: the lowest bytes of all first, their highest bytes last.
 fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     let mut out = vec![0; 4 * bits.len()];
     let (low, high) = out.split_at_mut(2 * bits.len());
@@ -430,8 +437,8 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     out
 }
 
-/// Computes [`Stats`] of values given as bits. Minimum and maximum are taken over [`ordered`] integers, which is
-/// associative, so the compiler can vectorize it and the order of the values does not matter.
+/// Computes the [`Stats`] of values given as bits. Minimum and maximum are those of [`ordered`] integers, so the
+/// compiler can vectorize them and the order of the values does not matter.
 pub(crate) fn stats(bits: &[u32]) -> Stats {
     const EXPONENT: u32 = 0x7f80_0000;
     let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);
@@ -445,7 +452,7 @@ pub(crate) fn stats(bits: &[u32]) -> Stats {
     if non_finite as usize == bits.len() {
         return Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite };
     }
-    // Adding +0 turns −0 into +0 and keeps every other value.
+    // Adding +0 turns −0 into +0 and leaves every other value as it is.
     Stats { min: f32::from_bits(unordered(min)) + 0.0, max: f32::from_bits(unordered(max)) + 0.0, non_finite }
 }
 

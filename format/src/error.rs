@@ -16,25 +16,25 @@ pub enum Error {
     /// The file violates SPEC.md: fetch it again, or save its intact part with [`crate::recover`].
     #[error("{path}, byte {offset}: expected {expected}, found {found}{advice}", path = path.shown(), advice = Advice(hint))]
     Malformed {
-        /// Path of the file that was read.
+        /// Path of the malformed file.
         path: PathBuf,
-        /// Byte at which the file is wrong, counted from its start.
+        /// Offset of the first wrong byte from the start of the file.
         offset: u64,
-        /// Content that a valid file has at this byte.
+        /// What a valid file contains at this offset.
         expected: String,
-        /// Content of this file.
+        /// What this file contains at this offset.
         found: String,
-        /// Advice on what to do next; may be empty.
+        /// Advice to the user on what to do next; may be empty.
         hint: &'static str,
     },
     /// The operating system refused an operation: check the path, the permissions and the free space.
     #[error("cannot {action} {path}: {source}", path = path.shown())]
     Io {
-        /// Operation that failed, as a verb: "open", "create", "rename".
+        /// Operation that failed, as a verb such as "open", "create" or "rename".
         action: &'static str,
-        /// File or folder of the operation.
+        /// File or folder to which the operation was applied.
         path: PathBuf,
-        /// Error of the operating system.
+        /// Error that the operating system reported.
         source: io::Error,
     },
     /// The caller passed invalid arguments: a layout outside its limits, a tile written twice, a tile that does not
@@ -42,8 +42,8 @@ pub enum Error {
     #[error("{0}")]
     Usage(String),
 }
-/// Advice of an error message, shown on a line of its own; an empty text is left out.
 
+/// Shows the advice of an error message on a line of its own; shows nothing if the advice is empty.
 struct Advice<'a>(&'a str);
 
 impl fmt::Display for Advice<'_> {
@@ -53,19 +53,20 @@ impl fmt::Display for Advice<'_> {
 }
 
 impl Error {
-    /// Returns a closure that turns an operating-system error of doing `action` to `path` into an [`Error::Io`].
+    /// Returns a closure that turns an error of the operating system into an [`Error::Io`]. `action` is the operation
+    /// that failed, applied to `path`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Error::Io { action, path, source }
     }
 
-    /// Builds an [`Error::Usage`].
+    /// Creates an [`Error::Usage`].
     pub(crate) fn usage(message: impl Into<String>) -> Self {
         Error::Usage(message.into())
     }
 }
 
-/// Malformed place in a file whose path is added later by [`Fault::at`]; see [`Error::Malformed`].
+/// Malformed place in a file, as in [`Error::Malformed`], without the path of the file; [`Fault::at`] adds the path.
 #[derive(Debug)]
 pub(crate) struct Fault {
     offset: u64,
@@ -75,18 +76,18 @@ pub(crate) struct Fault {
 }
 
 impl Fault {
-    /// Builds a fault at byte `offset` of the file, without a hint.
+    /// Creates a fault at byte `offset` of the file, without advice to the user.
     pub(crate) fn new(offset: u64, expected: impl Into<String>, found: impl fmt::Display) -> Self {
         Fault { offset, expected: expected.into(), found: found.to_string(), hint: "" }
     }
 
-    /// Sets the advice on what to do next.
+    /// Sets the advice to the user on what to do next.
     pub(crate) fn hint(mut self, hint: &'static str) -> Self {
         self.hint = hint;
         self
     }
 
-    /// Turns the fault into an error of the file at `path`.
+    /// Turns the fault into an [`Error::Malformed`] of the file at `path`.
     pub(crate) fn at(self, path: &Path) -> Error {
         let Fault { offset, expected, found, hint } = self;
         Error::Malformed { path: path.to_owned(), offset, expected, found, hint }

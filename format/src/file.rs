@@ -1,11 +1,12 @@
-//! Memory-mapped files: reading them by system calls and in place, and the behavior when a file changes meanwhile.
+//! Memory-mapped files: reading by system calls or in place from the memory map, and what happens if a file changes
+//! meanwhile.
 //!
-//! [`MappedFile::read_at`] reads by a system call; if the file was cut short, it returns an error.
-//! [`MappedFile::in_place`] returns a slice of the map. It compares the range with the current length of the file first
-//! and returns an error if the file is too short. If the file shrinks after this check, while the slice is in use, the
-//! system may end the process (SIGBUS). The race lasts from the check to the end of decoding one tile or copying one
-//! frame. The writers of this crate never shrink or rewrite a container; they replace it by renaming, which leaves maps
-//! of the old file intact.
+//! [`MappedFile::read_at`] reads by a system call and returns an error if the file was cut short.
+//! [`MappedFile::in_place`] returns a slice of the memory map. It first compares the range with the current length of
+//! the file, and returns an error if the file is too short. If the file shrinks after this check, while the slice is in
+//! use, the operating system may end the process (SIGBUS). This can happen from the check until one tile has been
+//! decoded or one frame has been copied. The writers of this crate never shrink or rewrite a container; they replace it
+//! by renaming, which leaves memory maps of the old file intact.
 //!
 //! Pages that were read in place count as memory of this process until [`MappedFile::release`].
 
@@ -17,13 +18,14 @@ use memmap2::Mmap;
 
 use crate::error::{Error, Fault, Result};
 
-/// Bytes read at a time where a long range is read in chunks; a multiple of the record length.
+/// Number of bytes read at a time from a long range; a multiple of the length of a record (64).
 pub(crate) const CHUNK_BYTES: usize = 1 << 16;
 
-/// Bytes around a touched page that the system may map together with it (Linux: fault-around of 64 KiB).
+/// Number of bytes around a page that the operating system may map together with it when it is first read (Linux:
+/// fault-around of 64 KiB).
 const FAULT_AROUND_BYTES: u64 = 1 << 16;
-/// Open file with a memory map of its whole length at opening.
 
+/// Open file, with a memory map of the length that it had when it was opened.
 pub(crate) struct MappedFile {
     path: PathBuf,
     file: File,
@@ -33,7 +35,7 @@ pub(crate) struct MappedFile {
 impl MappedFile {
     /// Opens and maps the regular file at `path`. Fails for folders, pipes and devices.
     pub(crate) fn open(path: &Path) -> Result<Self> {
-        // Check before opening: opening a pipe would wait for its writer.
+        // Checked before opening, because opening a pipe would wait for its writer.
         let metadata = fs::metadata(path).map_err(Error::io("open", path))?;
         if !metadata.is_file() {
             return Err(Fault::new(0, "a regular file", "a folder, pipe or device").at(path));
@@ -47,18 +49,18 @@ impl MappedFile {
         Ok(MappedFile { path: path.to_owned(), file, map })
     }
 
-    /// Returns the path the file was opened by.
+    /// Returns the path by which the file was opened.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the length of the file in bytes at opening.
+    /// Returns the length in bytes that the file had when it was opened.
     pub(crate) fn len(&self) -> u64 {
         self.map.len() as u64
     }
 
-    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process
-    /// shortens the file, this returns an error, whereas touching a mapped page would end the process.
+    /// Reads `out.len()` bytes from byte `offset` on, with a system call. If another process shortens the file, this
+    /// returns an error, whereas reading a page of the memory map would end the process.
     pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
         splat_platform::read_exact_at(&self.file, out, offset).map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
@@ -66,8 +68,8 @@ impl MappedFile {
         })
     }
 
-    /// Calls `each` with the offset and the bytes of successive chunks of `range`. Every chunk has [`CHUNK_BYTES`]
-    /// bytes except the last one, which may be shorter.
+    /// Reads `range` in successive chunks and calls `each` with the offset and the bytes of each. Every chunk has
+    /// [`CHUNK_BYTES`] bytes except the last one, which may be shorter. `chunk` is a buffer.
     pub(crate) fn read_chunks(
         &self,
         range: std::ops::Range<u64>,
@@ -82,7 +84,7 @@ impl MappedFile {
         Ok(())
     }
 
-    /// Returns `len` bytes at `offset` as a slice of the map. Fails if the file is now too short.
+    /// Returns `len` bytes from byte `offset` on as a slice of the memory map. Fails if the file has become too short.
     pub(crate) fn in_place(&self, offset: u64, len: u64) -> Result<&[u8]> {
         let now = self.file.metadata().map_err(Error::io("examine", &self.path))?.len();
         match offset.checked_add(len) {
@@ -91,28 +93,29 @@ impl MappedFile {
         }
     }
 
-    /// Tells the system that the bytes of `range` will be read soon. If the system ignores the advice, later reads wait
-    /// for the disk.
+    /// Tells the operating system that the bytes of `range` will be read soon. If it ignores this, later reads wait for
+    /// the disk.
     pub(crate) fn will_need(&self, range: std::ops::Range<u64>) {
         if !range.is_empty() {
             splat_platform::expect_pages(&self.map, range.start as usize..range.end as usize);
         }
     }
 
-    /// Reads the bytes of `range` from the disk into the page cache of the system and waits for them. Keeps none of
-    /// them in this process.
+    /// Reads the bytes of `range` from disk into the page cache of the operating system and waits for them. This
+    /// process keeps none of them.
     pub(crate) fn fetch(&self, range: std::ops::Range<u64>, chunk: &mut Vec<u8>) -> Result<()> {
         self.read_chunks(range, chunk, |_, _| Ok(()))
     }
 
-    /// Returns whether the byte at `offset` can be read without waiting for the disk; `None` if the system does not
-    /// tell.
+    /// Returns whether the byte at `offset` is in the page cache, so that reading it does not wait for the disk; `None`
+    /// if the operating system does not tell.
     pub(crate) fn is_cached(&self, offset: u64) -> Option<bool> {
         splat_platform::is_cached(&self.file, offset)
     }
 
-    /// Gives the pages of `range`, and the neighboring pages mapped with them, back to the system. They no longer count
-    /// as memory of this process. Slices of these pages stay valid: their bytes are read from the file again.
+    /// Gives the pages of `range`, and the neighboring pages mapped with them, back to the operating system, so that
+    /// they no longer count as memory of this process. Slices of these pages stay valid: their bytes are read from the
+    /// file again.
     pub(crate) fn release(&self, range: std::ops::Range<u64>) {
         let (start, end) = (
             range.start.saturating_sub(FAULT_AROUND_BYTES),
@@ -125,7 +128,7 @@ impl MappedFile {
         }
     }
 
-    /// Builds the error for `len` bytes at `offset` that reach past the end of the file.
+    /// Returns the error for `len` bytes at `offset` that reach past the end of the file.
     fn too_short(&self, offset: u64, len: u64) -> Error {
         let now = self.file.metadata().map_or(0, |metadata| metadata.len());
         Fault::new(offset, format!("{len} bytes"), format!("the end of the file at byte {now}")).at(&self.path)

@@ -1,4 +1,5 @@
-//! Index of a finished container: one entry per tile. It stays in the file; entries are read when they are needed.
+//! Index of a finished container: the table of its tiles, one entry per tile. The index stays in the file; entries are
+//! read when they are needed.
 
 use std::ops::Range;
 
@@ -7,30 +8,30 @@ use crate::file::MappedFile;
 use crate::layout::Layout;
 use crate::record::{Digest, RECORD_BYTES, Record, TileRecord};
 
-/// Location of the index in the file, and the limits its entries must respect.
+/// Place of the index (table of tiles) in the file, and limits that its entries must respect.
 pub(crate) struct Index {
     pub(crate) offset: u64,
     pub(crate) tiles: u64,
-    /// T, number of frames of the sequence.
+    /// Number of frames T of the sequence.
     pub(crate) frames: u64,
-    /// Byte range of the file in which payloads may lie.
+    /// Byte range of the file in which the stored bytes of tiles may lie.
     pub(crate) payloads: Range<u64>,
 }
 
 impl Index {
-    /// Returns the offset in the file of entry `index`.
+    /// Returns the offset in the file of entry number `index` of the index.
     pub(crate) fn entry_offset(&self, index: u64) -> u64 {
         self.offset + RECORD_BYTES * index
     }
 
-    /// Reads and checks entry `index`. Fails if it is damaged or describes another tile.
+    /// Reads and checks entry number `index` of the index. Fails if the entry is damaged or describes another tile.
     pub(crate) fn record(&self, file: &MappedFile, layout: &Layout, index: u64) -> Result<TileRecord> {
         let mut bytes = [0; RECORD_BYTES as usize];
         file.read_at(self.entry_offset(index), &mut bytes)?;
         self.parse(layout, index, &bytes).map_err(|fault| fault.at(file.path()))
     }
 
-    /// Decodes entry `index` from its bytes and checks it against the layout.
+    /// Decodes entry number `index` of the index from its bytes and checks it against the layout.
     fn parse(
         &self,
         layout: &Layout,
@@ -52,11 +53,11 @@ impl Index {
         }
     }
 
-    /// Checks all entries, adds them to `digest`, and returns for every column whether its values differ between
-    /// frames.
+    /// Checks all entries of the index, adds them to `digest`, and returns for every column whether its values differ
+    /// between frames.
     ///
-    /// Also checks that no two tiles overlap in the file; constant tiles may share all of their bytes. Takes more
-    /// memory, at most `memory` bytes, if the tiles do not lie in the order of the index.
+    /// Also checks that no two tiles overlap in the file; constant tiles (all frames equal) may share all of their
+    /// bytes. If the tiles do not lie in the order of the index, the check takes more memory, at most `memory` bytes.
     pub(crate) fn check(
         &self,
         file: &MappedFile,
@@ -75,9 +76,9 @@ impl Index {
         Ok(varies)
     }
 
-    /// Checks and hashes all entries in one pass, keeping only the last constant tile of each column and Gaussian
-    /// block. Returns for every column whether its values vary, and whether the pass proved that no two tiles overlap.
-    /// It does so if the tiles lie in the order of the index.
+    /// Checks and hashes all entries in one pass, in which it remembers only the last constant tile (all frames equal)
+    /// of each column and Gaussian block. Returns for every column whether its values differ between frames, and
+    /// whether the pass has shown that no two tiles overlap. It shows this if the tiles lie in the order of the index.
     fn check_entries(
         &self,
         file: &MappedFile,
@@ -86,7 +87,7 @@ impl Index {
         digest: &mut Digest,
     ) -> Result<(Vec<bool>, bool)> {
         let mut varies = vec![false; layout.columns.len()];
-        // One slot per column and Gaussian block. A file without frames has no tile, whatever its header says.
+        // One element per column and Gaussian block. A file without frames has no tile, whatever its header says.
         let mut constants: Vec<Option<TileRecord>> =
             vec![None; layout.tiles_per_frame_block().min(self.tiles) as usize];
         let mut end = 0;
@@ -114,7 +115,8 @@ impl Index {
         Ok((varies, in_order))
     }
 
-    /// Checks that no two tiles use the same bytes of the file, except constant tiles that share all of them.
+    /// Checks that no two tiles use the same bytes of the file, except constant tiles (all frames equal) that share all
+    /// of them.
     fn check_overlap(&self, tiles: &[TileRecord]) -> std::result::Result<(), Fault> {
         let mut order: Vec<usize> = (0..tiles.len()).collect();
         order.sort_unstable_by_key(|&i| (tiles[i].offset, i));
@@ -134,7 +136,7 @@ impl Index {
     }
 }
 
-/// Checks that `needed` bytes of memory for the index at `offset` are at most `memory`.
+/// Checks that `needed` bytes of memory, for the index at `offset` in the file, are at most `memory`.
 pub(crate) fn check_memory(offset: u64, needed: u64, memory: u64) -> std::result::Result<(), Fault> {
     if needed <= memory {
         return Ok(());
@@ -149,9 +151,9 @@ mod tests {
     use super::*;
     use crate::{ColumnSpec, Compression, Reader, TileId, Writer, encode_tile};
 
-    /// Writes a container of 2 blocks of 2 Gaussians and 3 frame blocks, the frame blocks in the order `order`, and
-    /// opens it. Column 0 moves in every frame block. Column 1 is constant in the first and last frame block, with the
-    /// same values, and moves in the middle one.
+    /// Writes a container of 2 blocks of 2 Gaussians and 3 frame blocks, and opens it. `order` is the order in which
+    /// the frame blocks are written. Column 0 varies in every frame block. Column 1 is constant in the first and the
+    /// last frame block, with the same values, and varies in the middle one.
     fn open(path: &std::path::Path, order: [u32; 3]) -> Reader {
         let columns =
             ["moving", "pausing"].map(|name| ColumnSpec { name: name.into(), width: 1, max_error: 0.0 }).into();

@@ -1,5 +1,5 @@
-//! Shape of a container (Gaussians, columns, division into tiles) and its encoding in the file header (SPEC.md,
-//! "Header").
+//! Shape of a container (number of Gaussians, columns, division into tiles) and its encoding in the file header
+//! (SPEC.md, "Header").
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -10,18 +10,18 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::bounded::BOUNDS;
 use crate::error::{Error, Fault, Result, quoted};
 
-/// First bytes of every container. They include a byte above 127, a line ending and a control byte, so that transfers
-/// that rewrite text damage them visibly.
+/// First bytes of every container. A byte above 127, a line ending and a control byte are among them, so that a
+/// transfer that changes text files damages them visibly.
 pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
-/// Format versions that this crate writes: version 1 if no column has a bound, version 2 if one has.
+/// Format versions that this crate writes: 1 if no column has an error bound, 2 if one has.
 pub(crate) const VERSIONS: [u32; 2] = [1, 2];
-/// Bytes before the first column: magic, version, header length, Gaussians, the two block lengths and the counts of
-/// columns and attributes.
+/// Length in bytes of the header before the first column: magic, version, header length, number of Gaussians, the two
+/// block lengths, and the numbers of columns and attributes.
 pub(crate) const FIXED_HEADER_BYTES: usize = 40;
 
-/// Largest decoded size of one tile, in bytes (256 MiB). A reader never allocates more for a tile.
+/// Maximum decoded size of one tile, in bytes (256 MiB). A reader never allocates more for a tile.
 pub const MAX_TILE_BYTES: u64 = 1 << 28;
-/// Maximum length of a header in bytes; bounds the allocation for a forged length.
+/// Maximum length of a header, in bytes. It limits what a reader allocates for a forged header length.
 pub(crate) const MAX_HEADER_BYTES: usize = 1 << 22;
 const MAX_GAUSSIANS: u64 = 1 << 32;
 const MAX_FRAME_BLOCK: u32 = 1 << 24;
@@ -30,44 +30,46 @@ const MAX_NAME_BYTES: usize = 64;
 const MAX_ATTRIBUTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 256;
 const MAX_VALUE_BYTES: usize = 1 << 20;
-/// Maximum number of tiles per frame block. Bounds the table of last constant tiles in readers and writers.
+/// Maximum number of tiles per frame block. It limits the memory in which readers and writers keep the last constant
+/// tile of each column and Gaussian block.
 const MAX_TILES_PER_FRAME_BLOCK: u64 = 1 << 24;
 
-/// Name, width and error bound of one column (an attribute of all Gaussians).
+/// Name, width and error bound of one column (an attribute of all Gaussians at all frames).
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColumnSpec {
     /// Name: `[a-z][a-z0-9_]*`, at most 64 bytes, unique in its container. SPEC.md lists well-known names.
     pub name: String,
-    /// Number of f32 components per Gaussian, at least 1.
+    /// Number of f32 components per Gaussian and frame, at least 1.
     pub width: u32,
-    /// Maximum absolute difference between a stored and an original value, in the unit of the column; 0: values are
-    /// stored exactly.
+    /// Maximum absolute difference between a stored and an original value, in the unit of the column's values; 0:
+    /// values are stored exactly.
     pub max_error: f64,
 }
 
-/// Shape of a container without the number of frames, which may not be known when writing begins.
+/// Shape of a container, except for the number of frames, which may be unknown when writing begins.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
-    /// N, number of Gaussians in every frame; 0 to 2³².
+    /// Number N of Gaussians in every frame; 0 to 2³².
     pub gaussians: u64,
-    /// Gaussians per tile, at least 1; the last block may be shorter.
+    /// Number of Gaussians per tile, at least 1; the last block of Gaussians may be shorter.
     pub gaussian_block: u32,
-    /// Frames per tile, 1 to 2²⁴; the last block may be shorter.
+    /// Number of frames per tile, 1 to 2²⁴; the last block of frames may be shorter.
     pub frame_block: u32,
-    /// Columns, 1 to 256. A full tile of the widest column must fit [`MAX_TILE_BYTES`].
+    /// Columns of the container, 1 to 256. A full tile of the widest column must fit [`MAX_TILE_BYTES`].
     pub columns: Vec<ColumnSpec>,
-    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB, 4 MiB in total.
+    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB each, 4 MiB in total.
     pub attributes: BTreeMap<String, String>,
 }
 
-/// Address of a tile: a column, a block of Gaussians and a block of frames.
+/// Address of a tile, which contains the values of one column for a block of Gaussians and a block of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TileId {
-    /// Index into [`Layout::columns`].
+    /// Column of the tile, as an index into [`Layout::columns`].
     pub column: u32,
-    /// Number of the Gaussian block; its first Gaussian is `gaussian_block · Layout::gaussian_block`.
+    /// Number of the tile's Gaussian block. The first Gaussian of the block is `gaussian_block ·
+    /// Layout::gaussian_block`.
     pub gaussian_block: u32,
-    /// Number of the frame block; its first frame is `frame_block · Layout::frame_block`.
+    /// Number of the tile's frame block. The first frame of the block is `frame_block · Layout::frame_block`.
     pub frame_block: u32,
 }
 
@@ -79,12 +81,12 @@ impl fmt::Display for TileId {
 }
 
 impl Layout {
-    /// Returns the index of the column called `name` in [`Layout::columns`], or `None`.
+    /// Returns the index in [`Layout::columns`] of the column called `name`, or `None` if there is none.
     pub fn column(&self, name: &str) -> Option<u32> {
         self.columns.iter().position(|column| column.name == name).map(|at| at as u32)
     }
 
-    /// Returns the number of Gaussian blocks; 0 without Gaussians.
+    /// Returns the number of blocks into which the Gaussians are divided; 0 without Gaussians.
     ///
     /// # Panics
     /// Panics if `gaussian_block` is 0, which no container has.
@@ -93,38 +95,39 @@ impl Layout {
         self.gaussians.div_ceil(u64::from(self.gaussian_block)) as u32
     }
 
-    /// Returns the range of Gaussians of a block; empty for blocks beyond the last.
+    /// Returns the range of Gaussians in Gaussian block `block`; empty for blocks beyond the last.
     pub fn gaussian_range(&self, block: u32) -> Range<u64> {
         let start = u64::from(block) * u64::from(self.gaussian_block);
         start.min(self.gaussians)..(start + u64::from(self.gaussian_block)).min(self.gaussians)
     }
 
-    /// Returns the range of frames of a block in a sequence of `frames` frames; empty for blocks beyond the last.
+    /// Returns the range of frames in frame block `block` of a sequence of `frames` frames; empty for blocks beyond the
+    /// last.
     pub fn frame_range(&self, block: u32, frames: u64) -> Range<u64> {
         let start = u64::from(block) * u64::from(self.frame_block);
         start.min(frames)..(start + u64::from(self.frame_block)).min(frames)
     }
 
-    /// Returns the number of Gaussians in a block.
+    /// Returns the number of Gaussians in Gaussian block `block`.
     pub(crate) fn block_len(&self, block: u32) -> u32 {
         let range = self.gaussian_range(block);
         (range.end - range.start) as u32
     }
 
-    /// Returns the decoded size in bytes of the largest tile of a sequence of `frames` frames.
+    /// Returns the size in bytes of the largest tile, decoded, of a sequence of `frames` frames.
     pub(crate) fn largest_tile(&self, frames: u64) -> u64 {
         let widest = self.columns.iter().map(|column| column.width).max().unwrap_or(0);
         let gaussians = self.gaussians.min(self.gaussian_block.into());
         4 * u64::from(widest) * gaussians * frames.min(self.frame_block.into())
     }
 
-    /// Returns the number of tiles per frame block.
+    /// Returns the number of tiles per frame block: columns times Gaussian blocks.
     pub(crate) fn tiles_per_frame_block(&self) -> u64 {
         self.columns.len() as u64 * u64::from(self.gaussian_blocks())
     }
 
-    /// Returns the position of a tile in the index, or `None` if there is no such column or Gaussian block. The index
-    /// is ordered by frame block, then Gaussian block, then column.
+    /// Returns the position of the tile `id` in the index (table of tiles), or `None` if there is no such column or
+    /// Gaussian block. The index is in the order of frame block, then Gaussian block, then column.
     pub(crate) fn index_of(&self, id: TileId) -> Option<u64> {
         if id.column as usize >= self.columns.len() || id.gaussian_block >= self.gaussian_blocks() {
             return None;
@@ -133,7 +136,7 @@ impl Layout {
         Some(u64::from(id.frame_block) * self.tiles_per_frame_block() + within)
     }
 
-    /// Returns the tile at a position of the index. Inverse of [`Layout::index_of`].
+    /// Returns the tile at position `index` of the index (table of tiles). Inverse of [`Layout::index_of`].
     pub(crate) fn tile_at(&self, index: u64) -> TileId {
         let columns = self.columns.len() as u64;
         TileId {
@@ -143,7 +146,8 @@ impl Layout {
         }
     }
 
-    /// Checks every limit. The error message names the first one that is broken.
+    /// Checks that the layout is within all limits of the format. The error message names the first one that is
+    /// exceeded.
     pub(crate) fn check(&self) -> std::result::Result<(), String> {
         let within = |what: &str, value: u64, range: std::ops::RangeInclusive<u64>| {
             if range.contains(&value) {
@@ -188,12 +192,12 @@ impl Layout {
         within("bytes in the header", self.header_len() as u64, 0..=MAX_HEADER_BYTES as u64)
     }
 
-    /// Returns the format version of a file with this layout.
+    /// Returns the format version of a file with this layout: 1, or 2 if a column has an error bound.
     fn version(&self) -> u32 {
         VERSIONS[usize::from(self.columns.iter().any(|column| column.max_error != 0.0))]
     }
 
-    /// Returns the length in bytes of the header, checksum included.
+    /// Returns the length of the header in bytes, including its checksum.
     fn header_len(&self) -> usize {
         let fields = if self.version() == VERSIONS[0] { 6 } else { 14 };
         let columns: usize = self.columns.iter().map(|column| fields + column.name.len()).sum();
@@ -201,8 +205,8 @@ impl Layout {
         FIXED_HEADER_BYTES + columns + attributes + 8
     }
 
-    /// Encodes the header of a file with this layout, without the zeros that pad it to 64 bytes. Fails if a limit is
-    /// broken.
+    /// Encodes the header of a file with this layout, without the zeros that pad it to a multiple of 64 bytes. Fails if
+    /// the layout exceeds a limit of the format.
     pub(crate) fn to_header(&self) -> Result<Vec<u8>> {
         self.check().map_err(|limit| Error::usage(format!("a container's layout must have {limit}")))?;
         let mut out = Vec::with_capacity(self.header_len());
@@ -234,8 +238,8 @@ impl Layout {
         Ok(out)
     }
 
-    /// Reads the length in bytes of the header that begins with `fixed`. Fails for another magic, version or an illegal
-    /// length.
+    /// Returns the length in bytes of the whole header, read from `fixed`, the first bytes of the file. Fails if the
+    /// magic or the version is another, or if the length is not allowed.
     pub(crate) fn header_len_from(fixed: &[u8; FIXED_HEADER_BYTES]) -> std::result::Result<usize, Fault> {
         let mut fields = Fields { bytes: fixed, at: 0 };
         let magic = fields.take(8)?;
@@ -259,7 +263,7 @@ impl Layout {
         Ok(len)
     }
 
-    /// Decodes a whole header and checks its checksum and every limit.
+    /// Decodes a whole header, and checks its checksum and all limits of the format.
     pub(crate) fn from_header(bytes: &[u8]) -> std::result::Result<Layout, Fault> {
         let body = bytes.len().saturating_sub(8);
         let mut fields = Fields { bytes, at: body };
@@ -316,21 +320,21 @@ impl Layout {
     }
 }
 
-/// Returns whether `name` is 1 to 64 bytes of the form `[a-z][a-z0-9_]*`.
+/// Returns whether `name` is allowed as the name of a column: 1 to 64 bytes of the form `[a-z][a-z0-9_]*`.
 fn is_column_name(name: &str) -> bool {
     name.len() <= MAX_NAME_BYTES
         && name.starts_with(|c: char| c.is_ascii_lowercase())
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_')
 }
 
-/// Cursor over the little-endian fields of a slice whose first byte is byte 0 of the file.
+/// Reads the little-endian fields of a header one after the other. The first byte of the slice is byte 0 of the file.
 struct Fields<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
 impl<'a> Fields<'a> {
-    /// Returns the next `len` bytes. Fails if fewer are left.
+    /// Returns the next `len` bytes of the header. Fails if fewer are left.
     fn take(&mut self, len: usize) -> std::result::Result<&'a [u8], Fault> {
         let left = self.bytes.len() - self.at;
         if len > left {
@@ -359,7 +363,7 @@ impl<'a> Fields<'a> {
         self.array().map(u64::from_le_bytes)
     }
 
-    /// Returns the next `len` bytes as text. Fails if they are not UTF-8.
+    /// Returns the next `len` bytes of the header as text. Fails if they are not UTF-8.
     fn text(&mut self, len: usize) -> std::result::Result<String, Fault> {
         let start = self.at as u64;
         let bytes = self.take(len)?;

@@ -1,10 +1,11 @@
 //! `gseq`: a chunked, memory-mapped container for sequences of Gaussians.
 //!
-//! A container holds N Gaussians × T frames in *columns* of f32 (a name and a number of components per Gaussian), a
-//! time stamp per frame, and string attributes. It is cut into *tiles*, one per (column, Gaussian block, frame block).
-//! Inside a tile the values lie as `[frame][component][gaussian]`, so that every (frame, component) plane is one
-//! contiguous slice. Values are read back with exactly the bits that were written, NaN payloads and −0 included. In
-//! columns with a bound ([`ColumnSpec::max_error`]) a value may differ by at most that bound.
+//! A container holds N Gaussians × T frames in *columns* of f32 (each has a name and a number of components per
+//! Gaussian), a time stamp per frame, and text attributes. It is divided into *tiles*, one per (column, block of
+//! Gaussians, block of frames). Within a tile, values are laid out as `[frame][component][gaussian]`, so that every
+//! (frame, component) plane is one contiguous slice. Values are read back with exactly the bits that were written, NaN
+//! payloads and −0 included. In columns with an error bound ([`ColumnSpec::max_error`]) a value may differ by at most
+//! this bound.
 //!
 //! ```
 //! # fn main() -> Result<(), gseq::Error> {
@@ -33,7 +34,8 @@
 //! # }
 //! ```
 //!
-//! The bytes are specified in `SPEC.md`. [`recover`] saves the complete frame blocks of a file whose writer was killed.
+//! The bytes of a container are specified in `SPEC.md`. [`recover`] saves the complete frame blocks of a file whose
+//! writer was killed.
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
 

@@ -1,4 +1,4 @@
-//! Reader of finished containers. Any number of threads may share one.
+//! Reader of finished containers. Any number of threads may use one reader together.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -19,14 +19,15 @@ mod tile_frames;
 
 pub use tile_frames::{TileFrames, TouchedPages};
 
-/// Maximum distance in bytes between tiles whose pages are prefetched or released in one call.
+/// If the bytes of two tiles are at most this far apart in the file, their pages are prefetched or released in one
+/// call.
 const MERGE_GAP_BYTES: u64 = 1 << 12;
 
-/// Open container.
+/// Open container, from which tiles are read.
 ///
 /// Memory: 8 bytes per frame and 1 byte per tile; while opening also about 80 bytes per column and Gaussian block. The
-/// index and the values stay on disk. If the tiles do not lie in the order of the index (a writer places them as they
-/// are written), opening takes 80 bytes per tile.
+/// index (table of tiles) and the values stay on disk. If the tiles do not lie in the order of the index (a writer
+/// places them in the order of writing), opening takes 80 bytes per tile.
 ///
 /// See [`Reader::tile`] for the behavior when the file changes while it is open.
 pub struct Reader {
@@ -35,35 +36,36 @@ pub struct Reader {
     pub(crate) times: Vec<f64>,
     pub(crate) index: Index,
     pub(crate) footer_offset: u64,
-    /// For every column whether its values differ between frames.
+    /// For every column, whether its values differ between frames.
     varies: Vec<bool>,
-    /// For every tile whether its bytes in the map have matched their checksum.
+    /// For every tile, whether its bytes in the memory map have been found to match their checksum.
     verified: Vec<AtomicBool>,
     digest: u64,
     read_bytes: AtomicU64,
     read_tiles: AtomicU64,
 }
 
-/// Reusable buffer for reading and decoding tiles. Grows to three times the size of the largest decoded tile.
+/// Buffer for reading and decoding tiles, which can be used again for the next tile. Grows to three times the size of
+/// the largest decoded tile.
 #[derive(Default)]
 pub struct TileBuffer {
     stored: Vec<u8>,
     decoder: TileDecoder,
     values: Vec<f32>,
-    /// zstd decoder, created when the first compressed tile is read.
+    /// Decompressor of zstd frames, created when the first compressed tile is read.
     zstd: Option<Decompressor<'static>>,
 }
 
-/// Amount of tile data that was read from a container.
+/// How much tile data a reader has read so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileReadCounts {
-    /// Stored bytes of the tiles that were read.
+    /// Number of bytes of stored tile data that were read from the file.
     pub bytes: u64,
-    /// Number of tiles that were decoded or, if raw, loaded.
+    /// Number of tiles that were decoded or, if they are raw (plain f32), loaded.
     pub tiles: u64,
 }
 
-/// Values of one tile.
+/// Values of one tile: one column for a block of Gaussians and a block of frames.
 #[derive(Debug, Clone, Copy)]
 pub struct Tile<'a> {
     values: &'a [f32],
@@ -73,28 +75,28 @@ pub struct Tile<'a> {
     constant: bool,
 }
 
-/// Index entry of a tile.
+/// Entry of a tile in the index (table of tiles) of a container.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileInfo {
-    /// Encoding of the stored bytes.
+    /// How the stored bytes encode the tile's values.
     pub encoding: Encoding,
-    /// Whether all frames are equal, so that only one is stored.
+    /// Whether all frames of the tile are equal, so that only one is stored.
     pub constant: bool,
-    /// Number of frames the tile covers.
+    /// Number of frames of the tile, also if only one is stored.
     pub frames: u32,
-    /// Offset of the stored bytes in the file. Constant tiles of other frame blocks may share them.
+    /// Offset of the tile's stored bytes in the file. Constant tiles of other frame blocks may share these bytes.
     pub offset: u64,
-    /// Length of the stored bytes.
+    /// Number of the tile's stored bytes.
     pub stored_bytes: u64,
-    /// xxh3-64 of the stored bytes.
+    /// Checksum (xxh3-64) of the tile's stored bytes.
     pub checksum: u64,
-    /// Minimum, maximum and number of non-finite values.
+    /// Minimum, maximum and number of non-finite values of the tile.
     pub stats: Stats,
 }
 
 impl<'a> Tile<'a> {
-    /// Returns component `component` of every Gaussian of the block at frame `frame` of the tile. A constant tile
-    /// returns the same plane for every frame.
+    /// Returns the values of component `component` for all Gaussians of the tile at its frame `frame`, counted from 0.
+    /// A constant tile (all frames equal) returns the same values for every frame.
     ///
     /// # Panics
     /// Panics if the tile has no such frame or component.
@@ -104,48 +106,50 @@ impl<'a> Tile<'a> {
         &self.values[(frame * self.width + component) * self.len..][..self.len]
     }
 
-    /// Returns all stored values as `[frame][component][gaussian]`; only one frame for a constant tile.
+    /// Returns all stored values of the tile, laid out as `[frame][component][gaussian]`; only one frame if all are
+    /// equal.
     pub fn values(&self) -> &'a [f32] {
         self.values
     }
 
-    /// Returns the number of frames the tile covers, also for a constant tile.
+    /// Returns the number of frames of the tile, even if only one is stored.
     pub fn frames(&self) -> usize {
         self.frames
     }
 
-    /// Returns the number of components per Gaussian.
+    /// Returns the number of values (components) that the tile has per Gaussian and frame.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Returns the number of Gaussians; never 0.
+    /// Returns the number of Gaussians in the tile; never 0.
     #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Returns whether one frame is stored for all.
+    /// Returns whether all frames of the tile are equal, so that only one is stored.
     pub fn is_constant(&self) -> bool {
         self.constant
     }
 }
 
 impl Reader {
-    /// Opens a container and checks its header, footer and index: every length and offset is within its limits, and no
-    /// two tiles overlap. The tiles themselves are checked when they are read, or by [`Reader::verify`].
+    /// Opens a container and checks its header, footer and index (table of tiles): every length and offset is within
+    /// its limits, and no two tiles overlap. The tiles themselves are checked when they are read, or by
+    /// [`Reader::verify`].
     pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
         Self::open_within(path, u64::MAX)
     }
 
-    /// Opens a container like [`Reader::open`], with at most `memory` bytes for the time stamps and the table of tiles.
-    /// Fails if the container needs more.
+    /// Opens a container like [`Reader::open`], with at most `memory` bytes of memory for the time stamps and the data
+    /// kept per tile. Fails if the container needs more.
     pub fn open_within(path: impl AsRef<Path>, memory: u64) -> Result<Reader> {
         let file = MappedFile::open(path.as_ref())?;
         Self::read(file, memory)
     }
 
-    /// Reads and checks header, trailer, footer and index.
+    /// Reads and checks the header, trailer, footer and index of the container `file`.
     fn read(file: MappedFile, memory: u64) -> Result<Reader> {
         let fault = |fault: Fault| fault.at(file.path());
         let (layout, header) = read_header(&file)?;
@@ -177,7 +181,8 @@ impl Reader {
         };
         let start = footer_offset + RECORD_BYTES;
         check_footer(&footer, &layout, &header, footer_offset, trailer_offset - start).map_err(fault)?;
-        // A time stamp per frame, a flag per tile, and the last constant tile of each column and Gaussian block.
+        // Memory for a time stamp per frame, a flag per tile, and the last constant tile of each column and Gaussian
+        // block.
         let slots = layout.tiles_per_frame_block().min(footer.tiles);
         let needed = footer.frames.saturating_mul(8) + footer.tiles + slots * size_of::<Option<TileRecord>>() as u64;
         check_memory(footer_offset, needed, memory).map_err(fault)?;
@@ -224,12 +229,12 @@ impl Reader {
         })
     }
 
-    /// Returns the shape of the container.
+    /// Returns the shape of the container: number of Gaussians, columns and block lengths.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// Returns the time stamp of every frame, strictly increasing.
+    /// Returns the time stamps of all frames, which strictly increase.
     pub fn times(&self) -> &[f64] {
         &self.times
     }
@@ -239,13 +244,13 @@ impl Reader {
         self.times.len()
     }
 
-    /// Returns the number of frame blocks.
+    /// Returns the number of blocks into which the frames are divided.
     pub fn frame_blocks(&self) -> u32 {
         self.times.len().div_ceil(self.layout.frame_block as usize) as u32
     }
 
-    /// Returns whether the values of a column differ between frames. Uses the index only: the values do not differ if
-    /// all tiles are constant and share their stored bytes.
+    /// Returns whether the values of a column differ between frames. Decided by the index alone: they do not differ if
+    /// all tiles of the column are constant and share their stored bytes.
     ///
     /// # Panics
     /// Panics if there is no such column.
@@ -253,13 +258,13 @@ impl Reader {
         self.varies[column as usize]
     }
 
-    /// Returns a hash of the content: header, time stamps, and checksums and statistics of every tile. Containers with
-    /// the same content, layout and compression have the same digest, in whatever order their tiles were written.
+    /// Returns a hash of the content: header, time stamps, and checksums and statistics of all tiles. Containers with
+    /// the same content, layout and compression have the same hash, in whatever order their tiles were written.
     pub fn digest(&self) -> u64 {
         self.digest
     }
 
-    /// Reads the index entry of a tile. Fails if there is no such tile.
+    /// Reads the entry of a tile in the index. Fails if there is no such tile.
     pub fn tile_info(&self, at: TileId) -> Result<TileInfo> {
         let (_, tile) = self.record(at)?;
         Ok(TileInfo {
@@ -273,19 +278,21 @@ impl Reader {
         })
     }
 
-    /// Returns the values of a tile: in place from the map if it is stored raw, otherwise decoded into `buffer`.
+    /// Returns the values of a tile: as a slice of the memory map if the tile is raw (plain f32), otherwise decoded
+    /// into `buffer`.
     ///
-    /// Verifies the checksum; for a tile in place only the first time. If the file shrank before this call, the call
-    /// fails. If it shrinks while the slice of a raw tile is in use, the system may end the process; if it is rewritten
-    /// in place, the slice shows the new bytes. Use [`Reader::read_tile`] for files that other processes may change
-    /// this way.
+    /// Checks the checksum of the stored bytes; for a raw tile only the first time. If the file shrank before this
+    /// call, the call fails. If it shrinks while the slice of a raw tile is in use, the operating system may end the
+    /// process; if it is rewritten in place, the slice shows the new bytes. Use [`Reader::read_tile`] for files that
+    /// other processes may change this way.
     pub fn tile<'a>(&'a self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         let (index, tile) = self.record(at)?;
         if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
             self.verify_in_place(index, &tile, bytes)?;
             self.count(1, bytes.len());
-            // Offsets are multiples of 64 and the map starts at a page, so the bytes are aligned.
+            // Stored bytes start at multiples of 64 and the memory map starts at a page, so the bytes are aligned for
+            // f32.
             if let Ok(values) = bytemuck::try_cast_slice(bytes) {
                 return Ok(self.tile_view(&tile, values));
             }
@@ -293,14 +300,14 @@ impl Reader {
         self.read_record(&tile, buffer)
     }
 
-    /// Returns the values of a tile, always read by system calls into `buffer` and verified. The map is not touched: a
-    /// file that is cut short at any moment causes an error and nothing worse.
+    /// Returns the values of a tile. They are read by system calls into `buffer`, never through the memory map, and
+    /// checked against the checksum. A file that is cut short at any moment thus causes an error and nothing worse.
     pub fn read_tile<'a>(&self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         self.read_record(&self.record(at)?.1, buffer)
     }
 
-    /// Returns how much tile data was read so far, by all threads. Bytes count each time they are read; of a raw tile
-    /// that was verified before, only the frames that are read count.
+    /// Returns how much tile data has been read so far, by all threads. Bytes count each time they are read. Of a raw
+    /// tile (plain f32) whose checksum was checked before, only the frames that are read count.
     pub fn tiles_read(&self) -> TileReadCounts {
         TileReadCounts {
             bytes: self.read_bytes.load(Ordering::Relaxed),
@@ -308,13 +315,13 @@ impl Reader {
         }
     }
 
-    /// Tells the system that tiles will be read soon, so that it reads them from disk during other work. Takes no
-    /// memory of this process. Read errors are ignored here; they appear when the tiles are read.
+    /// Tells the operating system that the stored bytes of tiles will be read soon, so that it reads them from disk
+    /// meanwhile. Takes no memory of this process. Read errors are ignored here; they appear when the tiles are read.
     pub fn expect(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut pending = 0..0;
         for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
             let end = tile.offset + u64::from(tile.stored_bytes);
-            // The columns of a block lie side by side with a record between them.
+            // The columns of a block lie side by side in the file, with a record between them.
             if tile.offset < pending.end || tile.offset - pending.end > MERGE_GAP_BYTES {
                 self.file.will_need(pending);
                 pending = tile.offset..end;
@@ -324,8 +331,9 @@ impl Reader {
         self.file.will_need(pending);
     }
 
-    /// Reads the stored bytes of tiles from disk into the page cache and waits for them, so that decoding threads do
-    /// not wait. Takes a small buffer. Read errors are ignored here; they appear when the tiles are read.
+    /// Reads the stored bytes of tiles from disk into the page cache of the operating system and waits for them, so
+    /// that threads that decode these tiles need not wait. Takes a small buffer. Read errors are ignored here; they
+    /// appear when the tiles are read.
     pub fn fetch(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut chunk = Vec::new();
         for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
@@ -333,12 +341,12 @@ impl Reader {
         }
     }
 
-    /// Estimates whether the file is in the page cache of the system, from `samples` evenly spaced offsets; `None` if
-    /// the system does not tell.
+    /// Estimates whether the whole file is in the page cache of the operating system, from `samples` evenly spaced
+    /// offsets; `None` if the operating system does not tell.
     pub fn is_cached(&self, samples: u64) -> Option<bool> {
         let step = (self.file.len() / samples.max(1)).max(1);
         let mut places = (0..self.file.len()).step_by(step as usize).map(|offset| self.file.is_cached(offset));
-        // 90% is enough: a few dropped pages cost less than switching to another method of reading.
+        // 90% of the offsets suffice: a few pages that must be read again cost less than another method of reading.
         let (mut cached, mut all) = (0, 0);
         places.try_for_each(|found| {
             cached += u64::from(found?);
@@ -348,17 +356,17 @@ impl Reader {
         Some(10 * cached >= 9 * all)
     }
 
-    /// Adds to the counters of [`Reader::tiles_read`].
+    /// Adds `tiles` tiles and `bytes` bytes to the counts of [`Reader::tiles_read`].
     fn count(&self, tiles: u64, bytes: usize) {
-        // Relaxed: the sums are read only after the reading is done.
+        // Relaxed ordering suffices: the sums are read only after the reading is done.
         self.read_tiles.fetch_add(tiles, Ordering::Relaxed);
         self.read_bytes.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Verifies the checksum of a raw tile in the map, unless that was done before. Returns whether it was verified
+    /// Checks the checksum of a raw tile in the memory map, unless this was done before. Returns whether it was checked
     /// now.
     fn verify_in_place(&self, index: usize, tile: &TileRecord, bytes: &[u8]) -> Result<bool> {
-        // Relaxed: the flag only saves repeated work.
+        // Relaxed ordering suffices: the flag only saves repeated work.
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(false);
         }
@@ -367,7 +375,7 @@ impl Reader {
         Ok(true)
     }
 
-    /// Returns the position of a tile in the index and its entry. Fails if there is no such tile.
+    /// Returns a tile's position in the index (table of tiles) and its entry there. Fails if there is no such tile.
     fn record(&self, at: TileId) -> Result<(usize, TileRecord)> {
         let index = self.layout.index_of(at).filter(|&index| index < self.index.tiles).ok_or_else(|| {
             let frames = self.frames();
@@ -379,14 +387,14 @@ impl Reader {
         Ok((index as usize, self.index.record(&self.file, &self.layout, index)?))
     }
 
-    /// Reads and decodes the tile of an index entry into `buffer` and counts it.
+    /// Reads and decodes the tile of the index entry `tile` into `buffer`, and counts it as read.
     fn read_record<'a>(&self, tile: &TileRecord, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         read_tile(&self.file, &self.layout, tile, buffer)?;
         self.count(1, tile.stored_bytes as usize);
         Ok(self.tile_view(tile, &buffer.values))
     }
 
-    /// Builds the view of a tile with these stored values.
+    /// Returns the tile of the index entry `tile`, whose stored values are `values`.
     fn tile_view<'a>(&self, tile: &TileRecord, values: &'a [f32]) -> Tile<'a> {
         Tile {
             values,
@@ -399,18 +407,19 @@ impl Reader {
 }
 
 impl TileBuffer {
-    /// Returns the values of the tile that was read last.
+    /// Returns the values of the tile that was read last into this buffer.
     pub(crate) fn values(&self) -> &[f32] {
         &self.values
     }
 
-    /// Returns the stored bytes of the tile that was read last.
+    /// Returns the stored bytes of the tile that was read last into this buffer.
     pub(crate) fn stored(&self) -> &[u8] {
         &self.stored
     }
 }
 
-/// Reads, verifies and decodes a tile whose record was checked.
+/// Reads a tile's stored bytes into `buffer`, checks their checksum and decodes them. The record `tile` must have been
+/// checked.
 pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, buffer: &mut TileBuffer) -> Result<()> {
     let TileBuffer { stored, decoder, values, zstd } = buffer;
     read_stored(file, tile, stored)?;
@@ -431,14 +440,14 @@ pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, b
     Ok(())
 }
 
-/// Reads and verifies the stored bytes of a tile.
+/// Reads the stored bytes of a tile into `stored` and checks their checksum.
 fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Result<()> {
     stored.resize(tile.stored_bytes as usize, 0);
     file.read_at(tile.offset, stored)?;
     check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
 }
 
-/// Decompresses the stored bytes of a tile that is not raw.
+/// Decompresses the stored bytes of a tile that is not raw, so that `decoder` can decode its frames.
 fn decompress(
     file: &MappedFile,
     layout: &Layout,
@@ -460,12 +469,12 @@ fn decompress(
         .map_err(|found| Fault::new(tile.offset, format!("{} bytes of {}", 4 * values, tile.id), found).at(file.path()))
 }
 
-/// Returns the number of values of a tile in one frame.
+/// Returns the number of values that a tile has per frame.
 fn plane_len(layout: &Layout, tile: &TileRecord) -> usize {
     layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize
 }
 
-/// Reads and checks the header. Returns the layout and the bytes of the header.
+/// Reads and checks the header of a file. Returns the layout that it describes, and its bytes.
 pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
     let fault = |fault: Fault| fault.at(file.path());
     let mut fixed = [0; FIXED_HEADER_BYTES];
@@ -476,7 +485,7 @@ pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
     Ok((Layout::from_header(&header).map_err(fault)?, header))
 }
 
-/// Checks the checksum `computed` over the stored bytes of a tile.
+/// Checks that `computed`, the checksum of the stored bytes of a tile, equals the checksum in the tile's record.
 fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fault> {
     if computed == tile.checksum {
         return Ok(());
@@ -485,8 +494,8 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
-/// Checks the footer at `offset` against the header, and its payload length against `payload_bytes`, the bytes before
-/// the trailer.
+/// Checks the footer at `offset` against the header. The footer's payload must have the length `payload_bytes`, which
+/// is the number of bytes between the footer record and the trailer.
 fn check_footer(
     footer: &FooterRecord,
     layout: &Layout,

@@ -1,5 +1,5 @@
 //! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes with a checksum of its
-//! own; a payload with another checksum may follow.
+//! own. A payload (the stored bytes of the record) with another checksum may follow.
 
 use std::fmt;
 
@@ -9,34 +9,35 @@ use crate::codec::{Encoding, Stats};
 use crate::error::Fault;
 use crate::layout::{Layout, TileId};
 
-/// Length in bytes of a record header, and alignment of records. Payloads are therefore 64-byte aligned in the file and
-/// in its map.
+/// Length in bytes of a record header. Records start at multiples of this length, so payloads are 64-byte aligned in
+/// the file and in its memory map.
 pub(crate) const RECORD_BYTES: u64 = 64;
-/// Length of the trailer in bytes.
+/// Length in bytes of the trailer, which ends a finished file.
 pub(crate) const TRAILER_BYTES: u64 = 32;
 /// Last bytes of every finished container.
 const END_MAGIC: [u8; 8] = *b"\x1aGSEQEND";
 
-/// Rounds `offset` up to the next offset where a record may start.
+/// Rounds `offset` up to the next offset at which a record may start.
 pub(crate) fn align(offset: u64) -> u64 {
     offset.next_multiple_of(RECORD_BYTES)
 }
 
-/// Record of one tile. The same 64 bytes lie before the payload and in the index.
+/// Record of one tile. The same 64 bytes lie before the tile's stored bytes and in the index (table of tiles).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TileRecord {
     pub(crate) id: TileId,
     pub(crate) frames: u32,
     pub(crate) encoding: Encoding,
     pub(crate) constant: bool,
-    /// Offset of the payload. A constant tile may share the payload of an earlier one.
+    /// Offset in the file of the tile's stored bytes. A constant tile (all frames equal) may share those of an earlier
+    /// one.
     pub(crate) offset: u64,
     pub(crate) stored_bytes: u32,
     pub(crate) checksum: u64,
     pub(crate) stats: Stats,
 }
 
-/// Record of the time stamps of one frame block.
+/// Record whose payload contains the time stamps of one frame block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TimesRecord {
     pub(crate) frame_block: u32,
@@ -44,13 +45,13 @@ pub(crate) struct TimesRecord {
     pub(crate) checksum: u64,
 }
 
-/// Record of all time stamps and the index of all tiles.
+/// Record whose payload contains all time stamps and the index of all tiles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct FooterRecord {
     pub(crate) frames: u64,
     pub(crate) tiles: u64,
     pub(crate) checksum: u64,
-    /// Checksum of the file header, so that a footer cannot be combined with another header.
+    /// Checksum of the file header, so that a footer cannot be used with another header.
     pub(crate) header_checksum: u64,
 }
 
@@ -72,14 +73,14 @@ impl fmt::Display for Record {
 }
 
 impl FooterRecord {
-    /// Returns the length of the payload in bytes (8 per frame and 64 per tile), or `None` if it overflows.
+    /// Returns the length in bytes of the footer's payload (8 per frame and 64 per tile), or `None` if it overflows.
     pub(crate) fn payload_bytes(&self) -> Option<u64> {
         self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD_BYTES)?)
     }
 }
 
 impl Record {
-    /// Encodes the record header with its checksum.
+    /// Encodes the record header, including its checksum.
     pub(crate) fn to_bytes(self) -> [u8; RECORD_BYTES as usize] {
         let mut out = [0; RECORD_BYTES as usize];
         match self {
@@ -121,8 +122,8 @@ impl Record {
         out
     }
 
-    /// Decodes the record header at `offset` and checks each field by itself. [`TileRecord::check`] checks a tile
-    /// against the layout.
+    /// Decodes the record header `bytes`, which lies at `offset` in the file, and checks each field by itself.
+    /// [`TileRecord::check`] checks the record of a tile against the layout.
     pub(crate) fn from_bytes(bytes: &[u8; RECORD_BYTES as usize], offset: u64) -> Result<Record, Fault> {
         let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         let u64_at = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
@@ -177,7 +178,7 @@ impl Record {
 }
 
 impl TileRecord {
-    /// Returns the number of f32 values in the payload; one frame for a constant tile.
+    /// Returns the number of f32 values that the tile stores: those of all frames, or of one frame if all are equal.
     pub(crate) fn value_count(&self, layout: &Layout) -> usize {
         let frames = if self.constant { 1 } else { self.frames as usize };
         frames
@@ -185,8 +186,8 @@ impl TileRecord {
             * layout.block_len(self.id.gaussian_block) as usize
     }
 
-    /// Checks the record at offset `place` against the layout: the tile exists, has a legal size, and its payload lies
-    /// within `payloads`.
+    /// Checks the record, which lies at `place` in the file, against the layout: the tile exists and has a legal size,
+    /// and its stored bytes lie within `payloads`.
     pub(crate) fn check(&self, layout: &Layout, payloads: std::ops::Range<u64>, place: u64) -> Result<(), Fault> {
         if layout.index_of(self.id).is_none() {
             return Err(Fault::new(place + 4, "a column and a Gaussian block of this container", self.id));
@@ -221,20 +222,20 @@ impl TileRecord {
         Ok(())
     }
 
-    /// Returns whether two tiles may share their stored bytes: constant tiles of the same column and Gaussian block
-    /// with equal fields, except frame block and number of frames.
+    /// Returns whether two tiles may share their stored bytes. They may if both are constant, of the same column and
+    /// Gaussian block, and have equal records except for the frame block and the number of frames.
     pub(crate) fn may_share(&self, other: &TileRecord) -> bool {
         let shared = |tile: &TileRecord| TileRecord { id: TileId { frame_block: 0, ..tile.id }, frames: 0, ..*tile };
         self.constant && shared(self).same_bits(&shared(other))
     }
 
-    /// Compares records by their encoded bytes, so that NaN and −0 compare as bits.
+    /// Returns whether two records have the same bytes when encoded, so that NaN and −0 are compared as bits.
     fn same_bits(&self, other: &TileRecord) -> bool {
         Record::Tile(*self).to_bytes() == Record::Tile(*other).to_bytes()
     }
 }
 
-/// Encodes the last bytes of a finished file: the offset of the footer, a checksum and the end magic.
+/// Encodes the last bytes of a finished file: the offset `footer` of the footer record, a checksum, and the end magic.
 pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER_BYTES as usize] {
     let mut out = [0; TRAILER_BYTES as usize];
     out[..8].copy_from_slice(&footer.to_le_bytes());
@@ -244,7 +245,7 @@ pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER_BYTES as usize] {
     out
 }
 
-/// Decodes the trailer at `offset` and returns the offset of the footer.
+/// Decodes the trailer, which lies at `offset` in the file, and returns the offset of the footer record.
 pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER_BYTES as usize], offset: u64) -> Result<u64, Fault> {
     let footer = u64::from_le_bytes(std::array::from_fn(|i| bytes[i]));
     if trailer_to_bytes(footer) != *bytes {
@@ -258,12 +259,12 @@ pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER_BYTES as usize], offset: u
     Ok(footer)
 }
 
-/// Hash that identifies the content of a container: header, time stamps, and every tile record in the order of the
-/// index, with offset 0, so that the order of writing does not matter.
+/// Hash (xxh3-64) that identifies the content of a container: header, time stamps, and the records of all tiles in the
+/// order of the index. The offset in the records counts as 0, so that the order of writing does not matter.
 pub(crate) struct Digest(Xxh3);
 
 impl Digest {
-    /// Starts the hash with the header and the time stamps.
+    /// Creates the hash of a header and the time stamps; tiles are added by [`Digest::tile`].
     pub(crate) fn new(header: &[u8], times: &[f64]) -> Self {
         let mut hash = Xxh3::new();
         hash.update(header);
@@ -271,12 +272,12 @@ impl Digest {
         Digest(hash)
     }
 
-    /// Adds the next tile in the order of the index.
+    /// Adds the next tile to the hash; tiles come in the order of the index.
     pub(crate) fn tile(&mut self, tile: &TileRecord) {
         self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
     }
 
-    /// Returns the hash of everything added so far.
+    /// Returns the hash of all that was added so far.
     pub(crate) fn value(&self) -> u64 {
         self.0.digest()
     }

@@ -1,4 +1,4 @@
-//! Recovery of the complete frame blocks of a container that was cut short, or damaged after its header.
+//! Recovery of the complete frame blocks of a container that was cut short, or that is damaged after its header.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,24 +15,25 @@ use crate::record::{RECORD_BYTES, Record, TileRecord, TimesRecord, align};
 use crate::verify::check_stats;
 use crate::writer::{Writer, check_times};
 
-/// Counts of what [`recover`] found and saved.
+/// Result of [`recover`]: numbers of frames, tiles and bytes that were found and saved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecoverReport {
     /// Number of frames in the new container.
     pub frames: u64,
-    /// Number of frames whose time stamps were found.
+    /// Number of frames whose time stamps were found in the damaged file.
     pub frames_seen: u64,
-    /// Number of intact tiles found.
+    /// Number of intact tiles that were found in the damaged file.
     pub tiles_seen: u64,
-    /// Number of tiles in the new container. The other tiles belong to an incomplete frame block or to one after it.
+    /// Number of tiles in the new container. The other intact tiles belong to an incomplete frame block or to one after
+    /// it.
     pub tiles_saved: u64,
-    /// Number of bytes that belong to no intact record.
+    /// Number of bytes of the damaged file that belong to no intact record.
     pub bytes_skipped: u64,
 }
 
-/// Writes a valid container `dst` with the frame blocks of `src` up to the first one that lacks its time stamps or a
-/// tile. Every value keeps its bits. After a damaged record the search continues at every multiple of 64 bytes. Memory:
-/// about 150 bytes per tile, the time stamps and one tile buffer.
+/// Writes a valid container `dst` with the frame blocks of the damaged container `src`, up to the first frame block
+/// that lacks its time stamps or a tile. Every value keeps its bits. After a damaged record, every multiple of 64 bytes
+/// is tried as the start of the next. Memory: about 150 bytes per tile, the time stamps, and one tile buffer.
 ///
 /// Fails if the header of `src` is damaged or `dst` cannot be written. If no frame can be saved, `dst` has no frames
 /// and the report says so; that is not an error.
@@ -40,7 +41,7 @@ pub fn recover(src: impl AsRef<Path>, dst: impl AsRef<Path>) -> Result<RecoverRe
     recover_within(src, dst, u64::MAX)
 }
 
-/// Recovers a container like [`recover`] with at most `memory` bytes. Fails also if the container needs more.
+/// Recovers a container like [`recover`], with at most `memory` bytes of memory. Also fails if more is needed.
 pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64) -> Result<RecoverReport> {
     let file = MappedFile::open(src.as_ref())?;
     let (layout, header) = read_header(&file)?;
@@ -80,7 +81,7 @@ pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64)
     Ok(report)
 }
 
-/// Wraps the stored bytes of a tile for the writer, without encoding it again.
+/// Returns a tile that is stored in a file as an encoded tile for the writer, without encoding it again.
 fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     let column = &layout.columns[tile.id.column as usize];
     EncodedTile {
@@ -96,19 +97,20 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     }
 }
 
-/// Intact records of a file: time stamps by frame block, tiles by their position in the index.
+/// Intact records that were found in a file: time stamps by frame block, and tiles by their position in the index.
 struct FoundRecords {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
-    /// Constant tiles with a payload of their own, by the offset of the payload.
+    /// Constant tiles (all frames equal) with stored bytes of their own, by the offset of these bytes.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
-    /// Bytes of all time stamps.
+    /// Number of bytes of all time stamps found (8 per frame).
     time_bytes: u64,
 }
 
-/// Reads record after record. After a damaged one it tries every multiple of 64. A record holds its own offset, so
-/// bytes inside a payload are not mistaken for a record.
+/// Finds the intact records of `file` from offset `start` on, one after the other. After a damaged record, it tries
+/// every multiple of 64 bytes. A record contains its own offset, so bytes inside a payload are not mistaken for a
+/// record.
 fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<FoundRecords> {
     let mut found = FoundRecords {
         times: HashMap::new(),
@@ -153,16 +155,16 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<F
 }
 
 impl FoundRecords {
-    /// Returns the memory in bytes of the records found so far, of their tables while they grow, and of decoding the
-    /// largest tile.
+    /// Returns the bytes of memory that the records found so far and the decoding of the largest tile take. Includes
+    /// the growth of the lists of records.
     fn bytes(&self, layout: &Layout) -> u64 {
         let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);
         let times = 2 * self.time_bytes + 64 * self.times.len() as u64;
         tiles as u64 + times + 3 * layout.largest_tile(u64::MAX)
     }
 
-    /// Stores the tile of the record at `position` if it is intact. Returns the length of the payload after the record:
-    /// 0 if the tile shares an earlier payload; `None` if it is damaged.
+    /// Adds the tile of the record at `position` if it is intact. Returns the number of stored bytes after the record,
+    /// which is 0 if the tile shares those of an earlier tile; `None` if the tile is damaged.
     fn add_tile(
         &mut self,
         file: &MappedFile,
@@ -181,8 +183,8 @@ impl FoundRecords {
                 self.constants.insert(tile.offset, *tile);
             }
         } else {
-            // The shared payload was decoded with its own record. A forged file of many records that share one large
-            // payload thus costs no more than its length.
+            // The shared bytes were decoded with the record before them. A forged file of many records that share the
+            // same bytes thus takes no longer than its length requires.
             self.constants.get(&tile.offset).filter(|owner| tile.may_share(owner))?;
         }
         self.tiles.entry(layout.index_of(tile.id)?).or_insert(*tile);
@@ -190,7 +192,8 @@ impl FoundRecords {
     }
 }
 
-/// Reads the time stamps of the record at `position` and checks them against its checksum and the layout.
+/// Reads the time stamps that follow the record at `position`, and checks them against the record's checksum and the
+/// layout.
 pub(crate) fn read_times(file: &MappedFile, layout: &Layout, times: &TimesRecord, position: u64) -> Result<Vec<f64>> {
     let fault = |fault: Fault| fault.at(file.path());
     if !(1..=layout.frame_block).contains(&times.frames) {

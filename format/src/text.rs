@@ -1,12 +1,13 @@
-//! Escapes text and paths from files and arguments, so that they cannot control a terminal when printed.
+//! Escapes text and paths that come from files and arguments, so that they cannot control a terminal when they are
+//! printed.
 
 use std::borrow::Cow;
 use std::ffi::OsStr;
 use std::fmt;
 use std::path::Path;
 
-/// Returns whether `c` moves the cursor, changes the direction of text or is invisible: control characters of both sets
-/// (C0 and C1), direction marks, zero-width characters, line separators, tags.
+/// Returns whether `c` moves the cursor, changes the direction of text, or is invisible: control characters of both
+/// sets (C0 and C1), direction marks, zero-width characters, line separators, tags.
 fn is_unprintable(c: char) -> bool {
     c.is_control()
         || matches!(c,
@@ -51,7 +52,7 @@ fn code(c: char) -> String {
     format!("<U+{:04X}>", c as u32)
 }
 
-/// Display of paths and file names in messages.
+/// Display of paths and file names in messages, with unprintable characters escaped.
 pub trait ShowPath {
     /// Returns the path for display: unprintable characters (line feeds too) are replaced by their codes, as in
     /// `<U+000A>`, and bytes that are not Unicode by U+FFFD.
@@ -70,7 +71,7 @@ impl ShowPath for OsStr {
     }
 }
 
-/// Wrapper of a path or file name that displays it escaped; see [`ShowPath`].
+/// A path or file name that displays with unprintable characters escaped; see [`ShowPath`].
 #[derive(Debug)]
 pub struct ShownPath<'a>(&'a OsStr);
 

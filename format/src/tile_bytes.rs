@@ -1,4 +1,4 @@
-//! Serialization of encoded tiles that are kept outside a container between encoding and writing.
+//! Serialization of encoded tiles that are kept outside a container until they are written.
 
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -7,13 +7,13 @@ use crate::error::{Error, Result};
 use crate::layout::TileId;
 use crate::record::{RECORD_BYTES, Record, TileRecord};
 
-/// Length in bytes of the fields before the stored bytes of the tile: a record with offset 0, then width, length and
-/// bound.
+/// Length in bytes of the fields before the stored bytes of a serialized tile: a record with offset 0, then width,
+/// number of Gaussians, and error bound.
 const HEAD_BYTES: usize = RECORD_BYTES as usize + 16;
 
 impl EncodedTile {
-    /// Serializes the tile for [`EncodedTile::from_bytes`] of the same version of this library. The layout is not part
-    /// of the file format.
+    /// Serializes the tile, to be restored by [`EncodedTile::from_bytes`] of the same version of this library. These
+    /// bytes are not a part of the file format.
     pub fn to_bytes(&self) -> Vec<u8> {
         let record = TileRecord {
             id: TileId { column: 0, gaussian_block: 0, frame_block: 0 },
@@ -34,7 +34,7 @@ impl EncodedTile {
         out
     }
 
-    /// Restores a tile from the output of [`EncodedTile::to_bytes`]. Fails if `bytes` were cut or changed.
+    /// Restores a tile that [`EncodedTile::to_bytes`] serialized. Fails if `bytes` were cut or changed.
     pub fn from_bytes(bytes: &[u8]) -> Result<EncodedTile> {
         let not_a_tile = || Error::usage(format!("{} bytes are not an encoded tile, or it was damaged", bytes.len()));
         let (record, rest) = bytes.split_first_chunk().ok_or_else(not_a_tile)?;

@@ -1,4 +1,4 @@
-//! Verification of every byte of a container, in the order of the file.
+//! Verification of every byte of a container, in the order of the bytes in the file.
 
 use std::collections::HashSet;
 
@@ -9,30 +9,30 @@ use crate::reader::{Reader, TileBuffer};
 use crate::record::{RECORD_BYTES, Record, TileRecord, TimesRecord, align};
 use crate::recover::read_times;
 
-/// Counts of what [`Reader::verify`] checked.
+/// Result of [`Reader::verify`]: numbers of frames, tiles and bytes that were checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct VerifyReport {
-    /// Number of frames of the sequence.
+    /// Number of frames of the container.
     pub frames: u64,
     /// Number of tiles of the container.
     pub tiles: u64,
-    /// Bytes of stored payloads; a shared payload counts once.
+    /// Number of stored bytes of all tiles; bytes that several tiles share count once.
     pub stored_bytes: u64,
-    /// Bytes of decoded values: one frame per constant tile; a shared payload counts once.
+    /// Number of bytes of decoded values. A constant tile (all frames equal) counts one frame; shared tiles count once.
     pub decoded_bytes: u64,
 }
 
 impl Reader {
-    /// Reads the whole file and checks everything that opening did not: every record equals its index entry, every tile
-    /// decodes to values with its checksum and statistics, and all bytes in between are zero. A file that passes has no
-    /// byte that could be changed unnoticed. Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant
-    /// tile.
+    /// Reads the whole file and checks all that opening did not: every record equals its entry in the index, the
+    /// stored bytes of every tile have the recorded checksum and decode to values with the recorded statistics, and all
+    /// bytes in between are zero. In a file that passes, no byte could be changed unnoticed. Memory: one
+    /// [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
     pub fn verify(&self) -> Result<VerifyReport> {
         self.verify_within(u64::MAX)
     }
 
-    /// Verifies the container like [`Reader::verify`], with at most `memory` bytes. Fails also if the container needs
-    /// more.
+    /// Verifies the container like [`Reader::verify`], with at most `memory` bytes of memory. Also fails if more is
+    /// needed.
     pub fn verify_within(&self, memory: u64) -> Result<VerifyReport> {
         let fault = |fault: Fault| fault.at(self.file.path());
         let tile = self.layout.largest_tile(self.times.len() as u64);
@@ -41,8 +41,8 @@ impl Reader {
         let mut buffer = TileBuffer::default();
         let mut seen = vec![false; self.index.tiles as usize];
         let mut blocks_seen = 0;
-        // Payloads of constant tiles that were met. Opening has checked that tiles with the same payload agree in all
-        // other fields.
+        // Offsets of the stored bytes of constant tiles met so far. Opening has checked that tiles with the same stored
+        // bytes agree in all other fields of their records.
         let mut own_payloads = HashSet::new();
         let (_, header) = crate::reader::read_header(&self.file)?;
         let mut position = self.skip_padding(header.len() as u64)?;
@@ -98,7 +98,8 @@ impl Reader {
         Ok(report)
     }
 
-    /// Checks that the record at `position` holds the time stamps of frame block `block` as given in the footer.
+    /// Checks that the record at `position` is followed by the time stamps of frame block `block`, equal to those in
+    /// the footer.
     fn check_times(&self, record: &TimesRecord, block: u32, position: u64) -> Result<()> {
         let stamps = read_times(&self.file, &self.layout, record, position)?;
         let range = self.layout.frame_range(block, self.times.len() as u64);
@@ -112,7 +113,7 @@ impl Reader {
         Ok(())
     }
 
-    /// Checks that zeros fill the file from `end` to the next multiple of 64, and returns that multiple.
+    /// Checks that the file contains only zeros from `end` to the next multiple of 64 bytes, and returns this multiple.
     fn skip_padding(&self, end: u64) -> Result<u64> {
         let mut zeros = [0; RECORD_BYTES as usize];
         let zeros = &mut zeros[..(align(end) - end) as usize];
@@ -125,10 +126,10 @@ impl Reader {
     }
 }
 
-/// Checks the statistics of the record at `position` against the values of its tile.
+/// Checks that the statistics in the record `tile` at `position` are those of the tile's values.
 pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
     let found = stats(bytemuck::cast_slice(values));
-    // Compare bits: a forged NaN must not pass, and −0 must not pass for +0.
+    // Bits are compared: a forged NaN must not pass, and −0 must not pass for +0.
     let bits = |stats: Stats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
     if bits(found) != bits(tile.stats) {
         return Err(Fault::new(position + 44, format!("{found}, as the values are"), tile.stats));

@@ -14,44 +14,47 @@ use crate::layout::{ColumnSpec, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD_BYTES, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
 use crate::text::ShowPath;
 
-/// Writes a container: the time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
+/// Writes a container: the time stamps of a frame block, then its tiles, and so on for each frame block, then
+/// [`Writer::finish`].
 ///
-/// Tiles may be written in any order once the time stamps of their frame block were appended. Writing all tiles of a
-/// block before the next block lets [`crate::recover`] save the most after a crash. The bytes of the file depend on the
-/// order of writing; its digest and content do not.
+/// Tiles may be written in any order once the time stamps of their frame block have been appended. If all tiles of a
+/// frame block are written before the next one begins, [`crate::recover`] saves the most after a crash. The bytes of
+/// the file depend on the order of writing; its digest and its content do not.
 ///
-/// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian block
-/// is not stored again. A column that never changes therefore costs 64 bytes per further tile and its index entry.
+/// A constant tile (all frames equal) is not stored again if its bytes equal those of the last constant tile written
+/// for its column and Gaussian block. A column that never changes therefore takes 64 bytes and an index entry per
+/// further tile.
 ///
-/// Memory: 8 bytes per frame, twice that in [`Writer::finish`]; 80 bytes per column and Gaussian block; the stored
-/// bytes of the largest constant tile. The index, 64 bytes per tile, is kept in an unnamed temporary file in the same
-/// folder until the end.
+/// Memory: 8 bytes per frame, twice as many in [`Writer::finish`]; 80 bytes per column and Gaussian block; the stored
+/// bytes of the largest constant tile. The index (table of tiles), 64 bytes per tile, is kept in an unnamed temporary
+/// file in the same folder until the end.
 ///
-/// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished writer
-/// removes it. A killed process leaves it behind; [`crate::recover`] can read it.
+/// The file grows under a hidden name ending in `.tmp`, in the folder of its final name. Dropping an unfinished writer
+/// removes the file. A killed process leaves it behind; [`crate::recover`] can read it.
 pub struct Writer {
     path: PathBuf,
     temporary: PathBuf,
     file: File,
     layout: Layout,
     header: Vec<u8>,
-    /// Offset of the next record; a multiple of 64.
+    /// Offset in the file of the next record; a multiple of 64.
     position: u64,
     times: Vec<f64>,
-    /// Unnamed temporary file with the record of tile i at byte 64·i, or zeros if the tile is not written yet.
+    /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
     index: File,
-    /// Number of tiles of the frame blocks appended so far, and number of tiles written.
+    /// Number of tiles in the frame blocks appended so far; `written` is how many of them have been written.
     tiles: u64,
     written: u64,
-    /// Last constant tile written for each column and Gaussian block; empty before the first frame block.
+    /// Last constant tile (all frames equal) written for each column and Gaussian block; empty before the first frame
+    /// block.
     constants: Vec<Option<TileRecord>>,
     stored: Vec<u8>,
     finished: bool,
 }
 
 impl Writer {
-    /// Starts a container that will get the name `path`. Fails if the layout breaks a limit or the folder does not
-    /// accept a new file.
+    /// Creates a container that will get the name `path` when it is finished. Fails if the layout exceeds a limit of
+    /// the format, or if the folder does not accept a new file.
     pub fn create(path: impl AsRef<Path>, layout: Layout) -> Result<Writer> {
         let path = path.as_ref();
         let mut header = layout.to_header()?;
@@ -82,15 +85,17 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Returns the shape the container was created with.
+    /// Returns the shape of the container: number of Gaussians, columns and block lengths.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
     /// Appends the next frame block and returns its number. `times` holds the time stamps of its frames:
-    /// [`Layout::frame_block`] of them, or fewer (at least one) in the last block, after which no other may follow.
+    /// [`Layout::frame_block`] of them, or fewer (at least one) in the last frame block, after which no other may
+    /// follow.
     ///
-    /// Fails if a time stamp is not finite or not above the previous one, or if the last block was appended before.
+    /// Fails if a time stamp is not finite or not greater than the previous one, or if the last frame block was
+    /// appended before.
     pub fn append_times(&mut self, times: &[f64]) -> Result<u32> {
         let most = self.layout.frame_block as usize;
         let first = self.times.len();
@@ -123,8 +128,8 @@ impl Writer {
         Ok(block)
     }
 
-    /// Writes one tile. Fails if there is no such tile, its time stamps have not been appended, it was written before,
-    /// or `tile` has another shape or a larger error bound than its column.
+    /// Writes one tile. Fails if there is no such tile, if its time stamps have not been appended, if it was written
+    /// before, or if `tile` has another shape or a larger error bound than its column.
     pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let &ColumnSpec { width, max_error, .. } = &self.layout.columns[at.column as usize];
@@ -167,9 +172,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Writes a tile equal to the last constant tile of its column and Gaussian block. Produces the same file as
-    /// [`Writer::write_tile`] with that tile, without encoding it again. Fails if there is no such tile, its time
-    /// stamps have not been appended, it was written before, or no constant tile came before it.
+    /// Writes a tile that equals the last constant tile (all frames equal) of its column and Gaussian block. The file
+    /// becomes the same as by [`Writer::write_tile`] with that tile, but nothing is encoded again. Fails if there is no
+    /// such tile, if its time stamps have not been appended, if it was written before, or if no constant tile came
+    /// before it.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let slot = index as usize % self.constants.len();
@@ -184,7 +190,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the position in the index of a tile that is not written yet, and the number of frames it covers.
+    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if it was written
+    /// before.
     fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
@@ -196,7 +203,7 @@ impl Writer {
         Ok((index, (frames.end - frames.start) as u32))
     }
 
-    /// Returns whether entry `index` of the index file is filled.
+    /// Returns whether the tile at position `index` of the index has been written.
     fn has_entry(&mut self, index: u64) -> Result<bool> {
         let mut bytes = Vec::new();
         let read = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
@@ -205,8 +212,8 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Adds the index entry of a tile whose record was appended at `start`. After an error the position is `start`
-    /// again.
+    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error the writer is at
+    /// `start` again.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
@@ -218,7 +225,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Calls `each` with successive chunks of whole index entries.
+    /// Reads the index entries from the temporary file and calls `each` with successive chunks of them.
     fn for_each_index_chunk(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
         let end = RECORD_BYTES * self.tiles;
         let mut chunk = Vec::new();
@@ -231,10 +238,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Writes the footer, syncs the file, renames it to its final name (replacing an existing file) and syncs the
-    /// folder. Returns the digest of the content; see [`crate::Reader::digest`].
+    /// Writes the footer, syncs the file to disk, renames it to its final name (replacing an existing file), and syncs
+    /// the folder. Returns the hash of the content; see [`crate::Reader::digest`].
     ///
-    /// Fails if a tile is missing; no file appears under the final name then.
+    /// Fails if a tile is missing; then no file appears under the final name.
     pub fn finish(mut self) -> Result<u64> {
         if self.written != self.tiles {
             let mut first = 0;
@@ -273,12 +280,12 @@ impl Writer {
             header_checksum: xxh3_64(&self.header),
         };
         let trailer = trailer_to_bytes(self.position);
-        // Time stamps and index have lengths that are multiples of 8. The trailer follows them without padding and ends
+        // The lengths of time stamps and index are multiples of 8. The trailer follows them without padding and ends
         // the file.
         self.append(&[&Record::Footer(footer).to_bytes(), &times])?;
         self.for_each_index_chunk(|writer, chunk| writer.append(&[chunk]))?;
         self.append(&[&trailer])?;
-        // Cut bytes that a failed write may have left behind the end.
+        // Removes bytes that a failed write may have left behind the end.
         self.file.set_len(self.position).map_err(Error::io("cut", &self.temporary))?;
         self.file.sync_all().map_err(Error::io("sync", &self.temporary))?;
         fs::rename(&self.temporary, &self.path).map_err(Error::io("rename", &self.temporary))?;
@@ -287,8 +294,8 @@ impl Writer {
         Ok(digest.value())
     }
 
-    /// Returns the offset of an equal payload already in the file for a constant tile, if there is one. Equal checksums
-    /// are only a hint; the bytes are read back and compared.
+    /// For a constant tile, returns the offset of equal stored bytes that are in the file already, if there are some.
+    /// Equal checksums are only a hint; the bytes are read back and compared.
     fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
         let Some(earlier) = self.constants[slot] else { return Ok(None) };
         if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {
@@ -300,14 +307,14 @@ impl Writer {
         Ok((self.stored == bytes).then_some(earlier.offset))
     }
 
-    /// Appends `parts`, then zeros up to the next multiple of 64.
+    /// Appends `parts` to the file, then zeros up to the next multiple of 64 bytes.
     fn append_padded(&mut self, parts: &[&[u8]]) -> Result<()> {
         let end = self.position + parts.iter().map(|part| part.len() as u64).sum::<u64>();
         let zeros = [0; RECORD_BYTES as usize];
         self.append(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())
     }
 
-    /// Appends `parts`. After an error the position is unchanged, so the call may be repeated.
+    /// Appends `parts` to the file. After an error the position is unchanged, so the call may be repeated.
     fn append(&mut self, parts: &[&[u8]]) -> Result<()> {
         let written = self
             .file
@@ -322,14 +329,14 @@ impl Writer {
 impl Drop for Writer {
     fn drop(&mut self) {
         if !self.finished {
-            // A failure cannot be reported from here, and the name shows that the file is temporary.
+            // A failure cannot be reported from here, and the name shows that the file is a temporary one.
             let _ = fs::remove_file(&self.temporary);
         }
     }
 }
 
-/// Checks that `times` are finite, strictly increasing and above `before`. The error holds the index of the first bad
-/// one and a description of it.
+/// Checks that `times` are finite, strictly increasing and greater than `before`. The error holds the index of the
+/// first time that is not, and a description of it.
 pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
     let mut last = before;
     for (frame, &time) in times.iter().enumerate() {
@@ -344,8 +351,8 @@ pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Re
     Ok(())
 }
 
-/// Creates a hidden file in the folder of `path`, named after it and this process, ending in `.tmp`. Returns its path
-/// and the open file.
+/// Creates a hidden file in the folder of `path`. Its name is that of `path` with the id of this process, and ends in
+/// `.tmp`. Returns the path of the hidden file, and the open file.
 fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
@@ -358,7 +365,7 @@ fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
         hidden.push(format!(".{}-{number}.tmp", std::process::id()));
         let temporary = path.with_file_name(hidden);
         match OpenOptions::new().read(true).write(true).create_new(true).open(&temporary) {
-            // Left by a killed process that had the same id: try the next number.
+            // A killed process with the same id left this file behind: try the next number.
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
             opened => return opened.map_err(Error::io("create", &temporary)).map(|file| (temporary, file)),
         }
@@ -370,7 +377,7 @@ fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Syncs the folder of `path`, so that a rename survives a power failure on systems that support it.
+/// Syncs the folder of `path` to disk, so that a rename in it survives a power failure on systems that support this.
 fn sync_folder(path: &Path) -> Result<()> {
     let folder = folder_of(path);
     splat_platform::sync_folder(folder).map_err(Error::io("sync", folder))

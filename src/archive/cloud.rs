@@ -1,7 +1,9 @@
 //! Encodes the canonical Gaussians, each attribute on its own quantization grid.
 //!
-//! In: Gaussians and the steps of their attributes. Out: symbols, and the order in which the Gaussians are restored:
-//! along a Morton curve, where a position is stored as the distance along the curve from the previous one.
+//! In: Gaussians, and a quantization step for each attribute. Out: entropy-coded symbols, and the order in which the
+//! Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve from
+//! the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
+//! Gaussians.
 
 use std::collections::BTreeMap;
 
@@ -13,37 +15,39 @@ use super::residual::Residuals;
 use super::step::QuantizationGrid;
 use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// Attributes with a step each, in the order of [`CloudSteps`]; SH coefficients by degree.
+/// Attributes that each have their own quantization step, in the order of [`CloudSteps`]; SH coefficients are divided
+/// by degree.
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
-/// Quantization step of each attribute; see [`super::step()`].
+/// Quantization step of each attribute of [`ATTRIBUTES`], as an exponent; see [`super::step()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
-/// Number of values from which a value is predicted: the previous one, the mean of the previous four, and the values of
-/// the same Gaussian in the two previous planes.
+/// Number of known values from which a value is predicted: the value of the previous Gaussian, the mean of the previous
+/// four, and the values of the same Gaussian in the two previous planes (scalar components).
 const NEIGHBORS: usize = 4;
-/// Bits per axis of the Morton curve.
+/// Number of bits per axis of an index along the Morton curve.
 const CURVE_BITS: u32 = 21;
 
-/// Parameters of encoded Gaussians, without the symbols.
+/// Parameters that are needed to decode the symbols of encoded Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PointCloudShape {
     pub(super) gaussians: usize,
     pub(super) sh_degree: usize,
     pub(super) steps: CloudSteps,
-    /// Minimum position on each axis, in steps.
+    /// Minimum position on each axis, in quantization steps.
     pub(super) lowest: [i64; 3],
-    /// Number of low bits of a position that are stored as plain bits and not used by the curve.
+    /// Number of low bits of each coordinate that are stored as plain bits and not used by the Morton curve.
     pub(super) loose: u32,
-    /// Mean of every plane after the positions, in steps.
+    /// Mean of every plane (scalar component) after the three of the position, in quantization steps.
     pub(super) means: Vec<i64>,
-    /// Predictor weights of every plane after the positions.
+    /// Predictor weights of every plane (scalar component) after the three of the position.
     pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
-/// Returns the planes after the positions: attribute, plane in it, and index in [`ATTRIBUTES`].
+/// Returns the planes (scalar components) in coding order, without the position: attribute, component in the attribute,
+/// and index in [`ATTRIBUTES`].
 fn planes(sh_degree: usize) -> Vec<(Attributes, usize, usize)> {
     let mut planes: Vec<_> = (0..4).map(|c| (Attributes::ROTATION, c, 1)).collect();
     planes.extend((0..3).map(|c| (Attributes::LOG_SCALE, c, 2)));
@@ -53,7 +57,7 @@ fn planes(sh_degree: usize) -> Vec<(Attributes, usize, usize)> {
 }
 
 impl PointCloudShape {
-    /// Checks that the numbers are consistent. Applies to shapes from untrusted files.
+    /// Returns whether the numbers are consistent. Applies to shapes from untrusted files.
     pub(super) fn is_sound(&self) -> bool {
         self.sh_degree <= MAX_SH_DEGREE
             && self.means.len() == planes(self.sh_degree).len()
@@ -63,13 +67,13 @@ impl PointCloudShape {
             && self.gaussians <= u32::MAX as usize
     }
 
-    /// Returns the number of f32 values of all Gaussians; `None` if it overflows.
+    /// Returns the number of f32 values that all Gaussians have together; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
         self.gaussians.checked_mul(Attributes::all().width(self.sh_degree))
     }
 }
 
-/// Inserts two zero bits between consecutive bits of `x`.
+/// Returns `x` with two zero bits inserted between consecutive bits.
 fn spread(x: u64) -> u64 {
     let mut x = x & ((1 << CURVE_BITS) - 1);
     for (shift, mask) in [
@@ -84,7 +88,7 @@ fn spread(x: u64) -> u64 {
     x
 }
 
-/// Reverses [`spread`].
+/// Inverse of [`spread`]: returns every third bit of `x`, packed together.
 fn gather(x: u64) -> u64 {
     let mut x = x & 0x1249_2492_4924_9249;
     for (shift, mask) in [
@@ -99,7 +103,8 @@ fn gather(x: u64) -> u64 {
     x
 }
 
-/// Returns positions in steps above the minimum, the minimum, and the number of bits that the curve does not use.
+/// Returns every position relative to the minimum on each axis, that minimum, and the number of low bits that the
+/// Morton curve does not use. Positions and minimum are in quantization steps.
 fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
@@ -108,14 +113,15 @@ fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u
     (above, lowest, (64 - most.leading_zeros()).saturating_sub(CURVE_BITS))
 }
 
-/// Returns the index of a grid position along the Morton curve.
+/// Returns the index along the Morton curve of a position in quantization steps. The `loose` lowest bits of each
+/// coordinate are left out.
 fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
     let [x, y, z] = place.map(|x| spread(x >> loose));
     x | y << 1 | z << 2
 }
 
-/// Encodes Gaussians. Returns the parameters, the symbols, and the ids of the Gaussians in their new order. Adds the
-/// approximate number of bits of every attribute to `bits`.
+/// Encodes Gaussians. Returns the parameters for decoding, the symbols, and the original index of each Gaussian in the
+/// new order. Adds the approximate number of bits of every attribute to `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     steps: &CloudSteps,
@@ -124,7 +130,7 @@ pub(super) fn encode(
     let mut encoder = SymbolEncoder::default();
     let (places, lowest, loose) = grid_positions(&cloud.position, QuantizationGrid::new(steps[0]));
     let mut order: Vec<u32> = (0..cloud.len() as u32).collect();
-    // The sort is stable: ties stay in the order of ids.
+    // The sort is stable: Gaussians with the same curve index stay in their original order.
     order.sort_by_key(|&id| curve_index(&places[id as usize], loose));
     let (mut lengths, mut before) = (CurveDistances::new(), 0);
     for &id in &order {
@@ -173,7 +179,7 @@ pub(super) fn encode(
     (shape, encoder.finish(), order)
 }
 
-/// Decodes Gaussians; `None` if the bytes do not match `shape`.
+/// Decodes the Gaussians from their symbols `bytes`; `None` if the bytes do not match `shape`.
 pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
@@ -204,20 +210,20 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians>
     decoder.is_finished().then_some(cloud)
 }
 
-/// Models of distances along the curve: the number of bits of a distance is coded as two symbols; the bits below the
-/// highest one are plain.
+/// Adaptive models for coding distances along the Morton curve. The number of bits of a distance is coded as two
+/// symbols; the bits below the highest one are plain.
 struct CurveDistances {
     high: SymbolModel,
     low: [SymbolModel; 4],
 }
 
 impl CurveDistances {
-    /// Returns models that have seen nothing.
+    /// Returns models that have seen no distance yet.
     fn new() -> CurveDistances {
         CurveDistances { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
     }
 
-    /// Writes a distance.
+    /// Writes a distance to `to` and updates the models.
     fn encode(&mut self, distance: u64, to: &mut SymbolEncoder) {
         let length = 64 - distance.leading_zeros();
         to.symbol(&mut self.high, length as usize / SYMBOLS);
@@ -225,7 +231,7 @@ impl CurveDistances {
         to.long_bits(distance, length.saturating_sub(1));
     }
 
-    /// Reads a distance.
+    /// Reads a distance from `from` and updates the models.
     fn decode(&mut self, from: &mut SymbolDecoder<'_>) -> u64 {
         let high = from.symbol(&mut self.high) & 3;
         let length = (high * SYMBOLS + from.symbol(&mut self.low[high])) as u32;
@@ -234,27 +240,29 @@ impl CurveDistances {
     }
 }
 
-/// State carried from plane to plane while all planes are coded.
+/// State that is carried from one plane (scalar component of all Gaussians) to the next while coding.
 #[derive(Clone)]
 struct PlaneCoder {
-    /// Differences from the mean in the previous plane and in the one before it.
+    /// For each Gaussian its value less the mean of the plane: in the previous plane, and in the plane before that.
     known: [Vec<f32>; 2],
-    /// Recent prediction errors of each Gaussian in steps, as a moving average.
+    /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
     sizes: Vec<f32>,
-    /// Attribute of the current plane; its planes share the models.
+    /// Attribute of the current plane, as an index in [`ATTRIBUTES`]. All planes of an attribute share the entropy
+    /// models.
     attribute: usize,
     models: Residuals,
 }
 
 impl PlaneCoder {
-    /// Returns the state before the first plane of `count` Gaussians.
+    /// Returns the state before the first plane is coded, for `count` Gaussians.
     fn new(count: usize) -> PlaneCoder {
         let none = || vec![0.0; count];
         PlaneCoder { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
     }
 
-    /// Visits every Gaussian of a plane. `code` receives the index, the values to predict from, the expected size of
-    /// the error in steps, and the models. It returns the multiple of the step and its difference from the prediction.
+    /// Visits every Gaussian of one plane (scalar component) in coding order. `code` receives the index of the
+    /// Gaussian, the known values to predict from, the expected absolute error in quantization steps, and the entropy
+    /// models. It returns the quantized value as a multiple of the step, and that multiple less the predicted one.
     #[inline(always)]
     fn plane(
         &mut self,
@@ -283,7 +291,7 @@ impl PlaneCoder {
     }
 }
 
-/// Rounds the values of `attributes` to their grids.
+/// Rounds the values of the attributes with the indices `attributes` in [`ATTRIBUTES`] to their quantization grids.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     for (column, c, attribute) in positions.chain(planes(cloud.sh_degree())) {
@@ -294,7 +302,7 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
     }
 }
 
-/// Returns the values of an attribute.
+/// Returns the values of all scalar components of the attribute [`ATTRIBUTES`]`[attribute]`, component by component.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
     let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     let own = positions.chain(planes(cloud.sh_degree())).filter(move |plane| plane.2 == attribute);

@@ -1,26 +1,27 @@
-//! Entropy coder: adaptive models of sixteen symbols, coded by an asymmetric numeral system (ANS), next to a stream of
-//! plain bits.
+//! Entropy coder for symbols from 0 to 15. Adaptive models predict the symbols, and an asymmetric numeral system (ANS)
+//! codes them. Plain bits are stored in a stream beside the symbols.
 //!
-//! In: symbols with the models that predict them. Out: words. Encoder and decoder update the models alike, so models
-//! are not stored. Memory: 4 bytes per symbol while encoding. Source: J. Duda, "Asymmetric numeral systems", 2013;
-//! models are updated by F. Giesen's mixing of distributions.
+//! In: symbols, each with the model that predicts it. Out: bytes. Encoder and decoder update the models alike, so
+//! models are not stored. Memory: 4 bytes per symbol while encoding. Source: J. Duda, "Asymmetric numeral systems",
+//! 2013; models are updated by F. Giesen's mixing of distributions.
 
-/// Bits of a probability: probabilities are multiples of 1/2^15.
+/// Number of bits of a probability: probabilities are multiples of 1/2^15.
 const PRECISION: u32 = 15;
-/// Sum of all probabilities less one; the sum itself does not fit into i16.
+/// Sum of all probabilities of a model less one, in units of 1/2^15; the sum itself does not fit into i16.
 const TOTAL: i16 = i16::MAX;
-/// Number of symbols of a model.
+/// Number of different symbols that a model predicts.
 pub(super) const SYMBOLS: usize = 16;
-/// Minimum probability of a symbol, in units of 1/2^15, so that no symbol becomes impossible.
+/// Minimum probability of a symbol, in units of 1/2^15. It keeps every symbol possible.
 const MIN_PROBABILITY: i16 = 8;
-/// Lower bound of the state of the coder.
+/// Lower bound of the 64-bit state of the ANS coder; below it, the decoder reads another word.
 const MIN_STATE: u64 = 1 << 31;
-/// Initial learning rate of a model: it moves by 1/2^rate of its error, and slows down as it sees more symbols.
+/// Initial learning rate: each symbol moves the probabilities by 1/2^rate of the way to those of a model that was
+/// certain of this symbol. The rate grows every 8 symbols, so the model changes more slowly.
 const FIRST_RATE: u32 = 3;
-/// Final learning rate of a model.
+/// Final learning rate, as in [`FIRST_RATE`].
 const LAST_RATE: u32 = 7;
 
-/// Cumulative probabilities of a model that is certain of the next symbol, by that symbol.
+/// For each symbol, the cumulative probabilities of a model that is certain of this symbol, in units of 1/2^15.
 const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
     let mut known = [[0; SYMBOLS]; SYMBOLS];
     let mut symbol = 0;
@@ -38,17 +39,17 @@ const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
     known
 };
 
-/// Adaptive probabilities of the next symbol.
+/// Adaptive probabilities of the symbols 0 to 15.
 #[derive(Debug, Clone)]
 pub(super) struct SymbolModel {
-    /// Cumulative probability of all symbols before each symbol.
+    /// For each symbol, the sum of the probabilities of all lower symbols, in units of 1/2^15.
     starts: [i16; SYMBOLS],
-    /// Number of symbols seen so far.
+    /// Number of symbols that the model has seen so far; it determines the learning rate.
     seen: u32,
 }
 
 impl SymbolModel {
-    /// Uniform distribution, before any symbol.
+    /// Model that has seen no symbol: all symbols are equally likely.
     pub(super) const NEW: SymbolModel = {
         let mut starts = [0; SYMBOLS];
         let mut i = 0;
@@ -59,15 +60,15 @@ impl SymbolModel {
         SymbolModel { starts, seen: 0 }
     };
 
-    /// Returns the cumulative probability before a symbol, and its own probability.
+    /// Returns the sum of the probabilities of all lower symbols, and the probability of `symbol`, in units of 1/2^15.
     fn interval(&self, symbol: usize) -> (u32, u32) {
         let start = self.starts[symbol] as u32;
         let end = self.starts.get(symbol + 1).map_or(1 << PRECISION, |&end| end as u32);
         (start, end - start)
     }
 
-    /// Updates the model with a symbol. Probabilities stay at least `MIN_PROBABILITY`: neighboring starts move by the same
-    /// fraction toward targets that are at least that far apart.
+    /// Updates the probabilities after `symbol` was coded. They stay at least `MIN_PROBABILITY`, because neighboring
+    /// entries of `starts` move by the same fraction toward targets that are at least that far apart.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);
@@ -77,24 +78,24 @@ impl SymbolModel {
     }
 }
 
-/// Writer of symbols and bits.
+/// Writer of entropy-coded symbols and plain bits.
 #[derive(Debug, Default)]
 pub(super) struct SymbolEncoder {
     symbols: Vec<(u16, u16)>,
     bits: Vec<u8>,
     pending: u64,
     pending_bits: u32,
-    /// Approximate number of bits written so far.
+    /// Approximate number of bits written so far, of symbols and plain bits.
     cost: f64,
 }
 
 impl SymbolEncoder {
-    /// Returns the approximate number of bits written so far.
+    /// Returns the approximate number of bits written so far, of symbols and plain bits.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
-    /// Writes a symbol and updates its model.
+    /// Writes a symbol with the probability that `model` gives it, then updates the model.
     pub(super) fn symbol(&mut self, model: &mut SymbolModel, symbol: usize) {
         let (start, interval) = model.interval(symbol);
         self.cost += f64::from(PRECISION) - f64::from(interval).log2();
@@ -102,7 +103,7 @@ impl SymbolEncoder {
         model.learn(symbol);
     }
 
-    /// Writes the low `count` bits of `value`, at most 32.
+    /// Writes the low `count` (at most 32) bits of `value` as plain bits.
     pub(super) fn bits(&mut self, value: u64, count: u32) {
         self.pending |= (value & ((1 << count) - 1)) << self.pending_bits;
         self.pending_bits += count;
@@ -114,22 +115,22 @@ impl SymbolEncoder {
         }
     }
 
-    /// Writes a number below 2^63 of unknown magnitude: for the number plus one, how many bits follow its first bit,
-    /// and these bits.
+    /// Writes a number below 2^63 of unknown magnitude: of the number plus one, first how many bits follow the highest
+    /// one bit, then these bits.
     pub(super) fn number(&mut self, value: u64) {
         let length = 64 - (value + 1).leading_zeros();
         self.bits(u64::from(length - 1), 6);
         self.long_bits(value + 1, length - 1);
     }
 
-    /// Writes the low `count` bits of `value`, at most 63.
+    /// Writes the low `count` (at most 63) bits of `value` as plain bits.
     pub(super) fn long_bits(&mut self, value: u64, count: u32) {
         let low = count.min(32);
         self.bits(value, low);
         self.bits(value >> 32, count - low);
     }
 
-    /// Returns the length of the words, the words of the symbols, and the bits.
+    /// Returns the encoded bytes: the length of the words in bytes, the words of the symbols, and the plain bits.
     pub(super) fn finish(mut self) -> Vec<u8> {
         if self.pending_bits > 0 {
             self.bits.push(self.pending as u8);
@@ -154,8 +155,8 @@ impl SymbolEncoder {
     }
 }
 
-/// Reader of the output of [`SymbolEncoder`]. Other bytes give arbitrary symbols, and [`SymbolDecoder::is_finished`] is
-/// false at the end.
+/// Decoder of the bytes written by [`SymbolEncoder`]. Other bytes decode to arbitrary symbols;
+/// [`SymbolDecoder::is_finished`] is then false at the end.
 #[derive(Debug)]
 pub(super) struct SymbolDecoder<'a> {
     state: u64,
@@ -163,12 +164,13 @@ pub(super) struct SymbolDecoder<'a> {
     bits: &'a [u8],
     pending: u64,
     pending_bits: u32,
-    /// Whether more words were needed than there are.
+    /// Whether more words were needed than the input has.
     is_short: bool,
 }
 
 impl<'a> SymbolDecoder<'a> {
-    /// Returns a decoder of `bytes`; `None` if the lengths do not fit.
+    /// Returns a decoder of `bytes`; `None` if the stored length of the words exceeds `bytes` or is not a multiple of
+    /// 4, or if there are fewer than two words.
     pub(super) fn new(bytes: &'a [u8]) -> Option<SymbolDecoder<'a>> {
         let (length, rest) = bytes.split_first_chunk::<8>()?;
         let (words, bits) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).ok()?)?;
@@ -178,7 +180,7 @@ impl<'a> SymbolDecoder<'a> {
         Some(SymbolDecoder { state, words: words.iter(), bits, pending: 0, pending_bits: 0, is_short: false })
     }
 
-    /// Reads a symbol and updates its model.
+    /// Reads the next symbol, which `model` predicts, and updates the model.
     #[inline(always)]
     pub(super) fn symbol(&mut self, model: &mut SymbolModel) -> usize {
         let place = (self.state & ((1 << PRECISION) - 1)) as i16;
@@ -200,7 +202,7 @@ impl<'a> SymbolDecoder<'a> {
         symbol
     }
 
-    /// Reads `count` bits, at most 32.
+    /// Reads `count` (at most 32) plain bits.
     #[inline(always)]
     pub(super) fn bits(&mut self, count: u32) -> u64 {
         if self.pending_bits < count {
@@ -212,7 +214,7 @@ impl<'a> SymbolDecoder<'a> {
         value
     }
 
-    /// Refills the buffer of bits.
+    /// Fills the 64-bit buffer of plain bits with whole bytes.
     #[inline(never)]
     fn fill(&mut self) {
         while self.pending_bits <= 56 {
@@ -224,20 +226,20 @@ impl<'a> SymbolDecoder<'a> {
         }
     }
 
-    /// Reads a number written by [`SymbolEncoder::number`].
+    /// Reads a number below 2^63 that [`SymbolEncoder::number`] wrote.
     pub(super) fn number(&mut self) -> u64 {
         let follow = self.bits(6) as u32;
         (1 << follow | self.long_bits(follow)) - 1
     }
 
-    /// Reads `count` bits, at most 63.
+    /// Reads `count` (at most 63) plain bits.
     pub(super) fn long_bits(&mut self, count: u32) -> u64 {
         let low = count.min(32);
         let value = self.bits(low);
         value | self.bits(count - low) << 32
     }
 
-    /// Returns whether exactly the written symbols and bits were read.
+    /// Returns whether all symbols and bits of the input were read, and no more.
     pub(super) fn is_finished(&self) -> bool {
         !self.is_short && self.state == MIN_STATE && self.words.len() == 0 && self.bits.is_empty()
     }

@@ -1,8 +1,8 @@
 //! Encodes the tensors of a deformation field, each on its own quantization grid.
 //!
-//! In: a state dict, the roles of its tensors, the stored positions. Out: symbols and a table of tensors. Planes store
-//! only the texels that some Gaussian reads at some time, with finer steps where a texel is read more. Matrices store
-//! all of their values. Tensors that nothing reads are restored as zeros.
+//! In: a state dict (tensors by name), the role of each tensor, and the stored positions. Out: symbols and a table of
+//! tensors. Of a feature plane only the texels that some Gaussian reads at some time are stored; texels that are read
+//! more have finer steps. Of a weight matrix all values are stored. Tensors that nothing reads are restored as zeros.
 
 use std::collections::BTreeMap;
 
@@ -17,84 +17,86 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Eighths of an octave by which the step of a texel is finer for each octave of its summed squared read weights, by
-/// which its squared error counts.
+/// Eighths of an octave by which the quantization step of a texel becomes finer when its squared read weights, summed
+/// over the Gaussians, double. The squared error of the texel counts in proportion to this sum.
 const FINER_PER_OCTAVE: i32 = 4;
 
-/// Class of a weight whose step has no offset; other classes differ from it by the offset in eighths of an octave.
+/// Class of a weight whose quantization step has no offset. Another class differs from it by its offset, in eighths of
+/// an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
-/// Use of a tensor by the deformation field.
+/// How the deformation field uses a tensor, which decides how an archive stores the tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
-    /// Plane `[1, channels, size_b, size_a]` over two spatial axes (a, b).
+    /// Feature plane `[1, channels, size_b, size_a]` over two spatial axes (a, b).
     Plane([usize; 2]),
-    /// Plane `[1, channels, times, size]` over a spatial axis and time.
+    /// Feature plane `[1, channels, times, size]` over one spatial axis and time.
     TimePlane(usize),
-    /// Weights: `[outputs, inputs]` or any other shape.
+    /// Weights of a layer: a matrix `[outputs, inputs]`, or a tensor of any other shape.
     Weights,
-    /// Values stored bit for bit.
+    /// Tensor whose values are stored bit for bit.
     Exact,
-    /// Values that are never used; not stored.
+    /// Tensor that is never used; its values are not stored.
     Unread,
 }
 
-/// Entry of a tensor in the table of an archive.
+/// Entry of a tensor in the table of contents of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TensorEntry {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     pub(super) role: Role,
-    /// Quantization step; see [`super::step()`].
+    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
     pub(super) step: i32,
-    /// Offsets added to the step: by channel of a plane, by row and then by column of a matrix; empty: none.
+    /// Offsets added to `step`, in eighths of an octave: one per channel of a plane; for a matrix one per row, followed
+    /// by one per column; one per element of any other tensor of weights. Empty if there are none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
-    /// Mean of the values, in steps.
+    /// Mean of the values, in quantization steps.
     pub(super) mean: i64,
-    /// Weights by which values are predicted from their neighbors.
+    /// Weights with which a value is predicted from its neighbors in the tensor.
     pub(super) parts: PredictorWeights<NEIGHBORS>,
 }
 
-/// Quantization steps of the tensors, by name.
+/// Quantization step of each tensor, by the name of the tensor.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 
-/// Quantization step of a tensor, with offsets.
+/// Quantization step of a tensor, with offsets for its channels, or for its rows and columns.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TensorSteps {
-    /// Quantization step; see [`super::step()`].
+    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
     pub step: i32,
-    /// Offsets added to the step: by channel of a plane, by row and then by column of a matrix, by element of any other
-    /// tensor of weights; empty: none.
+    /// Offsets added to `step`, in eighths of an octave: one per channel of a plane; for a matrix one per row, followed
+    /// by one per column; one per element of any other tensor of weights. Empty if there are none.
     pub channels: Vec<i8>,
 }
 
-/// Positions and times at which planes are read.
+/// Positions of the Gaussians and range of times at which the feature planes are read.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
     pub(super) position: &'a AttributeValues,
     pub(super) space: Option<Box3>,
-    /// First and last time.
+    /// First and last time at which the field is evaluated.
     pub(super) times: [f32; 2],
 }
 
 impl TensorEntry {
-    /// Returns the entry of a tensor before its mean and predictor are known.
+    /// Returns the table entry of a tensor; its mean and predictor weights are still zero.
     pub(super) fn new(name: &str, tensor: &Tensor, role: Role, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
         TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBORS] }
     }
 
-    /// Returns the number of values; `None` if it overflows.
+    /// Returns the number of values of the tensor; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |product, &extent| product.checked_mul(extent))
     }
 
-    /// Returns the numbers of channels, rows and columns.
+    /// Returns the numbers of channels, rows and columns as which the tensor is coded.
     fn extents(&self) -> [usize; 3] {
         match (self.role, &self.shape[..]) {
             (Role::Plane(_) | Role::TimePlane(_), &[_, channels, rows, columns]) => [channels, rows, columns],
@@ -103,7 +105,7 @@ impl TensorEntry {
         }
     }
 
-    /// Checks that shape, role and steps are consistent. Applies to entries from untrusted files.
+    /// Returns whether shape, role and steps are consistent. Applies to entries from untrusted files.
     pub(super) fn is_sound(&self) -> bool {
         let plane = |axes: &[usize]| {
             self.shape.len() == 4
@@ -127,8 +129,8 @@ impl TensorEntry {
         fits && channels && super::STEPS.contains(&self.step)
     }
 
-    /// Returns the key of the models that the tensor shares with others: planes of the same kind and size, matrices,
-    /// vectors.
+    /// Returns the key of the family of tensors that share entropy models: planes of the same kind and size, matrices,
+    /// or vectors.
     fn family(&self) -> (u8, usize) {
         match self.role {
             Role::Plane(_) => (0, self.shape[3]),
@@ -138,7 +140,7 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the grid of a class in a channel.
+    /// Returns the quantization grid for values of `class` in `channel`.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             Role::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -149,7 +151,8 @@ impl TensorEntry {
         })
     }
 
-    /// Returns the class of each weight: the sum of the offsets of its row and column.
+    /// Returns the class of each weight, row by row: [`ZERO_OFFSET_CLASS`] plus the offsets of the weight's row and
+    /// column.
     fn weight_classes(&self) -> Vec<u8> {
         let [_, rows, columns] = self.extents();
         let (row_offsets, column_offsets) = self.channels.split_at(self.channels.len().saturating_sub(columns));
@@ -167,7 +170,8 @@ impl TensorEntry {
         (0..rows).flat_map(|row| (0..columns).map(move |column| class_at(row, column))).collect()
     }
 
-    /// Calls `with` with the tensor on its grids and returns the result; `None` if the tensor has no quantized values.
+    /// Calls `with` with the tensor's quantization grids and returns the result; `None` if the tensor has no quantized
+    /// values.
     fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;
@@ -204,11 +208,11 @@ impl TensorEntry {
     }
 }
 
-/// Entropy models, by the key of the family of tensors that shares them.
+/// Entropy models by key ([`TensorEntry::family`]) of the family of tensors that share them.
 struct SharedModels(Vec<((u8, usize), Residuals)>);
 
 impl SharedModels {
-    /// Returns the models of the family of `entry`.
+    /// Returns the entropy models of the family of `entry`; creates them at the first call for this family.
     fn residuals(&mut self, entry: &TensorEntry) -> &mut Residuals {
         let family = entry.family();
         let place = self.0.iter().position(|(known, _)| *known == family).unwrap_or_else(|| {
@@ -219,8 +223,9 @@ impl SharedModels {
     }
 }
 
-/// Encodes the tensors of `entries`, and stores their means and predictor weights in the entries. Returns the symbols
-/// and the values of exact tensors. Adds the approximate number of bits of every tensor to `bits`.
+/// Encodes the tensors of `entries`, and sets the means and predictor weights in the entries. Returns the symbols of
+/// the quantized tensors and the values of tensors with [`Role::Exact`]. Adds the approximate number of bits of every
+/// tensor to `bits`.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
     tensors: &Tensors,
@@ -250,7 +255,8 @@ pub(super) fn encode(
     (encoder.finish(), exact)
 }
 
-/// Decodes the tensors of `entries`; `None` if the bytes do not match them. Shapes have been checked.
+/// Decodes the tensors of `entries` from the symbols `bytes` and the values `exact`; `None` if these do not match the
+/// entries. The caller has checked the shapes.
 pub(super) fn decode(
     entries: &[TensorEntry],
     bytes: &[u8],
@@ -278,8 +284,8 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns a tensor rounded with `steps`, as an archive would restore it. Ignores that unread rows are restored from
-/// their neighbors.
+/// Returns a tensor rounded with `steps`, as an archive would restore it. One difference remains: rows of a plane over
+/// time that no time reads keep their own values here.
 pub fn rounded(
     tensor: &Tensor,
     role: Role,

@@ -1,7 +1,8 @@
-//! File layout of an archive: a head with lengths and checksums, and four sections.
+//! File layout of an archive: a header with lengths and checksums, and four sections.
 //!
-//! In: sections. Out: bytes, and back. Everything read from a file is checked before it is used: lengths against the
-//! file, checksums against the bytes, sizes to allocate against the length of the file and the memory limit.
+//! In: the contents of the sections. Out: the bytes of the file, and back. Everything read from a file is checked
+//! before it is used: lengths against the length of the file, checksums against the bytes, and sizes to allocate
+//! against both the length of the file and the memory limit.
 
 use std::path::Path;
 
@@ -11,68 +12,69 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 
-/// First bytes of an archive; the line ends reveal a file that was transferred as text.
+/// First bytes of an archive. Their line ends reveal a file that was transferred as text.
 pub const MAGIC: [u8; 8] = *b"\x89GSZ\r\n\x1a\n";
-/// Version that is written, and the only version that is read.
+/// Format version that is written, and the only version that can be read.
 pub const VERSION: u16 = 1;
 
-/// Number of sections.
+/// Number of sections of an archive.
 const SECTIONS: usize = 4;
-/// Names of the sections, for messages.
+/// Names of the sections in error messages.
 const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
-/// Length of the head in bytes: magic, version, two zero bytes; for each section its length in the file, the length of
-/// its content and a checksum; checksum of the head.
+/// Length of the header in bytes: magic, version and two zero bytes; for each section its length in the file, the
+/// length of its content and a checksum; checksum of the header.
 pub const HEAD: usize = 12 + SECTIONS * 24 + 8;
-/// Compression level of zstd for the table and the blobs, which are small.
+/// Compression level of zstd for the table of contents and the plain bytes (`blobs`), which are small sections.
 const ZSTD_LEVEL: i32 = 19;
 /// Maximum number of bytes of content per byte of the file. The contents of trained models are 20 to 60 times as large
-/// as their archives. Symbols could stand for 800 bytes each, and unread texels for any number, but a file of 300 KB
-/// must not cost gigabytes.
+/// as their archives. Symbols could stand for 800 bytes each, and texels that are not stored for any number, but a file
+/// of 300 KB must not cost gigabytes.
 const MAX_CONTENT_PER_BYTE: u64 = 512;
-/// Number of bytes that may be allocated whatever the length of the file.
+/// Number of bytes that may be allocated while decoding even if the file is short.
 const ALWAYS_ALLOWED_BYTES: u64 = 64 << 20;
 
-/// Maximum length of the table in bytes. Tables of trained models have about 50 KB. The values parsed from it take up
-/// to 16 times its bytes.
+/// Maximum length in bytes of the table of contents. That of a trained model has about 50 KB. The values parsed from it
+/// take up to 16 times its bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
 
-/// Contents of the sections.
+/// Contents of the four sections, before compression.
 #[derive(Debug, PartialEq)]
 pub(super) struct Sections {
-    /// Table, in JSON.
+    /// Table of contents, in JSON.
     pub(super) table: Vec<u8>,
     /// Entropy-coded symbols of the Gaussians.
     pub(super) cloud: Vec<u8>,
     /// Entropy-coded symbols of the deformation field.
     pub(super) field: Vec<u8>,
-    /// Plain bytes.
+    /// Bytes stored without entropy coding: exact tensors, extra bytes of the Gaussians, and copied files.
     pub(super) blobs: Vec<u8>,
 }
 
-/// Number of bytes of an archive, by purpose.
+/// Size of an archive in bytes, divided by purpose.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ArchiveSize {
     /// Bytes of the Gaussians.
     pub cloud: u64,
     /// Bytes of the deformation field.
     pub field: u64,
-    /// Number of all other bytes.
+    /// All other bytes.
     pub rest: u64,
 }
 
 impl ArchiveSize {
-    /// Returns the sizes of an archive of `total` bytes.
+    /// Divides an archive of `total` bytes: `cloud` bytes for Gaussians, `field` bytes for the deformation field, and
+    /// the rest.
     fn new(total: u64, cloud: u64, field: u64) -> ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
 
-    /// Returns the number of bytes of the archive.
+    /// Returns the size of the whole archive in bytes.
     pub fn total(&self) -> u64 {
         self.cloud + self.field + self.rest
     }
 }
 
-/// Description of a defect of an archive, without the path of its file.
+/// Defect of an archive: where it is, what was expected and what was found. Lacks the path of the file.
 #[derive(Debug)]
 pub(super) struct Damage {
     place: String,
@@ -81,7 +83,7 @@ pub(super) struct Damage {
 }
 
 impl Damage {
-    /// Returns a defect at `place`.
+    /// Returns a defect at `place`, a part of the file such as a section.
     pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into() }
     }
@@ -93,10 +95,10 @@ impl Damage {
     }
 }
 
-/// Returns the bytes of an archive and their numbers by purpose.
+/// Returns the bytes of an archive, and its size by purpose.
 ///
 /// # Errors
-/// Compression fails.
+/// Fails if the compression fails.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let pack = |bytes: &[u8]| {
         zstd::bulk::compress(bytes, ZSTD_LEVEL)
@@ -120,16 +122,18 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     Ok((out, parts))
 }
 
-/// Head of an archive.
+/// Header of an archive.
 pub(super) struct ArchiveHeader {
     /// Length of the whole file in bytes.
     whole: u64,
-    /// For each section: bytes in the file, bytes of content, checksum of the bytes in the file.
+    /// For each section: number of bytes in the file, number of bytes of content, and checksum of the bytes in the
+    /// file.
     sections: [[u64; 3]; SECTIONS],
 }
 
 impl ArchiveHeader {
-    /// Parses the head of a file of `whole` bytes. `head` has at least [`HEAD`] bytes, unless the file is shorter.
+    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEAD`] bytes of the file or more, or the
+    /// whole file if it is shorter.
     pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
@@ -171,26 +175,26 @@ impl ArchiveHeader {
         Ok(ArchiveHeader { whole, sections })
     }
 
-    /// Returns the memory in bytes of the file and the contents of its sections, each counted twice: as a whole and in
-    /// parts.
+    /// Returns the bytes of memory that decoding takes: the file and the contents of its sections, each counted twice
+    /// (as a whole and in parts).
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;
         2 * self.whole + 16 * table + 2 * blobs
     }
 
-    /// Checks that reading the archive at `path` stays within `memory`.
+    /// Fails if reading the archive at `path` takes more than `memory`.
     pub(super) fn check_memory(&self, path: &Path, memory: ReadLimit) -> Result<()> {
         memory.check(path, "head", "the archive and its content", self.bytes())
     }
 }
 
-/// Returns the sections of an archive with head `head`, after verifying their checksums, and the sizes by purpose.
+/// Returns the sections of an archive with header `head`, after verifying their checksums, and its size by purpose.
 pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
     let mut rest = &bytes[HEAD..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
     for (k, name) in NAMES.iter().enumerate() {
         let [stored, _, checksum] = head.sections[k];
-        // The head was parsed with the length of `bytes`, so this fails only if `bytes` changed.
+        // The header was parsed with the length of `bytes`, so this fails only if `bytes` changed.
         let Some((own, after)) = rest.split_at_checked(stored as usize) else {
             return Err(Damage::new(name, format!("{stored} bytes"), format!("{} bytes", rest.len())));
         };
@@ -212,8 +216,8 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes` may be allocated for a file of `length` bytes. `None` stands for a number that overflowed and is
-/// refused.
+/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. `None` stands for a number that
+/// overflowed and is refused.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

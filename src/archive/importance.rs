@@ -1,11 +1,11 @@
-//! Relative influence of quantization errors in the channels, rows and columns of a tensor of the deformation field on
-//! the output of the field.
+//! Estimates how strongly quantization errors in each channel, row and column of a tensor change the output of the
+//! deformation field.
 //!
-//! In: a state dict, positions and times. Out: for every tensor the offsets added to its quantization step, by channel
-//! of a plane, by row and column of a matrix. The estimate is of first order and assumes that the errors of different
-//! values are independent. An error of a plane is multiplied by the product of the five other planes, an error of a
-//! weight by the input of that weight, and both by the weights of all later layers. Only the writer of an archive uses
-//! these numbers, so rounding differences are harmless.
+//! In: a state dict (tensors by name), positions and times. Out: for every tensor the offsets added to its quantization
+//! step, one per channel of a plane, or one per row and column of a matrix. The estimate is of first order and assumes
+//! that the errors of different values are independent. An error of a plane is multiplied by the product of the five
+//! other planes, an error of a weight by the input of that weight, and both by the weights of all later layers. Only
+//! the writer of an archive uses these numbers, so rounding differences between machines are harmless.
 
 use std::collections::BTreeMap;
 
@@ -13,17 +13,18 @@ use super::field::Role;
 use crate::deform::{Box3, Tap, Tensor, Tensors, tap};
 use crate::model::AttributeValues;
 
-/// Maximum number of Gaussians that are sampled.
+/// Maximum number of Gaussians at which the field is sampled.
 const GAUSSIANS: usize = 256;
-/// Number of times at which each Gaussian is sampled.
+/// Number of times at which the field is sampled for each sampled Gaussian.
 const TIMES: usize = 4;
-/// Granularity of offsets in eighths of an octave: half an octave.
+/// Offsets are multiples of this many eighths of an octave, which is half an octave.
 const OFFSET_UNIT: f64 = 4.0;
 /// Maximum absolute offset, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
-/// Returns the offsets added to the steps of each tensor, in eighths of an octave: by channel of a plane, by row and
-/// then by column of a matrix. Empty if the field has no planes or an unknown structure.
+/// Returns for each tensor the offsets added to its quantization step, in eighths of an octave: one per channel of a
+/// plane; for a matrix one per row, followed by one per column. Returns an empty map if the field has no planes or an
+/// unknown structure.
 pub fn offsets(
     field: &BTreeMap<String, Role>,
     tensors: &Tensors,
@@ -35,13 +36,13 @@ pub fn offsets(
     let mut found = BTreeMap::new();
     let Some(space) = space else { return found };
     let Some(trunk) = network.layers("deformation_net.feature_out", 0, 2) else { return found };
-    // Inputs of the trunk at some samples, and for each plane the squares of the factors that its values are multiplied
-    // by.
+    // Inputs of the trunk (the layers that all heads share) at some samples, and for each plane the squares of the
+    // factors that its values are multiplied by.
     let Some(samples) = Samples::new(tensors, position, space, times) else { return found };
     if trunk[0].inputs() != samples.width {
         return found;
     }
-    // Forward pass: mean squares of the inputs of every layer.
+    // Forward pass: computes the mean squares of the inputs of every layer.
     let mut reads: Vec<(WeightLayer<'_>, Vec<f64>)> = Vec::new();
     let mut now = samples.features.clone();
     for layer in &trunk {
@@ -62,13 +63,14 @@ pub fn offsets(
         let output_importance = vec![1.0; output.outputs()];
         let hidden_importance = output.backward(&output_importance, &active_fraction(&inside, hidden.outputs()));
         let input_importance = hidden.backward(&hidden_importance, &active);
-        // Every head has the same total weight here; renders decide how their steps relate.
+        // Every head has the same total importance here; how the steps of different heads relate is decided with
+        // renders.
         let all: f64 = input_importance.iter().sum::<f64>().max(f64::MIN_POSITIVE);
         leaving.iter_mut().zip(&input_importance).for_each(|(sum, x)| *sum += x / all);
         add(&mut found, &hidden, &hidden_importance, &read);
         add(&mut found, &output, &output_importance, &mean_squares(&inside, output.inputs()));
     }
-    // Backward pass through the trunk.
+    // Backward pass through the trunk (the layers that all heads share).
     for (layer, read) in reads.iter().rev() {
         add(&mut found, layer, &leaving, read);
         let ones = vec![1.0; layer.inputs()];
@@ -81,14 +83,15 @@ pub fn offsets(
     found
 }
 
-/// Adds the offsets of a layer: `rows` is the importance of its outputs, `columns` the mean square of its inputs.
+/// Adds the offsets of a layer to `found`. `rows` holds the importance of each output (effect of its errors on the
+/// result), `columns` the mean square of each input.
 fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
 }
 
-/// Returns offsets, in eighths of an octave, such that steps are proportional to 1/√importance, with a geometric mean
-/// of one. Importance below 1e-4 of the largest counts as 1e-4 of it.
+/// Returns offsets, in eighths of an octave, such that quantization steps are proportional to 1/√importance and their
+/// factors have a geometric mean of one. Importance below 1e-4 of the largest counts as 1e-4 of the largest.
 fn importance_offsets(importance: &[f64]) -> Vec<i8> {
     let most = importance.iter().copied().fold(0.0, f64::max);
     let octaves: Vec<f64> = importance.iter().map(|x| -0.5 * (x.max(1e-4 * most) / most).log2()).collect();
@@ -101,7 +104,7 @@ fn importance_offsets(importance: &[f64]) -> Vec<i8> {
     units.map(|units| (units * OFFSET_UNIT) as i8).collect()
 }
 
-/// Returns the names of the heads that are used.
+/// Returns the names of the heads (output networks) that the field uses.
 fn heads(field: &BTreeMap<String, Role>) -> Vec<String> {
     let head_name = |(name, role): (&String, &Role)| {
         let head =
@@ -111,12 +114,12 @@ fn heads(field: &BTreeMap<String, Role>) -> Vec<String> {
     field.iter().filter_map(head_name).collect()
 }
 
-/// Access to the layers of a deformation field.
+/// Tensors of a deformation field, for finding its layers.
 struct FieldWeights<'a> {
     tensors: &'a Tensors,
 }
 
-/// Linear layer: weights `[outputs, inputs]` and a bias.
+/// Linear layer of a network: weights `[outputs, inputs]` and a bias.
 #[derive(Clone)]
 struct WeightLayer<'a> {
     name: String,
@@ -125,37 +128,38 @@ struct WeightLayer<'a> {
 }
 
 impl<'a> FieldWeights<'a> {
-    /// Returns the layer called `name`; `None` if it is missing or malformed.
+    /// Returns the linear layer called `name`; `None` if it is missing or malformed.
     fn layer(&self, name: String) -> Option<WeightLayer<'a>> {
         let weight = self.tensors.get(&format!("{name}.weight")).filter(|weight| weight.shape.len() == 2)?;
         let bias = self.tensors.get(&format!("{name}.bias")).filter(|bias| bias.data.len() == weight.shape[0])?;
         Some(WeightLayer { name, weight, bias })
     }
 
-    /// Returns the layers with numbers `first`, `first + by`, …; `None` if there is none.
+    /// Returns the layers of the network `name` that are numbered `first`, `first + by`, and so on; `None` if there is
+    /// none.
     fn layers(&self, name: &str, first: usize, by: usize) -> Option<Vec<WeightLayer<'a>>> {
         let layers = (0..).map_while(|k| self.layer(format!("{name}.{}", first + k * by)));
         Some(layers.collect::<Vec<_>>()).filter(|layers| !layers.is_empty())
     }
 
-    /// Returns the two layers of a head.
+    /// Returns the two layers of the head (output network) `name`; `None` if one is missing or malformed.
     fn head(&self, name: &str) -> Option<[WeightLayer<'a>; 2]> {
         Some([self.layer(format!("{name}.1"))?, self.layer(format!("{name}.3"))?])
     }
 }
 
 impl WeightLayer<'_> {
-    /// Returns the number of inputs.
+    /// Returns the number of inputs of the layer.
     fn inputs(&self) -> usize {
         self.weight.shape[1]
     }
 
-    /// Returns the number of outputs.
+    /// Returns the number of outputs of the layer.
     fn outputs(&self) -> usize {
         self.weight.shape[0]
     }
 
-    /// Returns the outputs of all samples.
+    /// Returns the outputs of the layer for all samples, given its `inputs` for all samples.
     fn run(&self, inputs: &[f32]) -> Vec<f32> {
         let outputs_of = |sample: &[f32]| -> Vec<f32> {
             let rows = self.weight.data.chunks_exact(self.inputs()).zip(&self.bias.data);
@@ -164,8 +168,8 @@ impl WeightLayer<'_> {
         inputs.chunks_exact(self.inputs()).flat_map(outputs_of).collect()
     }
 
-    /// Returns the importance of the inputs, given that of the outputs, times the fraction `active` of samples in which
-    /// each input is above zero.
+    /// Returns the importance of each input of the layer (effect of its errors on the result). `outputs` is the
+    /// importance of each output; `active` is the fraction of samples in which each input is above zero.
     fn backward(&self, outputs: &[f64], active: &[f64]) -> Vec<f64> {
         let mut inputs = vec![0.0; self.inputs()];
         for (row, output_importance) in self.weight.data.chunks_exact(self.inputs()).zip(outputs) {
@@ -176,7 +180,7 @@ impl WeightLayer<'_> {
     }
 }
 
-/// Returns the mean square of each of `width` values over all samples.
+/// Returns the mean square over all samples of each of the `width` values of a sample.
 fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     let mut sums = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
@@ -186,7 +190,7 @@ fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     sums.iter().map(|sum| sum / count).collect()
 }
 
-/// Returns the fraction of samples in which each of `width` values is above zero.
+/// Returns for each of the `width` values of a sample the fraction of samples in which it is above zero.
 fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
     let mut counts = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
@@ -196,22 +200,22 @@ fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
     counts.iter().map(|count| count / all).collect()
 }
 
-/// Inputs of the trunk at some positions and times.
+/// Inputs of the trunk (the layers that all heads share) at some positions and times.
 struct Samples {
-    /// Number of inputs of the trunk.
+    /// Number of inputs of the trunk (the layers that all heads share).
     width: usize,
-    /// Inputs, `[samples, width]`.
+    /// Inputs of the trunk, `[samples, width]`.
     features: Vec<f32>,
-    /// For every plane: its name, the index of its first channel among the inputs, and by channel the sum over the
-    /// samples of the squared product of the five other planes.
+    /// For every plane: its name, the index of its first channel among the inputs, and for each channel the sum over
+    /// all samples of the squared product of the five other planes.
     plane_factors: Vec<(String, usize, Vec<f64>)>,
 }
 
-/// Axes of the six planes; 3 is time.
+/// The two axes of each of the six feature planes; 0 to 2 are x, y and z, 3 is time.
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the planes at some Gaussians and times; `None` if the planes are missing or malformed.
+    /// Evaluates the planes for some Gaussians at some times; `None` if the planes are missing or malformed.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
@@ -232,7 +236,7 @@ impl Samples {
         for sample in 0..count * TIMES {
             let (i, k) = (sample / TIMES, sample % TIMES);
             let [x, y, z] = space.normalized(position.row(i * position.len() / count));
-            // Times differ between Gaussians.
+            // Each Gaussian is sampled at other times.
             let part = (k as f32 + (i as f32 * 0.618).fract()) / TIMES as f32;
             let at = [x, y, z, first + part * (last - first)];
             for planes in &levels {
@@ -261,7 +265,7 @@ impl Samples {
     }
 }
 
-/// Returns all channels of a plane at a point, interpolated bilinearly.
+/// Returns the values of all channels of a plane at the point `at` (x, y, z, time), interpolated bilinearly.
 fn read(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
     let [channels, rows, columns] = [plane.shape[1], plane.shape[2], plane.shape[3]];
     let (a, b): (Tap, Tap) = (tap(at[axes[0]], columns), tap(at[axes[1]], rows));

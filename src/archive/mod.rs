@@ -2,9 +2,9 @@
 //! that keep the renders good, and entropy coded.
 //!
 //! In: [`Content`] and [`Steps`]. Out: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the content.
-//! Every quantized value is restored within half a step of its grid, every other byte exactly. Texels that no Gaussian
-//! reads are restored as the nearest stored texels or an average of their neighbors; tensors that nothing reads are
-//! restored as zeros.
+//! Every quantized value is restored with an error of at most half a quantization step, every other byte exactly.
+//! Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors; tensors
+//! that nothing reads are restored as zeros.
 
 mod cloud;
 mod entropy;
@@ -37,71 +37,72 @@ use crate::model::{Attributes, Gaussians};
 use field::{Readers, TensorEntry};
 use file::{ArchiveHeader, Damage, Sections};
 
-/// Name of the tensor that holds the box covered by the planes.
+/// Name of the tensor that holds the box of space that the feature planes cover.
 pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 
-/// Content of an archive.
+/// Everything that an archive stores, in decoded form.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Content {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
-    /// Role of each tensor of the deformation field; empty if there is no field.
+    /// How the deformation field uses each of its tensors, by name; empty if there is no field.
     pub field: BTreeMap<String, Role>,
-    /// Tensors of the deformation field.
+    /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
     /// First and last time at which the deformation field is evaluated.
     pub times: [f32; 2],
-    /// Extra (non-Gaussian) bytes of every Gaussian, the same number for each, one Gaussian after another.
+    /// Extra bytes of every Gaussian that are no attributes (for example, other PLY properties). Each Gaussian has the
+    /// same number of them; they are stored one Gaussian after another.
     pub beside: Vec<u8>,
-    /// Files and other bytes, by name.
+    /// Copied files and other bytes, by name.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// Quantization steps of a content.
+/// Quantization steps for encoding a [`Content`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Steps {
-    /// Steps of the attributes of the Gaussians.
+    /// Quantization step of each attribute of the Gaussians.
     pub cloud: CloudSteps,
-    /// Steps of the tensors of the deformation field.
+    /// Quantization step of each tensor of the deformation field.
     pub field: FieldSteps,
 }
 
-/// Encoded archive.
+/// Encoded archive and how its bytes are used.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Encoded {
-    /// Bytes of the file.
+    /// Bytes of the archive file.
     pub bytes: Vec<u8>,
-    /// Number of bytes by purpose.
+    /// Size of the archive in bytes, divided by purpose.
     pub parts: ArchiveSize,
-    /// For every Gaussian of the archive, its index in the content.
+    /// For each Gaussian in the order of the archive, its index in the encoded [`Content`].
     pub order: Vec<u32>,
-    /// Approximate number of bits of each attribute and of each quantized tensor, by name.
+    /// Approximate number of bits that each attribute and each quantized tensor take, by name.
     pub bits: BTreeMap<String, f64>,
 }
 
-/// Table of an archive: everything except entropy-coded symbols and plain bytes (blobs).
+/// Table of contents of an archive: everything except entropy-coded symbols and plain bytes (blobs).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Table {
     cloud: cloud::PointCloudShape,
-    /// Bits of the first and the last time; decimal text would round them.
+    /// Bit patterns of the first and the last time (f32); decimal text would round them.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Number of extra bytes per Gaussian.
+    /// Number of extra bytes per Gaussian that are no attributes.
     beside: usize,
-    /// Names and lengths of files.
+    /// Names and lengths in bytes of the copied files.
     files: Vec<(String, usize)>,
 }
 
-/// Encodes `content`.
+/// Encodes `content` with the quantization steps `steps`.
 ///
 /// # Errors
-/// A value is not finite, or a step or tensor is not allowed in an archive; the error names it.
+/// Fails if a value is not finite, or if a step or tensor is not allowed in an archive; the error names it.
 pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     check(content, steps)?;
     let mut bits = BTreeMap::new();
     let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
-    // Positions as a reader will decode them.
+    // Positions as a reader of the archive will decode them.
     let stored =
         cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
     let readers = Readers { position: &stored.position, space: space(content), times: content.times };
@@ -126,7 +127,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
         files: content.files.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect(),
     };
     let mut blobs: Vec<u8> = exact.iter().flat_map(|value| value.to_le_bytes()).collect();
-    // Ordered by byte position in the row, so that similar bytes are adjacent.
+    // The bytes are ordered by their place in the row of a Gaussian first, so that similar bytes are adjacent.
     for at in 0..width {
         blobs.extend(order.iter().map(|&id| content.beside[id as usize * width + at]));
     }
@@ -139,15 +140,15 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// Decodes the archive `bytes`, read from `path`.
 ///
 /// # Errors
-/// The bytes are not an archive, are truncated or damaged, have another version, or declare more than they can hold or
-/// than `memory` allows. Declared sizes are checked before anything is allocated.
+/// Fails if the bytes are not an archive, are truncated or damaged, have another version, or declare more than they can
+/// hold or than `memory` allows. Declared sizes are checked before anything is allocated.
 pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
     let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
     head.check_memory(path, memory)?;
     let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
     let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
-    // While decoding, two values of each Gaussian and its error size are kept.
+    // While decoding, two values and one mean error size (12 bytes) are kept for each Gaussian.
     let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
@@ -156,12 +157,13 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, 
 /// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the rest is read.
 ///
 /// # Errors
-/// The head is not that of an archive of this length; the archive and its content exceed `memory`.
+/// Fails if these bytes are not the header of an archive of this length, or if the archive and its content exceed
+/// `memory`.
 pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
     ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.check_memory(path, memory)
 }
 
-/// Parses the table of an archive of `length` bytes and checks that its numbers are consistent.
+/// Parses the table of contents of an archive of `length` bytes and checks that its numbers are consistent.
 fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
     let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
@@ -180,7 +182,7 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-/// Decodes the sections of an archive with a checked table.
+/// Decodes the sections of an archive whose table of contents has been checked.
 fn decoded(
     sections: Sections,
     table: Table,
@@ -216,7 +218,7 @@ fn decoded(
         content.files.insert(name, own.to_vec());
         rest = after;
     }
-    // The box is one of the exact tensors; it is needed before planes are decoded.
+    // The box of space is one of the exact tensors; it is needed before planes are decoded.
     let before = table.tensors.iter().take_while(|entry| entry.name != BOX_TENSOR).filter(count);
     let start: usize = before.filter_map(TensorEntry::values).sum();
     let has_box = table.tensors.iter().any(|entry| entry.name == BOX_TENSOR && entry.role == Role::Exact);
@@ -231,22 +233,23 @@ fn decoded(
     Ok((content, parts))
 }
 
-/// Returns the box covered by the planes of the deformation field; `None` without such a field.
+/// Returns the box of space that the feature planes of the deformation field cover; `None` without such a field.
 pub fn space(content: &Content) -> Option<Box3> {
     content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
 }
 
-/// Rounds `attributes` of the Gaussians to their grids, as in an archive, but without changing their order.
+/// Rounds the attributes with the indices `attributes` in [`ATTRIBUTES`] to their quantization grids, as an archive
+/// would, but without changing the order of the Gaussians.
 pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     cloud::round(cloud, steps, attributes);
 }
 
-/// Returns the values of attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
+/// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
 pub fn attribute(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
     cloud::values(cloud, k)
 }
 
-/// Checks that every value is finite and every step is within [`STEPS`].
+/// Checks that every value is finite and that every quantization step is within [`STEPS`].
 fn check(content: &Content, steps: &Steps) -> Result<()> {
     for column in Attributes::all().iter() {
         let values = content.cloud.column(column);

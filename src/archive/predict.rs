@@ -1,18 +1,18 @@
-//! Prediction of a value: the mean of its plane plus a weighted sum of the differences of known values from their
-//! means.
+//! Prediction of a value: a mean plus a weighted sum of differences. Each difference is a known neighboring value less
+//! its own mean.
 
-/// Denominator of the weights: they are multiples of 1/64.
+/// Denominator of the predictor weights, which are multiples of 1/64.
 const WEIGHT_DENOMINATOR: f32 = 64.0;
 
-/// Weights of `N` differences, each in 64ths from −2 to 127/64.
+/// Predictor weights of `N` differences, in 64ths: from −128 (weight −2) to 127.
 pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
-/// Returns the weights as f32.
+/// Returns the predictor weights as plain factors (64 becomes 1).
 pub(super) fn factors<const N: usize>(parts: &PredictorWeights<N>) -> [f32; N] {
     parts.map(|part| f32::from(part) / WEIGHT_DENOMINATOR)
 }
 
-/// Returns the prediction: `mean` plus the weighted `differences`, summed in order.
+/// Returns the predicted value: `mean` plus the sum of `differences` times `factors`, added in order.
 #[inline(always)]
 pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], differences: &[f32; N]) -> f32 {
     let mut sum = mean;
@@ -22,12 +22,12 @@ pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], difference
     sum
 }
 
-/// Least-squares fit of predictor weights.
+/// Least-squares fit of the weights with which a value is predicted from `N` differences.
 #[derive(Debug)]
 pub(super) struct PredictorFit<const N: usize> {
-    /// Sums of products of differences (lower triangle).
+    /// For each pair of differences, the sum of their products over all samples (lower triangle).
     products: [[f64; N]; N],
-    /// Sums of products of differences with the value.
+    /// For each difference, the sum over all samples of its product with the value to predict.
     with_value: [f64; N],
 }
 
@@ -37,7 +37,7 @@ impl<const N: usize> PredictorFit<N> {
         PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }
 
-    /// Adds a sample: `value`, less its mean, next to `differences`.
+    /// Adds a sample: `value`, from which its mean has been subtracted, and the `differences` that predict it.
     #[inline(always)]
     pub(super) fn add(&mut self, differences: &[f32; N], value: f32) {
         for i in 0..N {
@@ -48,8 +48,8 @@ impl<const N: usize> PredictorFit<N> {
         }
     }
 
-    /// Returns the weights: solves the normal equations by Cholesky factorization, with a ridge of 1e-4 times the mean
-    /// diagonal so that they are solvable. All weights are 0 if every difference is 0 or one is not finite.
+    /// Returns the fitted weights. Solves the normal equations by Cholesky factorization, with a ridge of 1e-4 times
+    /// the mean diagonal so that they are solvable. All weights are 0 if all differences are 0 or one is not finite.
     pub(super) fn parts(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {

@@ -1,46 +1,48 @@
 //! Codes a tensor as channels of rows of values; each value is predicted from its neighbors to the left and above.
 //!
-//! In: values `[channels, rows, columns]`, and a class for every place of a channel, which gives its step or marks it
-//! as unread. Out: symbols, and the restored values. Memory: three rows.
+//! In: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the quantization
+//! step of the place or marks it as never read. Out: symbols, and the restored values. Memory: three rows.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
 use super::step::QuantizationGrid;
 
-/// Number of values from which a value is predicted: left, above, above left, above right, two to the left, two above.
+/// Number of neighbors from which a value is predicted: left, above, above left, above right, two to the left, two
+/// above.
 pub(super) const NEIGHBORS: usize = 6;
 
-/// Class of a place that is never read.
+/// Class of a place (row and column) that the deformation field never reads.
 pub(super) const UNREAD: u8 = u8::MAX;
 
-/// Tensor with its quantization grids.
+/// Shape of a tensor with the quantization grids of its values.
 pub(super) struct QuantizedTensor<'a> {
     pub(super) channels: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
-    /// Rows that are stored; rows before and after repeat the nearest stored row.
+    /// Range of rows that are stored. Rows before and after it are restored as copies of the nearest stored row.
     pub(super) stored: std::ops::Range<usize>,
-    /// Class of every place of a channel, `[rows, columns]`, or of one row that holds for all rows, `[columns]`.
+    /// Class of every place of a channel, `[rows, columns]`, or of one row that holds for all rows, `[columns]`. The
+    /// class selects the quantization grid.
     pub(super) classes: &'a [u8],
-    /// Grid of every class of every channel.
+    /// Returns the quantization grid for a channel and a class.
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
-    /// Number of classes.
+    /// Number of classes that select a quantization grid.
     pub(super) class_count: usize,
-    /// Mean that predictions start from.
+    /// Mean value, from which predictions start.
     pub(super) mean: f32,
 }
 
-/// Values from which a place is predicted.
+/// Known values from which the value at a place (row and column) is predicted.
 struct Context {
-    /// Differences from the mean.
+    /// Values of the neighbors less the mean of the tensor.
     values: [f32; NEIGHBORS],
-    /// Mean size of the prediction errors of the neighbors, in steps of this place.
+    /// Mean absolute prediction error of the neighbors, in quantization steps of this place.
     size: f32,
 }
 
 impl QuantizedTensor<'_> {
-    /// Returns the mean of the values that are read.
+    /// Returns the mean of the values `data` at places that are read.
     pub(super) fn mean(&self, data: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0usize);
         for plane in data.chunks_exact((self.rows * self.columns).max(1)) {
@@ -55,7 +57,7 @@ impl QuantizedTensor<'_> {
         sum / count.max(1) as f64
     }
 
-    /// Returns the classes of a row.
+    /// Returns the class of every place in `row`.
     fn row_classes(&self, row: usize) -> &[u8] {
         if self.classes.len() == self.columns {
             self.classes
@@ -64,7 +66,7 @@ impl QuantizedTensor<'_> {
         }
     }
 
-    /// Returns the predictor weights with the least squared error. `data` becomes the rounded values.
+    /// Returns the predictor weights with the least squared prediction error. Rounds `data` to the quantization grids.
     pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBORS> {
         let mut fit = PredictorFit::new();
         self.visit(data, |_, value, context, grid| {
@@ -75,7 +77,7 @@ impl QuantizedTensor<'_> {
         fit.parts()
     }
 
-    /// Writes the values; `data` becomes the restored values.
+    /// Encodes the values `data` and replaces them by the values that a decoder restores.
     pub(super) fn encode(
         &self,
         parts: &PredictorWeights<NEIGHBORS>,
@@ -92,7 +94,7 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Reads the values into `data`.
+    /// Decodes the values into `data`.
     pub(super) fn decode(
         &self,
         parts: &PredictorWeights<NEIGHBORS>,
@@ -109,12 +111,13 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Visits every place that is read, row by row. `code` returns the value at the place and the absolute prediction
-    /// error, which become the context of later places. Places that are never read get the mean of their neighbors.
+    /// Visits every place (row and column) that is read, row by row. `code` returns the restored value at the place and
+    /// the absolute prediction error; later places are predicted from both. Places that are never read get the mean of
+    /// their neighbors.
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
-        // Two extra places at the left and one at the right.
+        // Each line has two extra places at the left and one at the right.
         let line = || vec![0.0f32; columns + 3];
         let (mut above2, mut above, mut here) = (line(), line(), line());
         let (mut sizes_above, mut sizes) = (line(), line());

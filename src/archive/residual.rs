@@ -1,11 +1,12 @@
-//! Codes prediction errors; the model of each is chosen by the size of the errors around it.
+//! Codes prediction errors with entropy models, which are chosen by the size of neighboring errors.
 //!
 //! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. Its position within the
 //! class and its sign are plain bits, because probabilities within a class hardly differ.
 
 use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 
-/// First magnitude and number of bits of each class; the last class is unlimited.
+/// Smallest magnitude of each class of errors, and number of bits of a position in the class; the last class is
+/// unlimited.
 const CLASSES: [(u64, u32); SYMBOLS] = [
     (0, 0),
     (1, 0),
@@ -25,28 +26,30 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
     (128, 0),
 ];
 
-/// Number of models: half octaves of the expected size, from a quarter of a step.
+/// Number of entropy models. Each is for half an octave of the expected error, beginning at a quarter of a quantization
+/// step.
 const CONTEXTS: usize = 16;
 
-/// Models shared by a group of similar planes.
+/// Entropy models of prediction errors that similar planes or tensors share, by the expected size of the error.
 #[derive(Debug, Clone)]
 pub(super) struct Residuals([SymbolModel; CONTEXTS]);
 
 impl Residuals {
-    /// Returns models that have seen nothing.
+    /// Returns models that have seen no error yet.
     pub(super) fn new() -> Residuals {
         Residuals([SymbolModel::NEW; CONTEXTS])
     }
 
-    /// Returns the model for `size`, the mean magnitude of the errors around, in steps. The index is the exponent and
-    /// the first bit of the mantissa.
+    /// Returns the entropy model for errors of the expected size `size`: the mean magnitude of neighboring errors, in
+    /// quantization steps. Its index consists of the exponent of `size` and the first bit of the mantissa.
     #[inline(always)]
     fn model_for_size(&mut self, size: f32) -> &mut SymbolModel {
         let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
         &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Writes a prediction error.
+    /// Writes the prediction error `residual` (in quantization steps). `size` is the expected magnitude, which selects
+    /// the model.
     pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut SymbolEncoder) {
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
@@ -62,7 +65,7 @@ impl Residuals {
         }
     }
 
-    /// Reads a prediction error.
+    /// Reads a prediction error, in quantization steps. `size` is the expected magnitude, which selects the model.
     #[inline(always)]
     pub(super) fn decode(&mut self, size: f32, from: &mut SymbolDecoder<'_>) -> i64 {
         let class = from.symbol(self.model_for_size(size));

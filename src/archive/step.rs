@@ -1,9 +1,11 @@
-//! Steps of uniform quantization grids, given by whole numbers so that every machine computes the same values.
+//! Steps of uniform quantization grids. Each is given by a whole number, so that every machine computes the same
+//! values.
 //!
-//! Step `k` is 2^(k/8). A value `v` on the grid with step `s` is stored as the multiple `round(v / s)` and restored as
-//! the nearest f32 of that multiple, so that |v' − v| ≤ s/2, except for half a unit in the last place of an f32.
+//! Step `k` is 2^(k/8). A value `v` on the grid with step `s` is stored as the whole number `round(v / s)` and restored
+//! as `v'`, the f32 nearest to this number times `s`. So |v' − v| ≤ s/2, plus at most half a unit in the last place of
+//! an f32.
 
-/// 2^(i/8).
+/// The powers 2^(i/8) for `i` from 0 to 7.
 const EIGHTHS: [f64; 8] = [
     1.0,
     1.090_507_732_665_257_7,
@@ -15,27 +17,28 @@ const EIGHTHS: [f64; 8] = [
     1.834_008_086_409_342_4,
 ];
 
-/// Range of allowed steps: 2^−40 to 2^40.
+/// Allowed step numbers `k`; the steps range from 2^−40 to 2^40.
 pub const STEPS: std::ops::RangeInclusive<i32> = -320..=320;
 
-/// Maximum absolute multiple, so that multiples and sums of them are exact in an f64.
+/// Maximum absolute value of a stored multiple of the step, so that multiples and sums of them are exact in an f64.
 const MAX_MULTIPLE: f64 = (1u64 << 50) as f64;
 
 /// Constant 1.5 · 2^52: adding and subtracting it rounds to the nearest whole number, halves to even, for |x| < 2^51.
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
-/// Returns the step `k`, 2^(k/8).
+/// Returns the quantization step 2^(k/8).
 pub fn step(k: i32) -> f64 {
     let whole = k.div_euclid(8).clamp(-1000, 1000);
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// Returns the `k` whose step is closest to `size`, which is positive, in octaves; within [`STEPS`].
+/// Returns the number `k` in [`STEPS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size` must be
+/// positive.
 pub fn nearest(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }
 
-/// Uniform grid of quantized values.
+/// Uniform grid of the values to which quantization rounds: all multiples of a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct QuantizationGrid {
     step: f64,
@@ -43,44 +46,44 @@ pub(super) struct QuantizationGrid {
 }
 
 impl QuantizationGrid {
-    /// Returns the grid with step `k`.
+    /// Returns the grid with the step 2^(k/8).
     pub(super) fn new(k: i32) -> QuantizationGrid {
         let step = step(k);
         QuantizationGrid { step, inverse: 1.0 / step }
     }
 
-    /// Returns the multiple nearest to `value`.
+    /// Returns the whole number of steps nearest to `value`; 0 for NaN.
     #[inline(always)]
     pub(super) fn multiple(self, value: f32) -> i64 {
         self.nearest(f64::from(value))
     }
 
-    /// Returns the multiple nearest to `value`, at most [`MAX_MULTIPLE`] in magnitude; 0 for NaN.
+    /// Returns the whole number of steps nearest to `value`, at most [`MAX_MULTIPLE`] in magnitude; 0 for NaN.
     #[inline(always)]
     pub(super) fn nearest(self, value: f64) -> i64 {
         let x = (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
         (x + ROUNDING - ROUNDING) as i64
     }
 
-    /// Returns the value of a multiple.
+    /// Returns `multiple` times the step.
     #[inline(always)]
     pub(super) fn value(self, multiple: i64) -> f32 {
         (multiple as f64 * self.step) as f32
     }
 
-    /// Returns `size` in steps.
+    /// Returns `size` divided by the step.
     #[inline(always)]
     pub(super) fn in_steps(self, size: f32) -> f32 {
         size * self.inverse as f32
     }
 
-    /// Returns the step.
+    /// Returns the step, which is the distance of neighboring grid values.
     #[inline(always)]
     pub(super) fn size(self) -> f32 {
         self.step as f32
     }
 
-    /// Returns the nearest value on the grid.
+    /// Returns the grid value nearest to `value`.
     pub(super) fn round(self, value: f32) -> f32 {
         self.value(self.multiple(value))
     }

@@ -8,7 +8,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::*;
 use crate::deform::{Tensor, tap};
 
-/// Deterministic pseudo-random numbers.
+/// Generator of deterministic pseudo-random numbers.
 struct SeededNoise(u64);
 
 impl SeededNoise {
@@ -23,7 +23,7 @@ fn tensor(noise: &mut SeededNoise, shape: &[usize]) -> Tensor {
     Tensor { shape: shape.to_vec(), data }
 }
 
-/// Returns a content of `count` Gaussians with tensors of every role.
+/// Returns an archive content of `count` Gaussians with tensors of every role (plane, weights, exact, unread).
 fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
     let mut noise = SeededNoise(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
@@ -111,7 +111,8 @@ proptest! {
                 Role::Plane(_) | Role::TimePlane(_) => (),
             }
         }
-        // The error of a plane at a Gaussian is at most half a step at the coarsest weight that the Gaussian may have.
+        // The error of a plane at a Gaussian is at most half the coarsest quantization step that its read weight
+        // allows.
         let space = space(&content).unwrap();
         for (name, axes) in [("a.plane.xy", [0, 1]), ("a.plane.yz", [1, 2])] {
             let [rows, columns] = [7usize, 9];
@@ -125,8 +126,8 @@ proptest! {
                             let at = (c * rows + row as usize) * columns + column as usize;
                             let off = f64::from(content.tensors[name].data[at] - back.tensors[name].data[at]).abs();
                             let step = step(steps.field.0[name].step);
-                            // If a texel is read one octave less, its step is half an octave larger; classes are whole
-                            // octaves.
+                            // If the read weight of a texel is one octave less, its step is half an octave larger;
+                            // classes are whole octaves.
                             prop_assert!(off * weight <= 0.75 * step + 1e-4 * weight, "{name} {off} x {weight} of {step}");
                         }
                     }
@@ -150,7 +151,7 @@ proptest! {
     }
 }
 
-/// Recomputes the checksums of an archive, as far as its lengths are valid.
+/// Updates the checksums of an archive to its present bytes, as far as its lengths are valid.
 fn reseal(bytes: &mut [u8]) {
     let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
     let head: usize = 12 + 4 * 24 + 8;
@@ -203,7 +204,7 @@ fn impossible_lengths_are_refused_before_allocation() {
         reseal(&mut bytes);
         assert!(decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).is_err());
     }
-    // A consistent table that declares too many Gaussians.
+    // A consistent table of contents that declares too many Gaussians.
     let (Sections { table, cloud, field, blobs }, _) =
         file::read(&ArchiveHeader::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
     let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");

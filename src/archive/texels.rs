@@ -1,25 +1,27 @@
-//! Determines which texels of a plane are read, and with what total weight.
+//! Determines which texels of a feature plane are read by some Gaussian, and with what total weight.
 //!
-//! In: canonical positions as they are stored, the box, the axes and size of a plane. Out: a class for each texel.
-//! Writer and reader of an archive both compute the classes, so they are not stored. Sums and products of f32 in a
-//! fixed order give the same classes on every machine.
+//! In: canonical positions as they are stored, the box of space that the plane covers, its axes and its size. Out: a
+//! class for each texel. Writer and reader of an archive both compute the classes, so they are not stored. Sums and
+//! products of f32 in a fixed order give the same classes on every machine.
 
 use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};
 use crate::model::AttributeValues;
 
-/// Exponent (floor of log2) of the summed squared weights of class 0. Smaller sums also belong to class 0.
+/// Exponent of class 0: floor of log2 of the squared weights with which Gaussians read a texel, summed. Smaller sums
+/// also belong to class 0.
 const MIN_EXPONENT: i32 = -8;
-/// Number of classes of texels.
+/// Number of classes of texels; each class is an octave of the summed squared read weights.
 pub(super) const CLASSES: usize = 16;
 
-/// Returns the summed squared weight of a class in octaves, relative to a texel that is read once with weight 1.
+/// Returns the summed squared read weight of a class as an exponent of 2; 0 for a texel that is read once with weight
+/// 1.
 pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
 
-/// Returns the class of a texel. `squared_weight` is the sum of the squared interpolation weights with which Gaussians
-/// read the texel.
+/// Returns the class of a texel. `squared_weight` is the sum, over the Gaussians that read the texel, of the squared
+/// interpolation weight.
 fn class(squared_weight: f32) -> u8 {
     if squared_weight <= 0.0 {
         return UNREAD;
@@ -28,7 +30,7 @@ fn class(squared_weight: f32) -> u8 {
     (exponent - MIN_EXPONENT).clamp(0, CLASSES as i32 - 1) as u8
 }
 
-/// Returns the classes `[size_b, size_a]` of a plane over two spatial axes.
+/// Returns the class of each texel, `[size_b, size_a]`, of a feature plane over two spatial axes (a, b).
 pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
@@ -44,7 +46,7 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the classes `[size]` of the columns of a plane over a spatial axis and time.
+/// Returns the class of each column, `[size]`, of a feature plane over one spatial axis and time.
 pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {
@@ -56,7 +58,7 @@ pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis:
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the rows of a plane over time that are read at times from `first` to `last`.
+/// Returns the rows of a plane over time that are read at times from `first` to `last`; the plane has `size` rows.
 pub(super) fn time_rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
     let (first, last) = (tap(first, size), tap(last, size));
     let end = if last.fraction > 0.0 { last.high } else { last.low };

@@ -1,4 +1,4 @@
-//! Work folder with the files of cache entries.
+//! Work folder with the files of cache entries (stored results of stages).
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,11 +16,11 @@ use crate::cache::shard::MAX_SHARDS;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::remove_leftovers;
 
-/// Work folder that is read and written.
+/// Open work folder, in which cache entries (stored results of stages) are read and written.
 #[derive(Debug)]
 pub(super) struct CacheDir {
     folder: PathBuf,
-    /// Key on which all keys of this run depend.
+    /// Key on which all keys of this run depend, such as the key of the input.
     context: CacheKey,
     about: String,
 }
@@ -40,17 +40,18 @@ impl CacheDir {
         }
     }
 
-    /// Makes all further keys also depend on `context`.
+    /// Makes all keys used from now on depend on `context` as well.
     pub(super) fn depend_on(&mut self, context: CacheKey) {
         self.context = self.context.and(&context);
     }
 
-    /// Returns the combination of `key` with the context.
+    /// Returns `key` combined with the context, the key on which all keys of this run depend.
     pub(super) fn key(&self, key: CacheKey) -> CacheKey {
         self.context.and(&key)
     }
 
-    /// Returns the indices of the stored shards of `stage`, by the number of shards.
+    /// Returns the indices of the stored shards (parts of a divided stage) of `stage` with the key `key`, grouped by
+    /// the number of shards into which the stage was divided.
     pub(super) fn stored_shards(&self, stage: &str, key: CacheKey) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
         let key = self.key(key).text();
         let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
@@ -63,13 +64,13 @@ impl CacheDir {
         Ok(found)
     }
 
-    /// Returns descriptions of the inputs to which stored shards of `stage` with other keys belong.
+    /// Returns descriptions of the inputs to which stored shards of `stage` with a key other than `key` belong.
     pub(super) fn foreign_inputs(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
         let is_foreign = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
         let mut found = BTreeMap::new();
         for name in names(&self.folder)?.into_iter().filter(is_foreign) {
-            // One shard per key is enough. The input of a damaged shard is unknown.
+            // Opening one shard per key is enough. The input of a damaged shard is unknown.
             if let Entry::Vacant(new) = found.entry(name.key.clone()) {
                 let entry = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
                 new.insert(entry.map_or_else(|_| "an unknown input".to_owned(), |entry| entry.about().to_owned()));
@@ -78,8 +79,8 @@ impl CacheDir {
         Ok(found.into_values().collect())
     }
 
-    /// Reads the value of a cache entry, if it exists. Calls `damaged` with a message for a damaged entry, which counts
-    /// as missing.
+    /// Reads the value of the cache entry `name`; `None` if it is missing or damaged. Calls `damaged` with a message
+    /// about a damaged entry.
     pub(super) fn read<T: DeserializeOwned>(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<T>> {
         let Some(entry) = self.open_entry(name, &damaged)? else { return Ok(None) };
         let found = entry.value();
@@ -87,8 +88,8 @@ impl CacheDir {
         Ok(found.map_err(wrong).ok())
     }
 
-    /// Opens the content of a cache entry, if it exists and is undamaged. Calls `damaged` with a message for a damaged
-    /// one.
+    /// Opens the content of the cache entry `name` for reading; `None` if it is missing or damaged. Calls `damaged`
+    /// with a message about a damaged entry.
     pub(super) fn open(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<Spill>> {
         let at = self.folder.join(name.file());
         let spill = |entry: CacheEntry| {
@@ -115,12 +116,12 @@ impl CacheDir {
         }
     }
 
-    /// Checks that the folder still exists: a vanished folder is an error, not an empty cache.
+    /// Checks that the work folder still exists. A vanished folder is an error, not an empty cache.
     fn check_exists(&self) -> Result<()> {
         fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
     }
 
-    /// Writes a cache entry with the value `found`.
+    /// Writes a cache entry `name` with the value `found`.
     pub(super) fn write<T: Serialize>(&self, name: &EntryName, found: &T) -> Result<()> {
         let mut writer = self.begin_entry(name)?;
         writer.write_value(found)?;
@@ -128,7 +129,7 @@ impl CacheDir {
         Ok(())
     }
 
-    /// Begins to write a cache entry.
+    /// Begins a cache entry `name` and returns the writer of its content.
     pub(super) fn begin_entry(&self, name: &EntryName) -> Result<SpillWriter> {
         self.check_exists()?;
         let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();

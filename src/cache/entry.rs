@@ -1,4 +1,4 @@
-//! File format of cache entries.
+//! File format of cache entries (stored results of stages).
 //!
 //! Layout, all numbers little-endian:
 //!
@@ -29,20 +29,20 @@ use crate::files::digest::hash_rest;
 
 const MAGIC: [u8; 8] = *b"SPLSPIEC";
 const VERSION: u32 = 1;
-/// Bytes of the header before the text.
+/// Number of bytes of the header, which precedes the text (description of the input).
 const HEADER: usize = 48;
 /// Extension of the file names of cache entries.
 pub(super) const EXTENSION: &str = ".piece";
-/// Maximum bytes of all strings in the value of an entry.
+/// Maximum size, bytes, of the buffer into which all strings in the value of an entry are read.
 const MAX_STRING_BYTES: u64 = 8 << 20;
 
 /// File name of a cache entry.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct EntryName {
     pub(super) stage: String,
-    /// Cache key as 32 hexadecimal digits.
+    /// Cache key of the result as 32 hexadecimal digits.
     pub(super) key: String,
-    /// Index of the shard, from 1, and number of shards; (1, 1) is the full result.
+    /// Index of the shard (part of a divided stage), from 1, and number of shards; (1, 1) is the full result.
     pub(super) part: (usize, usize),
 }
 
@@ -59,7 +59,7 @@ impl EntryName {
         }
     }
 
-    /// Parses the file name of a cache entry; returns `None` for other files.
+    /// Parses the file name of a cache entry; returns `None` for the names of other files.
     pub(super) fn parse(file: &str) -> Option<EntryName> {
         let mut fields = file.strip_suffix(EXTENSION)?.split('.');
         let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
@@ -71,12 +71,12 @@ impl EntryName {
             }
         };
         let name = EntryName { stage: stage.to_owned(), key: key.to_owned(), part };
-        // Accept only names that `file` produces.
+        // Accept only names that `EntryName::file` produces.
         (fields.next().is_none() && key.len() == 32 && name.file() == file).then_some(name)
     }
 }
 
-/// Returns the names of all cache entries in `folder`, sorted.
+/// Returns the parsed file names of all cache entries in `folder`, sorted.
 pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
@@ -87,19 +87,20 @@ pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     Ok(found)
 }
 
-/// Writer of the file of a cache entry.
+/// Writer of the file of a cache entry. Its header is written last.
 pub(super) struct EntryWriter {
     file: BufWriter<File>,
     key: u128,
     text: u32,
     length: u64,
     hash: Box<Xxh3>,
-    /// Last error of a write. The serializer does not pass errors on, so they are kept here.
+    /// Last error of a write. The serializer does not return it, so it is kept here.
     pub(super) failed: Option<io::Error>,
 }
 
 impl EntryWriter {
-    /// Begins the file with an empty header and the text `about`.
+    /// Begins the file with an empty header and the text `about`, which describes the input. `key` is the cache key of
+    /// the entry.
     pub(super) fn new(file: File, key: u128, about: &str) -> io::Result<EntryWriter> {
         let mut writer = EntryWriter {
             file: BufWriter::new(file),
@@ -115,12 +116,12 @@ impl EntryWriter {
         Ok(writer)
     }
 
-    /// Returns the file offset of the content.
+    /// Returns the byte offset in the file at which the content begins.
     pub(super) fn start(&self) -> u64 {
         HEADER as u64 + u64::from(self.text)
     }
 
-    /// Writes the header and returns the file, which is open for reading.
+    /// Writes the header with the final lengths and hash. Returns the file, which is open for reading.
     pub(super) fn finish(self) -> io::Result<File> {
         let mut header = Vec::with_capacity(HEADER);
         header.extend_from_slice(&MAGIC);
@@ -149,12 +150,12 @@ impl Write for EntryWriter {
     }
 }
 
-/// Returns a copy of the error.
+/// Returns a copy of `error`, which has no `clone`.
 fn copied_error(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
 }
 
-/// Cache entry that was read and verified, open for reading.
+/// Cache entry whose bytes have been verified, open for reading.
 pub(super) struct CacheEntry {
     file: File,
     about: String,
@@ -162,7 +163,7 @@ pub(super) struct CacheEntry {
     length: u64,
 }
 
-/// Numbers in the header of a cache entry.
+/// Numbers in the header of a cache entry: lengths in bytes of text and content, hash, and cache key.
 struct EntryHeader {
     text: u64,
     content: u64,
@@ -187,10 +188,10 @@ impl EntryHeader {
 }
 
 impl CacheEntry {
-    /// Opens a cache entry and verifies the hash of all its bytes. Returns the reason, as inner `Err`, if the entry is
-    /// damaged or its key is not `key`.
+    /// Opens the cache entry at `path` and verifies the hash of all its bytes. If the entry is damaged or its key is
+    /// not `key`, returns the reason as inner `Err`.
     ///
-    /// Reads the file in plain reads: a memory map of a large entry would count as memory of this process.
+    /// Reads the file without a memory map, which for a large entry would count as memory of this process.
     pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<CacheEntry, String>> {
         let failed = |error| Error::io("read", path)(error);
         let mut file = File::open(path).map_err(Error::io("open", path))?;
@@ -222,19 +223,19 @@ impl CacheEntry {
         Ok(Ok(CacheEntry { file, about, start, length: content }))
     }
 
-    /// Returns the file and the offset of the content.
+    /// Returns the file, and the byte offset in it at which the content begins.
     pub(super) fn into_file(self) -> (File, u64) {
         (self.file, self.start)
     }
 
-    /// Reads the value of the entry.
+    /// Deserializes the content of the entry as a value.
     pub(super) fn value<T: DeserializeOwned>(self) -> postcard::Result<T> {
         // Buffer into which the deserializer reads strings one after the other.
         let mut string_buffer = vec![0; self.length.min(MAX_STRING_BYTES) as usize];
         postcard::from_io((BufReader::new(self.file), &mut string_buffer)).map(|(value, _)| value)
     }
 
-    /// Returns the description of the input that the entry belongs to.
+    /// Returns the description of the input to which the entry belongs.
     pub(super) fn about(&self) -> &str {
         &self.about
     }

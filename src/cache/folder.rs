@@ -1,4 +1,4 @@
-//! Listing and cleaning of a work folder for the command line.
+//! Listing and cleaning of a work folder, for the command `cache`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,26 +13,27 @@ use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;
 
-/// Result in a work folder, complete or in shards.
+/// Stored result of a stage in a work folder, complete or in shards (parts of a divided stage).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Listed {
     /// Name of the stage.
     pub stage: String,
     /// Cache key of the result, 32 hexadecimal digits.
     pub key: String,
-    /// Number of shards; 1: the result is not divided.
+    /// Number of shards into which the stage was divided; 1: the result is not divided.
     pub parts: usize,
-    /// Indices of the shards that are missing.
+    /// Indices of the shards that are not stored, from 1.
     pub missing: Vec<usize>,
-    /// Indices of the damaged shards, which will be computed again.
+    /// Indices of the stored shards that are damaged and will be computed again, from 1.
     pub damaged: Vec<usize>,
-    /// Bytes of all files of the result.
+    /// Number of bytes of all files of the result.
     pub bytes: u64,
-    /// Description of the input that the result belongs to.
+    /// Description of the input to which the result belongs.
     pub belongs_to: String,
 }
 
-/// Returns all results in the work folder `folder`, sorted by input and stage. Reads and verifies every byte.
+/// Returns all stored results in the work folder `folder`, sorted by input and stage. Reads and verifies every byte of
+/// them.
 ///
 /// # Errors
 /// Fails if the folder cannot be read.
@@ -62,7 +63,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     Ok(found)
 }
 
-/// Formats a listing for display.
+/// Formats the listing of a work folder for display.
 pub fn text(listed: &[Listed]) -> String {
     let mut out = String::new();
     for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
@@ -86,8 +87,8 @@ pub fn text(listed: &[Listed]) -> String {
     out
 }
 
-/// Removes all cache entries of the work folder `folder`, and the folder if it is empty then. Returns the number of
-/// files and their bytes.
+/// Removes all cache entries from the work folder `folder`, and the folder itself if it is empty then. Returns the
+/// number of removed files and of their bytes.
 ///
 /// # Errors
 /// Fails if the folder cannot be read or a file cannot be removed.
@@ -100,7 +101,7 @@ pub fn clean(folder: &Path) -> Result<(usize, u64)> {
         files += 1;
     }
     remove_leftovers(folder, EXTENSION);
-    // A folder with files of other programs is not empty, so it stays.
+    // A folder with files of other programs is not empty, so removing it fails and it stays.
     let _ = fs::remove_dir(folder);
     Ok((files, bytes))
 }

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use serde::Serialize;
 use xxhash_rust::xxh3::Xxh3;
 
-/// Digest of everything that a result depends on.
+/// Cache key: digest of everything that a result depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CacheKey(Option<u128>);
 
@@ -13,7 +13,7 @@ impl CacheKey {
     /// Key of a run without a work folder: no result is looked up under it.
     pub const NONE: CacheKey = CacheKey(None);
 
-    /// Returns the digest of `value`, by its bits.
+    /// Returns the digest of the bits of `value`.
     pub fn new(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
         // Every hashed value can be serialized.
@@ -21,7 +21,7 @@ impl CacheKey {
         CacheKey(Some(hash.0.digest128()))
     }
 
-    /// Returns the key that depends on this key and on `value`.
+    /// Returns the key that depends on everything that this key depends on, and on `value`.
     pub fn and(self, value: &impl Serialize) -> CacheKey {
         self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }
@@ -38,7 +38,7 @@ impl Serialize for CacheKey {
     }
 }
 
-/// Writer that hashes the bytes.
+/// Writer that hashes the bytes written to it.
 struct Hash(Xxh3);
 
 impl Write for Hash {

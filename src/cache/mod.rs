@@ -1,14 +1,14 @@
-//! Cache of stage results in a work folder. An interrupted run continues from it, and several processes share work
-//! through it.
+//! Cache of stage results in a work folder. An interrupted run continues from these results, and several processes
+//! divide work by writing their parts into the folder.
 //!
 //! Every result of a stage is a *cache entry*: a file named after the stage and the cache key, the digest of everything
 //! that the result depends on (input, cameras, parameters, version of this program, instruction set of the machine). So
 //! an entry is never out of date; a changed recipe uses entries with other names. A stage that can be divided has
-//! *units* (blocks of Gaussians, views, frame blocks). Shard `i` of `n` is a range of consecutive units, and joined
-//! shards equal the undivided result bit for bit. Entries appear completely or not at all. A damaged entry is computed
-//! again.
+//! *units* (blocks of Gaussians, views, frame blocks). A *shard* is a range of consecutive units, shard `i` of `n`;
+//! joined shards equal the undivided result bit for bit. Entries appear completely or not at all. The result of a
+//! damaged entry is computed again.
 //!
-//! Without a work folder nothing is stored, and the same calls always compute.
+//! Without a work folder nothing is stored, and every call computes its result.
 
 pub(crate) mod dir;
 pub(crate) mod entry;
@@ -35,22 +35,22 @@ pub use folder::{Listed, clean, list, text};
 pub use key::CacheKey;
 pub use spill::{Spill, SpillWriter};
 
-/// Work folder and shard that the user asks for.
+/// Work folder that the user asks for, and the shard (part of a divided stage) to compute.
 #[derive(Debug, Clone)]
 pub struct CacheRequest {
     /// Path of the work folder.
     pub folder: PathBuf,
-    /// Shard of the next stage that can be divided. The run computes only this shard. `None`: the run computes
+    /// Shard to compute of the next stage that can be divided; the run ends after it. `None`: the run computes
     /// everything.
     pub part: Option<Shard>,
 }
 
-/// Cache of stage results, if there is a work folder, and the shard that this run computes.
+/// Cache of stage results, if there is a work folder, and the shard (part of a divided stage) that this run computes.
 #[derive(Debug, Default)]
 pub struct Cache {
     dir: Option<CacheDir>,
     part: Option<Shard>,
-    /// Cache key of the ids of Gaussians that are excluded from the input; `None`: none are excluded.
+    /// Cache key made from the ids of Gaussians that are excluded from the input; `None`: none are excluded.
     absent: Mutex<Option<CacheKey>>,
     notes: Mutex<Vec<String>>,
 }
@@ -61,8 +61,8 @@ impl Cache {
         Cache::default()
     }
 
-    /// Opens the cache in the work folder of `asked`, which is created if it does not exist. `about` describes in words
-    /// what the entries belong to.
+    /// Opens the cache in the work folder of `asked`, which is created if it does not exist. `about` describes the
+    /// input for people; it is stored in every entry.
     ///
     /// # Errors
     /// Fails if the folder cannot be created or the path is not a folder.
@@ -70,25 +70,27 @@ impl Cache {
         Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
-    /// Makes all further keys also depend on `context`.
+    /// Makes all keys used from now on depend on `context` as well.
     pub fn follow_from(&mut self, context: CacheKey) {
         if let Some(dir) = &mut self.dir {
             dir.depend_on(context);
         }
     }
 
-    /// Returns whether results are stored.
+    /// Returns whether results are stored, that is, whether there is a work folder.
     pub fn keeps(&self) -> bool {
         self.dir.is_some()
     }
 
-    /// Makes all further keys also depend on the ids of Gaussians that are excluded from the input, if there are any.
+    /// Makes all keys used from now on depend on the ids of the Gaussians that are excluded from the input, if there
+    /// are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.keeps() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
-    /// Returns the cache key of `value`. Without a work folder returns [`CacheKey::NONE`] and does not hash.
+    /// Returns the cache key of `value`, a digest of its bits. Without a work folder returns [`CacheKey::NONE`] and
+    /// does not hash.
     pub fn key(&self, value: &impl Serialize) -> CacheKey {
         let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
         match (self.keeps(), absent) {
@@ -98,7 +100,7 @@ impl Cache {
         }
     }
 
-    /// Returns the notes for the user since the last call.
+    /// Returns the notes about the cache, for the user, that were added since the last call.
     pub fn take_notes(&self) -> Vec<String> {
         std::mem::take(&mut self.notes.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -123,8 +125,8 @@ impl Cache {
         self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
-    /// Returns the stored result of `stage` for `key`, or computes and stores it. A run of a single shard computes it,
-    /// too, unless `compute` ends the run with [`end_shard_before`](Cache::not_divided).
+    /// Returns the stored result of `stage` for `key`, or computes and stores it. A run that computes only one shard
+    /// also computes this result, unless `compute` ends the run with [`Cache::end_shard_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -142,10 +144,11 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends a run of a single shard before `stage`, which cannot be divided.
+    /// Ends a run that computes only one shard before `stage`, which cannot be divided into shards. Otherwise does
+    /// nothing.
     ///
     /// # Errors
-    /// Fails with [`Error::ShardDone`] in a run of a single shard.
+    /// Fails with [`Error::ShardDone`] if the run computes only one shard.
     pub fn end_shard_before(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
@@ -155,12 +158,13 @@ impl Cache {
         }
     }
 
-    /// Returns the result of `stage` from shards: `compute` is called for consecutive ranges of all `units`, here or in
-    /// other runs, and `join` combines the results in order. The combined result must not depend on the division.
+    /// Returns the result of `stage`, which is computed in shards (ranges of its `units` units of work), by this run or
+    /// by others. `compute` returns the result of a range; `join` combines the results of all ranges in order. The
+    /// combined result must not depend on how the units are divided.
     ///
     /// # Errors
-    /// Fails if `compute` or `join` fails or the folder cannot be used. In a run of a single shard, ends with
-    /// [`Error::ShardDone`] once the shard is stored.
+    /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
+    /// [`Error::ShardDone`] once this shard is stored.
     pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
@@ -187,8 +191,9 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Works like [`Cache::divided`] for content that stays on disk, written by `write`. Without a work folder the
-    /// content is in a scratch file in the folder `scratch`. Returns the units of every shard and their content.
+    /// Computes a stage in shards like [`Cache::divided`], for results that stay on disk. `write` writes the result of
+    /// a range of units. Without a work folder the results go to a scratch file in the folder `scratch`. Returns the
+    /// units of every shard with the file content that holds their result.
     ///
     /// # Errors
     /// Fails where [`Cache::divided`] fails.
@@ -221,7 +226,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. Ends a run of shard 1/1, which is complete then.
+    /// Returns `whole`, the full result of `stage`. In a run that computes only shard 1/1 returns [`Error::ShardDone`]
+    /// instead.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -231,9 +237,9 @@ impl Cache {
         }
     }
 
-    /// Returns the number of shards into which `stage` is to be divided, if its full result is not stored. The shards
-    /// are stored already or have to be computed; 1: the full result has to be computed. A run of a single shard
-    /// computes this shard and ends.
+    /// Returns the number of shards from which `stage` is to be joined, if its full result is not stored. With 1, the
+    /// full result has to be computed; otherwise the shards that are not stored have to be computed. A run that
+    /// computes only one shard computes it here and ends with [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,
@@ -242,7 +248,7 @@ impl Cache {
         make: &dyn Fn(Shard) -> Result<T>,
     ) -> Result<usize> {
         let Some(dir) = &self.dir else { return Ok(1) };
-        // Stored shards by the number of shards.
+        // Indices of the stored shards, by the number of shards.
         let stored = dir.stored_shards(stage, key)?;
         if let Some((&count, _)) = stored.iter().find(|(count, parts)| parts.len() == **count) {
             return Ok(count);
@@ -263,7 +269,7 @@ impl Cache {
         if count == 1 {
             return Ok(1);
         }
-        // A file with the name of this shard may be damaged, so it is read.
+        // A file with the name of this shard may be damaged, so its content is read.
         let done = match find(part)? {
             Some(_) => "is there already",
             None => {
@@ -283,7 +289,7 @@ impl Cache {
         Err(Error::ShardDone(report))
     }
 
-    /// Adds a note if shards of `stage` are stored that this run cannot use.
+    /// Adds a note for the user if shards of `stage` are stored that belong to another input or recipe.
     fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in dir.foreign_inputs(stage, key)? {
             self.add_note(format!(
@@ -305,7 +311,7 @@ impl Cache {
     }
 }
 
-/// Returns the indices of the `count` shards that are not in `stored`, as text.
+/// Returns the indices of the shards, of `count`, that are not in `stored`, as text.
 fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
     ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }

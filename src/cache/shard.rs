@@ -1,4 +1,4 @@
-//! Shards of the work of a stage.
+//! Shards: parts of the work of a stage that several processes divide among themselves.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,24 +6,24 @@ use std::str::FromStr;
 
 use crate::error::{Error, Result};
 
-/// Maximum number of shards of a stage. Each shard is a file, and all files of a stage may be open at once.
+/// Maximum number of shards (parts) of a stage. Each shard is a file, and all files of a stage may be open at once.
 pub(super) const MAX_SHARDS: usize = 900;
 
-/// Result of a run that may have computed only one shard of the work.
+/// Outcome of a run, which may have computed only one shard (part of a divided stage).
 #[derive(Debug)]
 #[must_use]
 pub enum Completion<T> {
-    /// The run did all the work.
+    /// The run did all its work, with this result.
     Whole(T),
     /// The run computed one shard and wrote no result. Holds a report for display.
     Shard(String),
 }
 
 impl<T> Completion<T> {
-    /// Turns [`Error::ShardDone`], the early end of a run of one shard, into a success.
+    /// Converts the result of a run: [`Error::ShardDone`], with which a run of only one shard ends, becomes a success.
     ///
     /// # Errors
-    /// Fails with every other error of `result`.
+    /// Fails if `result` is any other error.
     pub(crate) fn from_result(result: Result<T>) -> Result<Completion<T>> {
         match result {
             Ok(whole) => Ok(Completion::Whole(whole)),
@@ -33,7 +33,7 @@ impl<T> Completion<T> {
     }
 }
 
-/// Shard `index`, counted from 1, of `count` shards.
+/// Shard (part of a divided stage) number `index`, counted from 1, of `count` shards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
@@ -41,20 +41,20 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Shard 1 of 1: all the work.
+    /// Shard 1 of 1, which contains all the work.
     pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
-    /// Returns all shards of a division into `count`.
+    /// Returns all shards of a stage divided into `count` shards, in order.
     pub(super) fn all(count: usize) -> impl Iterator<Item = Shard> {
         (1..=count).map(move |index| Shard { index, count })
     }
 
-    /// Returns the index of the shard and the number of shards.
+    /// Returns the index of the shard, from 1, and the number of shards.
     pub(super) fn numbers(self) -> (usize, usize) {
         (self.index, self.count)
     }
 
-    /// Returns the range of `units` that belongs to this shard.
+    /// Returns the range of a stage's units of work, 0 to `units`, that belongs to this shard.
     pub(super) fn unit_range(self, units: usize) -> Range<usize> {
         let end = |shards: usize| (units as u128 * shards as u128 / self.count as u128) as usize;
         end(self.index - 1)..end(self.index)

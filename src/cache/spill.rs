@@ -1,4 +1,4 @@
-//! Data kept on disk: in an unnamed file that lasts as long as the run, or in a cache entry that stays.
+//! Data moved from memory to disk: to an unnamed file that lasts as long as the run, or to a cache entry that stays.
 
 use std::fs::File;
 use std::io::{self, Write as _};
@@ -12,10 +12,10 @@ use crate::cache::entry::EntryWriter;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile};
 
-/// Number of bytes that this process has read back from all [`Spill`]s.
+/// Number of bytes that this process has read back from all [`Spill`]s so far.
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
-/// Content of a file that is written once and then read in arbitrary pieces.
+/// Data on disk that is written once and then read in pieces, in any order.
 #[derive(Debug)]
 pub struct Spill {
     file: File,
@@ -23,32 +23,32 @@ pub struct Spill {
     path: PathBuf,
 }
 
-/// Writer of a [`Spill`].
+/// Writer of a [`Spill`] (data on disk that is written once and read in pieces).
 pub struct SpillWriter {
     writer: EntryWriter,
-    /// Path for error messages: the file itself, or the folder of an unnamed file.
+    /// Path shown in error messages: the file itself, or the folder of an unnamed file.
     path: PathBuf,
-    /// Temporary file that is renamed when the spill is complete; `None` for an unnamed file.
+    /// Temporary file that gets its final name when all data is written; `None` for an unnamed file.
     staged: Option<StagedFile>,
 }
 
 impl Spill {
-    /// Returns the content of `file` from byte `start` on.
+    /// Returns a spill of the bytes of `file` from byte `start` on. `path` is shown in error messages.
     pub(super) fn from_file(file: File, start: u64, path: PathBuf) -> Spill {
         Spill { file, start, path }
     }
 
-    /// Reads `bytes.len()` bytes, beginning at byte `start` of the content.
+    /// Fills `bytes` with data from byte `start` of the content on.
     ///
     /// # Errors
-    /// Fails if a read fails or the content ends.
+    /// Fails if a read fails or the content ends before `bytes` is full.
     pub fn read(&self, start: u64, bytes: &mut [u8]) -> Result<()> {
         READ_BACK.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.path))
     }
 
-    /// Reads the record that [`SpillWriter::write_record`] wrote at `start` into `bytes`. Returns the start of the next
-    /// record.
+    /// Reads the record at byte `start`, written by [`SpillWriter::write_record`], into `bytes`. Returns the start of
+    /// the next record.
     ///
     /// # Errors
     /// Fails where [`Spill::read`] fails.
@@ -61,7 +61,7 @@ impl Spill {
         Ok(start + 8 + length)
     }
 
-    /// Returns the number of bytes that this process has read back from all spills.
+    /// Returns the number of bytes that this process has read back from all spills so far.
     pub fn read_back() -> u64 {
         READ_BACK.load(Ordering::Relaxed)
     }
@@ -78,7 +78,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
-    /// Creates a file that gets the name `target` when it is complete.
+    /// Creates a cache entry that gets the path `target` when it is complete. `key` is its cache key, `about` the
+    /// description of its input.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
@@ -87,12 +88,12 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
-    /// Returns the action for error messages; a scratch file has no name that could be shown.
+    /// Returns the action that error messages name. A scratch file has no name that could be shown, only its folder.
     fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }
 
-    /// Appends `bytes`.
+    /// Appends `bytes` to the content.
     ///
     /// # Errors
     /// Fails if the write fails.
@@ -101,7 +102,7 @@ impl SpillWriter {
         self.writer.write_all(bytes).map_err(failed)
     }
 
-    /// Appends the length of `bytes`, then `bytes`.
+    /// Appends the length of `bytes` as 8 bytes, then `bytes`, to the content.
     ///
     /// # Errors
     /// Fails if the write fails.
@@ -110,14 +111,14 @@ impl SpillWriter {
         self.write(bytes)
     }
 
-    /// Appends the serialized `value`.
+    /// Appends the serialized `value` to the content.
     pub(super) fn write_value(&mut self, value: &impl Serialize) -> Result<()> {
         let Err(error) = postcard::to_io(value, &mut self.writer) else { return Ok(()) };
         let failed = self.writer.failed.take().unwrap_or_else(|| io::Error::other(error));
         Err(Error::io(self.write_action(), &self.path)(failed))
     }
 
-    /// Completes the file and gives it its name, if it has one. The content can be read only then.
+    /// Completes the file and gives it its final name, unless it is unnamed. Returns the content for reading.
     ///
     /// # Errors
     /// Fails if a write fails.

@@ -11,8 +11,8 @@ fn open_cache(folder: &Path, part: Option<&str>) -> Cache {
     Cache::open(&request(folder, part), "a test".to_owned()).unwrap()
 }
 
-/// Computes the squares of the first `units` numbers in shards. Returns the result and the units that were computed
-/// here.
+/// Computes the squares of the first `units` numbers in shards. Returns the result of the stage, and the units that
+/// this call computed.
 fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     let computed = RefCell::new(Vec::new());
     let compute = |some: Range<usize>| {

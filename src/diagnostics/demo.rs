@@ -152,7 +152,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
             original,
             compressed: folder.join(TENTH),
             ground_truth: None,
-            part: ViewSet::HeldOut,
+            views: ViewSet::HeldOut,
             max_frames: None,
             max_views: None,
             background: None,
@@ -228,7 +228,7 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
     let progress = events.task("film", "frames", pictures.len() as u64);
     let subjects = [RenderedSource::all(&scene), RenderedSource::all(&pruned), RenderedSource::all(&refined)];
-    show(subjects, &[camera], &pictures, Batch::of_frame(limits), |views| {
+    show(subjects, &[camera], &pictures, Batch::one_frame(limits), |views| {
         let render = |view: &ViewStates<'_, 3>| {
             let black = rig.background.unwrap_or_default();
             beside([0, 1, 2].map(|subject| view.render(subject, black)))

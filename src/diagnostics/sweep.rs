@@ -1,8 +1,10 @@
-//! Trade-off curves: compresses with every method at every kept fraction, and with `default` at one fraction and
-//! several numbers of refinement steps, as a user would. Compares each result with the original on held-out views.
+//! Trade-off curves of size against quality. Compresses with every method at every kept fraction, and with the preset
+//! `default` at one fraction and several numbers of refinement steps. Compares each result with the original on
+//! held-out (test) views.
 //!
-//! Every point is a whole run, from opening the input to a result on disk, so that its time and memory are those of
-//! that run alone. The result is deleted once it is measured. Memory: that of `compress`, then that of `evaluate`.
+//! Every point of a curve is a complete run as a user would start it, from opening the input to a result on disk, so
+//! that its time and memory are those of that run alone. The result is deleted once it is measured. Memory: that of
+//! `compress`, then that of `evaluate`.
 
 use std::fs;
 use std::path::PathBuf;
@@ -20,36 +22,38 @@ use crate::pipeline::Target;
 use crate::report::trade_off::{PAGE, page};
 use crate::scene::{InputOptions, open_scene};
 
-/// Options of a sweep.
+/// Options of a sweep, which measures trade-off curves of size against quality.
 #[derive(Debug, Clone)]
 pub struct SweepOptions {
-    /// Input and cameras; its split is ignored.
+    /// Input and cameras. The requested split into training and test views is ignored.
     pub input: InputOptions,
-    /// Methods, in the order of the result.
+    /// Compression methods to compare, in the order of the result.
     pub methods: Vec<Method>,
-    /// Kept fractions, in (0, 1].
+    /// Fractions of the Gaussians to keep, in (0, 1].
     pub fractions: Vec<f64>,
-    /// Numbers of refinement steps to run `default` with; 0: no refinement.
+    /// Numbers of refinement steps with which the preset `default` is run; 0: no refinement.
     pub steps: Vec<u32>,
-    /// Kept fraction of the runs in `steps`, in (0, 1].
+    /// Fraction of the Gaussians kept by the runs in `steps`, in (0, 1].
     pub steps_at: f64,
-    /// Number of runs of every point, at least 1; the median time is reported.
+    /// Number of runs of every point, at least 1. The median time is reported.
     pub runs: usize,
-    /// Maximum number of frames to compare, evenly spaced; `None`: all frames.
+    /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
     pub max_frames: Option<usize>,
-    /// Background color: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
+    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
     pub background: Option<[f32; 3]>,
-    /// Folder for `sweep.json`, `sweep.csv`, `knobs.csv` and the page.
+    /// Folder that gets `sweep.json`, `sweep.csv`, `knobs.csv` and the page with the curves.
     pub output: PathBuf,
-    /// Policy if the folder exists.
+    /// Policy if the output folder already exists.
     pub overwrite: Replace,
 }
 
-/// Runs every method at every fraction, and methods that choose a size by themselves at that size too; then `default`
-/// with every number of steps. Scores by the training views, compares by the held-out ones.
+/// Runs every method at every fraction, and methods that choose a size by themselves at that size too. Then runs the
+/// preset `default` with every number of refinement steps. Gaussians are scored by the training views; results are
+/// compared on the held-out views.
 ///
 /// # Errors
-/// Fails if the input, the cameras, the fractions or the output are invalid, or if a run fails. No files remain then.
+/// Fails if the input, the cameras, the fractions or the output are invalid, or if a run fails. No files remain in this
+/// case.
 pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     for (flag, fractions) in [("--fractions", &options.fractions[..]), ("--steps-at", &[options.steps_at])] {
         if let Some(invalid) = fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
@@ -120,13 +124,13 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     }
     write("sweep.json", found.json())?;
     write(PAGE, page(&found))?;
-    // With this file a later run recognizes the folder as one that it may replace.
+    // The marker file lets a later run recognize the folder as one that it may replace.
     write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
     staged.commit()?;
     Ok(found)
 }
 
-/// Returns the data that all points share, and the file name that gives a result the input's kind.
+/// Returns the result without points yet, and the file name that makes outputs of the same kind as the input.
 fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&with_training_views(&options.input))?;
     let name = result_name(&scene)?;
@@ -147,19 +151,20 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-/// Returns the number of Gaussians that merging leaves if nothing is pruned, once that point is measured.
+/// Returns the number of Gaussians that merging without pruning leaves; `None` until that point is measured.
 fn merge_only_count(found: &TradeOff) -> Option<usize> {
     let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether `method` merges only, and cannot reach the fraction `fraction`.
+/// Returns whether `method` merges without pruning and leaves more Gaussians than `fraction` allows.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
     let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// Measures one point of the sweep.
+/// Measures one point of the curves: runs `method` at the fraction `fraction`; `None`: at the size that the method
+/// chooses.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,

@@ -1,4 +1,4 @@
-//! A whole run as a user starts it, from opening the input to a result on disk, and the quality of its result.
+//! A complete run as a user starts it, from opening the input to a result on disk, and the quality of its result.
 
 use std::fs;
 use std::path::Path;
@@ -15,26 +15,26 @@ use crate::pipeline::{Request, Target, compress};
 use crate::scene::pictures::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
-/// Settings shared by all runs that are compared with one another.
+/// Settings shared by all complete runs that are compared with one another.
 #[derive(Debug, Clone)]
 pub(crate) struct WholeRun<'a> {
-    /// Input and cameras; the input is scored by the training views.
+    /// Input and cameras. Gaussians are scored by the training views.
     pub(crate) input: &'a InputOptions,
-    /// Path of a folder that does not exist yet, for results while they are measured.
+    /// Path of a folder that does not exist yet. Results are in it while they are measured.
     pub(crate) scratch: &'a Path,
-    /// File name of the result, which determines its kind.
+    /// File name of the result, which determines the kind of output.
     pub(crate) name: &'a str,
-    /// Number of repetitions of each run.
+    /// How often each run is repeated to measure its time.
     pub(crate) repeats: Repeats,
-    /// Maximum number of frames to compare, evenly spaced; `None`: all frames.
+    /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,
-    /// Background color: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
+    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
     pub(crate) background: Option<[f32; 3]>,
 }
 
 impl WholeRun<'_> {
-    /// Compresses by `means`, measures time and memory, and calls `look` with the path of the result before it is
-    /// deleted. Returns the value of `look` and the cost of the compression.
+    /// Compresses the input by the method `means`, measures time and memory, and calls `look` with the path of the
+    /// result, which is then deleted. Returns the value of `look` and the cost of the compression.
     ///
     /// # Errors
     /// Returns the errors of `compress` and of `look`.
@@ -62,7 +62,7 @@ impl WholeRun<'_> {
         Ok((seen, cost))
     }
 
-    /// Compares a result with the original on held-out views.
+    /// Compares the result at the path `result` with the original on held-out (test) views.
     ///
     /// # Errors
     /// Returns the errors of `evaluate`.
@@ -82,7 +82,7 @@ impl WholeRun<'_> {
     }
 }
 
-/// Returns the file name that gives a result the kind of `scene`'s input.
+/// Returns the file name that makes the output of the same kind as the input of `scene`.
 ///
 /// # Errors
 /// Fails if the index of a container cannot be read.
@@ -90,7 +90,7 @@ pub(crate) fn result_name(scene: &Scene) -> Result<&'static str> {
     Ok(if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" })
 }
 
-/// Returns the input, scored by its training views.
+/// Returns `input` with the training views as the views by which Gaussians are scored.
 pub(crate) fn with_training_views(input: &InputOptions) -> InputOptions {
     InputOptions { split: Some(Split::Train), ..input.clone() }
 }

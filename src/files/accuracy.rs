@@ -1,4 +1,5 @@
-//! Error check of lossy file formats: compares the values a file will hold with the values to be written.
+//! Error check for lossy file formats: compares the values that a file will store (after quantization) with the
+//! original values.
 //!
 //! Input: pairs of original and stored attributes of each Gaussian. Output: the largest errors, or an error that names
 //! the Gaussian furthest beyond its bound. Gaussians with an opacity below 1/255 before and after are never drawn and
@@ -12,7 +13,7 @@
 //! | SH coefficients above degree 0 | 1 |
 //!
 //! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
-//! change it. Distances are maxima over the three axes.
+//! change it. The distance of two positions is the largest of the differences along x, y and z.
 
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Gaussians, color, opacity};
@@ -25,12 +26,12 @@ const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
 const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
 /// Maximum error of opacities and base colors, which are in [0, 1].
 const MAX_COLOR_ERROR: f64 = 0.02;
-/// Maximum error of SH coefficients above degree 0; their sum is a color.
+/// Maximum error of an SH coefficient above degree 0. A color is a sum of such coefficients times basis functions.
 const MAX_SH_ERROR: f64 = 1.0;
 /// Opacity below which a Gaussian is not drawn.
 const MIN_OPACITY: f64 = 1.0 / 255.0;
 
-/// Attributes of one Gaussian as a renderer uses them.
+/// Attributes of one Gaussian after activation, as a renderer uses them.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderedAttributes {
     /// Position in scene units.
@@ -44,7 +45,8 @@ pub struct RenderedAttributes {
 }
 
 impl RenderedAttributes {
-    /// Returns the attributes of row `row` of `state` after activation.
+    /// Returns the position, scales, opacity and base color of Gaussian `row` of `state`, with the activation functions
+    /// applied.
     pub fn from_state(state: &Gaussians, row: usize) -> RenderedAttributes {
         RenderedAttributes {
             position: state.position.row::<3>(row).map(f64::from),
@@ -54,7 +56,7 @@ impl RenderedAttributes {
         }
     }
 
-    /// Returns the median of the three scales.
+    /// Returns the median of the Gaussian's three scales.
     fn middle_scale(&self) -> f64 {
         let mut scale = self.scale;
         scale.sort_unstable_by(f64::total_cmp);
@@ -62,7 +64,7 @@ impl RenderedAttributes {
     }
 }
 
-/// Error of one quantity of one Gaussian, and its bound.
+/// Error of one quantity of one Gaussian, with the maximum error allowed for it.
 #[derive(Debug, Clone, Copy)]
 struct Excess {
     id: usize,
@@ -71,21 +73,21 @@ struct Excess {
     bound: f64,
 }
 
-/// Errors of a file, accumulated over its Gaussians.
+/// Largest coding errors of a file, collected Gaussian by Gaussian.
 #[derive(Debug)]
 pub struct Accuracy {
     /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
-    /// Index of the Gaussian furthest from the median position.
+    /// Index of the Gaussian that is furthest from the median position of all Gaussians.
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
-    /// Error that exceeds its bound by the largest factor; `None` if all are within their bounds.
+    /// Error that exceeds its allowed maximum by the largest factor; `None` if no error exceeds its maximum.
     worst: Option<Excess>,
 }
 
 impl Accuracy {
-    /// Starts without errors for a file of Gaussians at `positions`.
+    /// Creates the record for a file of Gaussians at `positions`. No Gaussian has been compared yet.
     pub fn new(positions: &AttributeValues) -> Accuracy {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
@@ -99,12 +101,12 @@ impl Accuracy {
         Accuracy { scene: median(distances), furthest, position: 0.0, worst: None }
     }
 
-    /// Returns the largest error of a position so far, in scene units.
+    /// Returns the largest position error among the Gaussians added so far, in scene units.
     pub fn position_error(&self) -> f64 {
         self.position
     }
 
-    /// Adds Gaussian `id` with its original attributes `wanted` and its stored ones `found`.
+    /// Compares the original attributes `wanted` of Gaussian `id` with its stored ones `found` and records the errors.
     pub fn add(&mut self, id: usize, wanted: &RenderedAttributes, found: &RenderedAttributes) {
         if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
             return;
@@ -117,7 +119,7 @@ impl Accuracy {
         let position_error = max_difference(wanted.position, found.position);
         self.position = largest([self.position, position_error, 0.0]);
         let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
-        // Screens show colors clamped to [0, 1].
+        // Clamp colors to [0, 1] before comparing them, as a screen does.
         let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
         self.check_error(
             id,
@@ -132,26 +134,28 @@ impl Accuracy {
         self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
 
-    /// Adds the error of one SH coefficient above degree 0 of Gaussian `id`.
+    /// Records the error of one SH coefficient above degree 0 of Gaussian `id`.
     pub fn add_sh(&mut self, id: usize, error: f64) {
         self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
-    /// Compares an error with its bound and keeps it if it exceeds the bound by the largest factor so far.
+    /// Compares an error with the allowed maximum `bound`. Records it if it exceeds `bound` by the largest factor so
+    /// far.
     fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
         let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };
-        // Written as "not within" because NaN counts as beyond every bound.
+        // `!is_within` rather than `error > bound`, so that NaN counts as beyond every bound.
         let is_within = error <= bound;
         if !is_within && self.worst.is_none_or(|worst| excess(&now) > excess(&worst)) {
             self.worst = Some(now);
         }
     }
 
-    /// Checks that all errors are within their bounds. `kind` names the file in the message, for example "a .spz".
+    /// Checks that no recorded error exceeds its allowed maximum. `kind` names the file in the message, for example "a
+    /// .spz".
     ///
     /// # Errors
-    /// Fails if an error exceeds its bound. The message names the Gaussian, the error and what to do.
+    /// Fails if an error exceeds its maximum. The message names the Gaussian, the error and a remedy.
     pub fn check(&self, kind: &str) -> Result<()> {
         let Some(Excess { id, quantity, error, bound }) = self.worst else { return Ok(()) };
         let unit = if matches!(quantity, "position" | "scale") { " scene units" } else { "" };
@@ -169,7 +173,7 @@ impl Accuracy {
     }
 }
 
-/// Returns the (lower) median of the finite values; 0 if there are none.
+/// Returns the median of the finite values among `values` (of two middle values the lower one); 0 if none is finite.
 fn median(mut values: Vec<f64>) -> f64 {
     values.retain(|value| value.is_finite());
     if values.is_empty() {
@@ -187,7 +191,8 @@ mod tests {
         RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Returns the accuracy of five Gaussians at distances of 2 from one another and one far away. The scene size is 2.
+    /// Returns the record for six Gaussians: five at distances of 2 from one another and one far away. The scene size
+    /// is 2.
     fn accuracy() -> Accuracy {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);

@@ -2,9 +2,9 @@
 //!
 //! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` syncs it to disk and
 //! publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an output
-//! without `commit` removes it. [`withdraw_all`] removes all unpublished outputs when a signal ends the process. The
-//! next run with the same output repairs and removes what killed runs left behind ([`leftovers`]). Runs in different
-//! containers and on different machines may share folders.
+//! without `commit` removes it. When a signal ends the process, [`withdraw_all`] removes all outputs that have not been
+//! published. The workspaces of killed runs are repaired and removed by the next run with the same output
+//! ([`leftovers`]). Runs in different containers and on different machines may share folders.
 //!
 //! [`Replace`] determines which existing outputs are overwritten. Only regular files, folders and links to regular
 //! files are ever replaced; output to a character device or FIFO is written into it.
@@ -35,10 +35,10 @@ pub use workspace::{Withdrawn, withdraw_all};
 /// Checks, before any work, that a run reading `inputs` may write an output to `target`. Completes or removes an output
 /// with this name that a killed run left unfinished.
 ///
-/// Refuses a target without a name or in a folder that does not exist; a target that is an input, contains one or lies
-/// inside one, whatever `replace` is and also through links; an existing target that `replace` does not allow to
-/// replace, except an empty folder to be replaced by a folder; a file in place of a folder or the reverse; sockets,
-/// block devices and dangling links.
+/// Refuses a target without a name or in a folder that does not exist. Refuses a target that is an input, contains an
+/// input or lies inside one, also through links and whatever `replace` is. Refuses an existing target that `replace`
+/// does not allow to replace (a folder may always replace an empty folder), a file in place of a folder or the reverse,
+/// sockets, block devices and dangling links.
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
@@ -46,8 +46,8 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
     let shown = target.shown();
     let real_parent = real_parent(target)?;
     let (_, name) = split_target(target)?;
-    // Compare the entry itself and the file it links to: renaming over a link replaces only the link, but a user who
-    // names the input through a link does not want it replaced.
+    // Compare both the entry `target` and the file that it links to. Renaming over a link replaces only the link, but a
+    // user who names the input through a link does not want that link replaced.
     let named = real_parent.join(name);
     let linked = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
     for input in inputs {
@@ -59,8 +59,8 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
             let input = input.shown();
             return Err(Error::usage(format!("{shown} contains the input {input}; give another output")));
         }
-        // A PLY file added to a folder of frames would become another frame, a folder added to a model another
-        // iteration.
+        // Do not write into an input folder: a PLY file added to a folder of frames would become another frame, and a
+        // folder added to a model would become another iteration.
         if named.starts_with(&real) || linked.starts_with(&real) {
             let input = input.shown();
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
@@ -74,11 +74,11 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
     check_writable(target, &real_parent)
 }
 
-/// Confirms that a file can be created in `parent`, the folder that `target` is written into. The file has no name and is
-/// gone when this returns.
+/// Checks that a file can be created in `parent`, the folder that `target` is written into. Creates a file without a
+/// name there and removes it again.
 ///
 /// # Errors
-/// As [`Error::Usage`]: a folder without write permission, a read-only file system, no space left.
+/// Fails with [`Error::Usage`] if the folder has no write permission, the file system is read-only or no space is left.
 fn check_writable(target: &Path, parent: &Path) -> Result<()> {
     match tempfile::tempfile_in(parent) {
         Ok(_) => Ok(()),
@@ -90,10 +90,10 @@ fn check_writable(target: &Path, parent: &Path) -> Result<()> {
     }
 }
 
-/// Checks that a file and its `companions` may be written, each as in [`check_target`].
+/// Checks, as [`check_target`] does for one file, that `target` and the files `companions` beside it may be written.
 ///
 /// # Errors
-/// Fails like [`check_target`], and if a target is a device or FIFO, which can hold only one file.
+/// Fails like [`check_target`], and if one of these paths is a device or FIFO, which can hold only one file.
 pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], replace: Replace) -> Result<()> {
     for path in std::iter::once(target).chain(companions.iter().map(PathBuf::as_path)) {
         check_target(path, Kind::File, inputs, replace)?;
@@ -107,7 +107,8 @@ pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], re
     Ok(())
 }
 
-/// Output file that appears under its name at [`StagedFile::commit`], or is then written into a device or FIFO.
+/// Output file that is written under a hidden name. [`StagedFile::commit`] moves it to its own name, or copies it into
+/// a device or FIFO.
 #[derive(Debug)]
 pub struct StagedFile {
     target: PathBuf,
@@ -118,7 +119,8 @@ pub struct StagedFile {
 }
 
 impl StagedFile {
-    /// Prepares to write `target`, which must have passed [`check_target`]. Does not create the file yet.
+    /// Prepares to write the output file `target`, which must have passed [`check_target`]. Does not create the file
+    /// yet.
     ///
     /// # Errors
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
@@ -126,19 +128,19 @@ impl StagedFile {
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
         let is_stream = destination(target)? == Destination::Stream;
         let workspace = match is_stream {
-            // No folder can be created beside a device.
+            // Write in the system's folder for temporary files, because no folder can be created beside a device.
             true => scratch_workspace(&std::env::temp_dir())?,
             false => output_workspace(target, Kind::File, replace)?,
         };
         Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
     }
 
-    /// Returns the path to write the file to before [`StagedFile::commit`].
+    /// Returns the hidden path to which the caller writes the file before [`StagedFile::commit`].
     pub fn path(&self) -> &Path {
         &self.content
     }
 
-    /// Syncs the file to disk and publishes it under its name, replacing an earlier output if that is allowed.
+    /// Syncs the file to disk and gives it its final name, replacing an existing file if `replace` allows it.
     ///
     /// # Errors
     /// Fails if nothing was written, if a file that may not be replaced appeared meanwhile, or if a system call fails.
@@ -152,7 +154,7 @@ impl StagedFile {
     }
 }
 
-/// Output file with companion files beside it, all published together at [`StagedFiles::commit`].
+/// Output file with companion files beside it. [`StagedFiles::commit`] gives all of them their final names together.
 #[derive(Debug)]
 pub struct StagedFiles {
     file: StagedFile,
@@ -160,8 +162,9 @@ pub struct StagedFiles {
 }
 
 impl StagedFiles {
-    /// Prepares to write `target` and its `companions`, which must have passed [`check_targets`]. The names of the
-    /// companions start with that of `target`, and the first companion is the summary.
+    /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
+    /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
+    /// the summary.
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -173,21 +176,22 @@ impl StagedFiles {
         Ok(StagedFiles { file, companions })
     }
 
-    /// Returns the path to write the file to before [`StagedFiles::commit`].
+    /// Returns the hidden path to which the caller writes the output file before [`StagedFiles::commit`].
     pub fn path(&self) -> &Path {
         self.file.path()
     }
 
-    /// Returns the path to write companion `index` to.
+    /// Returns the hidden path to which the caller writes the companion file with index `index`.
     pub fn companion(&self, index: usize) -> PathBuf {
         self.file.workspace.folder.join(companion_name(index))
     }
 
-    /// Lists all files in the summary, syncs them to disk and publishes them. The summary comes first, so that the
-    /// others are known as results from the start; the file itself comes last.
+    /// Adds the list of all files to the summary (the first companion), syncs the files to disk and gives them their
+    /// final names. The summary is moved into place first, so that the other files are known as parts of this result
+    /// from the start; the output file itself is moved last.
     ///
     /// Runs with the same output publish one after the other, so files of different runs are never mixed. If the
-    /// process is killed in between, the next run with this output publishes the remaining files.
+    /// process is killed while the files are being moved, the next run with this output publishes the remaining files.
     ///
     /// # Errors
     /// Fails if the summary is not a JSON object, and like [`StagedFile::commit`] for each file.
@@ -211,12 +215,12 @@ impl StagedFiles {
     }
 }
 
-/// Returns the name of companion `index` in the workspace.
+/// Returns the hidden file name that companion `index` has in the workspace.
 fn companion_name(index: usize) -> String {
     format!("companion-{index}")
 }
 
-/// Output folder that appears under its name at [`StagedFolder::commit`].
+/// Output folder that is written under a hidden name. [`StagedFolder::commit`] moves it to its own name.
 #[derive(Debug)]
 pub struct StagedFolder {
     target: PathBuf,
@@ -226,7 +230,7 @@ pub struct StagedFolder {
 }
 
 impl StagedFolder {
-    /// Creates an empty folder for `target`, which must have passed [`check_target`].
+    /// Creates an empty hidden folder that will become `target`, which must have passed [`check_target`].
     ///
     /// # Errors
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
@@ -238,16 +242,18 @@ impl StagedFolder {
         Ok(StagedFolder { target: target.to_owned(), content, replace, workspace })
     }
 
-    /// Returns the folder to write into before [`StagedFolder::commit`].
+    /// Returns the hidden folder into which the caller writes before [`StagedFolder::commit`].
     pub fn path(&self) -> &Path {
         &self.content
     }
 
-    /// Lists the files in the summary of the folder, if it has one, syncs everything to disk and publishes the folder.
+    /// Adds the list of its files to the summary of the folder, if it has a summary, syncs everything to disk and gives
+    /// the folder its final name.
     ///
-    /// An earlier output is moved aside, replaced, then deleted. Files in it that do not belong to it are moved into
-    /// the new folder. If the run is killed in between, either the earlier or the new folder is complete; the foreign
-    /// files are in it or in the hidden workspace, from where the next run with this output moves them.
+    /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
+    /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the
+    /// earlier or the new folder is complete. The foreign files are then in this folder or in the hidden workspace,
+    /// from where the next run with this output moves them.
     ///
     /// # Errors
     /// Fails if the summary is not a JSON object, if the target appeared meanwhile and may not be replaced, or if a
@@ -262,21 +268,22 @@ impl StagedFolder {
     }
 }
 
-/// Creates the workspace of an output after repairing and removing leftovers of killed runs with this output.
+/// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the
+/// workspaces that killed runs with this output left behind.
 fn output_workspace(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
     clean_up(target);
     check_replace(target, kind, replace)?;
     Workspace::beside(target)
 }
 
-/// Creates a workspace for scratch files in `folder` after removing scratch files of killed runs.
+/// Creates a workspace (hidden folder) for scratch files in `folder`. First removes scratch files of killed runs.
 fn scratch_workspace(folder: &Path) -> Result<Workspace> {
     let target = folder.join(SCRATCH);
     clean_up(&target);
     Workspace::beside(&target)
 }
 
-/// Temporary file with a path, removed when this value is dropped.
+/// Path for a temporary file. The file is removed when this value is dropped.
 #[derive(Debug)]
 pub struct ScratchFile {
     content: PathBuf,
@@ -284,7 +291,7 @@ pub struct ScratchFile {
 }
 
 impl ScratchFile {
-    /// Reserves an unused path in `folder`. Does not create the file yet.
+    /// Reserves an unused path for a scratch file in `folder`. Does not create the file yet.
     ///
     /// # Errors
     /// Fails if the folder does not exist or a system call fails.
@@ -293,7 +300,7 @@ impl ScratchFile {
         Ok(ScratchFile { content: workspace.content(), _workspace: workspace })
     }
 
-    /// Returns the path to write the file to.
+    /// Returns the path to which the caller writes the scratch file.
     pub fn path(&self) -> &Path {
         &self.content
     }
@@ -314,13 +321,13 @@ impl ScratchFolder {
         Ok(ScratchFolder(scratch))
     }
 
-    /// Returns the folder to write into.
+    /// Returns the path of the temporary folder.
     pub fn path(&self) -> &Path {
         self.0.path()
     }
 }
 
-/// Replaces the path of a hidden workspace in a system error by the output path that the user gave.
+/// Replaces, in an error of the system, a path in a hidden workspace by the output path that the user gave.
 pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {
@@ -335,12 +342,12 @@ pub fn with_user_path(error: Error) -> Error {
     }
 }
 
-/// Syncs a file to disk.
+/// Syncs the file at `path` to disk.
 fn sync(path: &Path) -> Result<()> {
     splat_platform::sync_file(path).map_err(Error::io("sync", path))
 }
 
-/// Syncs all files and folders below `folder` to disk.
+/// Syncs `folder`, and all files and folders below it, to disk.
 fn sync_tree(folder: &Path) -> Result<()> {
     for path in entries(folder)?.iter().map(|entry| folder.join(entry)) {
         if path.is_dir() { sync_tree(&path)? } else { sync(&path)? }

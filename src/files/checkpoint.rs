@@ -1,11 +1,13 @@
 //! PyTorch checkpoints as written by `torch.save`.
 //!
-//! Input: a path. Output: the object tree of the pickle, and the values of requested tensors. Nothing in the pickle is
-//! executed. Memory: the list of files, the tree and one storage at a time; each is checked against the [`ReadLimit`]
-//! before it is allocated.
+//! Input: a path. Output: the object tree of the pickle (the serialized Python objects in the file), and the values of
+//! requested tensors. Nothing in the pickle is executed. Memory: the list of files in the zip archive, the object tree,
+//! and one storage (block of tensor values) at a time. Each is checked against the memory limit ([`ReadLimit`]) before
+//! it is allocated.
 //!
-//! A tensor is `torch._utils._rebuild_tensor_v2(storage, offset, size, stride, …)`, or a parameter made of one. Its
-//! storage is an entry of the zip archive and may be shared by several tensors. The device of a storage is ignored.
+//! A tensor is `torch._utils._rebuild_tensor_v2(storage, offset, size, stride, …)`, or a parameter made of such a
+//! tensor. Its storage is an entry of the zip archive and may be shared by several tensors. The device of a storage is
+//! ignored.
 
 pub(crate) mod write;
 
@@ -25,17 +27,19 @@ use super::zip_directory::declared_directory;
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
-/// Maximum size of a pickle in bytes. A pickle of ten thousand tensors has about one million.
+/// Maximum size in bytes of the pickle of a checkpoint. A pickle that describes ten thousand tensors has about one
+/// million.
 const MAX_PICKLE: u64 = 1 << 23;
-/// Maximum number of files in an archive.
+/// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Memory in bytes that the list of files takes per file, in addition to three times its size in the archive.
+/// Bytes of memory that the list of files takes per file, in addition to three times the size of the file's entry in
+/// the list of the archive.
 const ENTRY_BYTES: u64 = 640;
-/// Maximum number of values that tensors may have per stored value. A view may repeat its storage (stride 0), so a
-/// small file can declare any number of values; no trained model needs more than this.
+/// Maximum number of values that the tensors of a storage may have per stored value. A tensor may repeat stored values
+/// (stride 0), so a small file can declare any number of values. No trained model needs more than this.
 const MAX_EXPANSION: usize = 4;
 
-/// Open checkpoint.
+/// PyTorch checkpoint that is open for reading.
 #[derive(Debug)]
 pub(crate) struct Checkpoint {
     path: PathBuf,
@@ -43,9 +47,9 @@ pub(crate) struct Checkpoint {
     file: SharedFile,
     archive: ZipArchive<SharedFile>,
     pickle: Pickle,
-    /// Index of the pickle among the entries of the archive.
+    /// Index of the pickle file among the files of the archive.
     pickle_index: usize,
-    /// Storages by key: index of the entry in the archive, and size in bytes.
+    /// Storages (blocks of tensor values) by key: index of the file in the archive, and size in bytes.
     storages: HashMap<String, (usize, usize)>,
 }
 
@@ -56,7 +60,7 @@ pub(crate) enum ValueType {
     BF16,
     F32,
     F64,
-    /// Integers, booleans or complex numbers: name of the type and bytes per value.
+    /// Type that is not floating-point (integers, booleans, complex numbers): its name and the bytes per value.
     Other(&'static str, usize),
 }
 
@@ -80,7 +84,7 @@ impl ValueType {
         })
     }
 
-    /// Returns the name of the type in PyTorch.
+    /// Returns the name that PyTorch gives the type.
     pub(crate) fn name(self) -> &'static str {
         match self {
             ValueType::F16 => "float16",
@@ -101,12 +105,12 @@ impl ValueType {
         }
     }
 
-    /// Returns whether this is a floating-point type.
+    /// Returns whether the values are floating-point numbers.
     pub(crate) fn is_float(self) -> bool {
         !matches!(self, ValueType::Other(..))
     }
 
-    /// Decodes one stored floating-point value. Returns NaN for other types.
+    /// Decodes one floating-point value from its bytes `stored`. Returns NaN for types that are not floating-point.
     fn decode(self, stored: &[u8]) -> f32 {
         match (self, stored) {
             (ValueType::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
@@ -117,7 +121,7 @@ impl ValueType {
         }
     }
 
-    /// Encodes `value` into `stored`; writes zeros for types that are not floating-point.
+    /// Encodes `value` into the bytes `stored`. Writes zeros for types that are not floating-point.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self {
             ValueType::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
@@ -129,12 +133,13 @@ impl ValueType {
     }
 }
 
-/// View of a storage: the element with indices `i` is value `offset + Σ i·stride` of the storage.
+/// Tensor as a view of a storage (block of values): the element with indices `i` is value `offset + Σ i·stride` of the
+/// storage.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TensorView {
-    /// Node that builds the tensor; for a parameter the node of its tensor.
+    /// Node of the object tree that builds the tensor. For a parameter, the node of the tensor inside it.
     pub(crate) id: NodeId,
-    /// Key of its storage.
+    /// Key of the storage that holds the values.
     pub(crate) storage: String,
     pub(crate) kind: ValueType,
     pub(crate) shape: Vec<usize>,
@@ -143,10 +148,10 @@ pub(crate) struct TensorView {
     pub(crate) places: NumberRanges,
 }
 
-/// Byte ranges in the pickle of the numbers that describe a tensor.
+/// Byte ranges in the pickle at which the numbers that describe a tensor are written.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NumberRanges {
-    /// Number of values of its storage.
+    /// Number of values of the storage.
     pub(crate) numel: Range<usize>,
     pub(crate) offset: Range<usize>,
     pub(crate) shape: Vec<Range<usize>>,
@@ -154,18 +159,19 @@ pub(crate) struct NumberRanges {
 }
 
 impl TensorView {
-    /// Returns type and shape for messages.
+    /// Returns the type and shape of the tensor as text for messages.
     pub(crate) fn describe(&self) -> String {
         let shape = &self.shape;
         format!("{} {shape:?}", self.kind.name())
     }
 
-    /// Returns the number of elements; `None` if it overflows.
+    /// Returns the number of elements of the tensor; `None` if it overflows.
     pub(crate) fn len(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |product, &length| product.checked_mul(length))
     }
 
-    /// Calls `take` with the storage index of every element, the last axis fastest.
+    /// Calls `take` for every element, the last axis fastest, with the index of the element in the storage (block of
+    /// values).
     pub(crate) fn each(&self, mut take: impl FnMut(usize)) {
         if self.shape.contains(&0) {
             return;
@@ -190,7 +196,7 @@ impl TensorView {
 }
 
 impl Checkpoint {
-    /// Opens the checkpoint at `path` within `memory`.
+    /// Opens the checkpoint at `path`. Reading may use at most `memory` bytes of memory.
     ///
     /// # Errors
     /// Fails if the file is not a zip archive of uncompressed entries or is cut short, if its pickle cannot be read, or
@@ -250,7 +256,7 @@ impl Checkpoint {
         }
         let (pickle_index, bytes) = pickle_index.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
         memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
-        // Keep an eighth for the allocator: memory that was freed before may not fit new requests.
+        // Leave an eighth of the memory to the allocator, which cannot always reuse freed memory for new requests.
         let left = (memory.bytes() - listed - bytes) / 8 * 7;
         let bytes = read_entry(&mut archive, &file, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
         let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
@@ -269,27 +275,28 @@ impl Checkpoint {
         Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
     }
 
-    /// Checks that reading `what` at `place` may take `bytes` of memory.
+    /// Checks that `bytes` of memory may be used for reading `what`; `place` is its place in the file for messages.
     pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
         self.memory.check(&self.path, place, what, bytes)
     }
 
-    /// Returns the object tree.
+    /// Returns the object tree of the checkpoint.
     pub(crate) fn pickle(&self) -> &Pickle {
         &self.pickle
     }
 
-    /// Builds the error for unexpected content at `place`.
+    /// Builds the error for unexpected content at `place` in the file.
     pub(crate) fn wrong(&self, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(&self.path, place, expected, found)
     }
 
-    /// Describes a node for messages.
+    /// Returns a description of a node of the object tree for messages.
     pub(crate) fn describe(&self, id: NodeId) -> String {
         self.tensor(id).map_or_else(|| self.pickle.describe(id), |tensor| format!("a tensor, {}", tensor.describe()))
     }
 
-    /// Returns the tensor at a node: the node itself, or the tensor of a parameter.
+    /// Returns the tensor at node `id` of the object tree: the tensor that the node builds, or the one inside a
+    /// parameter. Returns `None` for other nodes.
     pub(crate) fn tensor(&self, id: NodeId) -> Option<TensorView> {
         match self.pickle.call(id)? {
             ("torch._utils._rebuild_parameter" | "torch._utils._rebuild_parameter_with_state", [tensor, ..]) => {
@@ -299,7 +306,7 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the tensor that the node itself builds; `None` for other nodes.
+    /// Returns the tensor that node `id` itself builds; `None` for parameters and other nodes.
     fn plain_tensor(&self, id: NodeId) -> Option<TensorView> {
         let (name, arguments) = self.pickle.call(id)?;
         let [storage, offset, size, stride, ..] = *arguments else { return None };
@@ -323,12 +330,12 @@ impl Checkpoint {
         })
     }
 
-    /// Returns every tensor once.
+    /// Returns every tensor in the object tree once.
     pub(crate) fn tensors(&self) -> impl Iterator<Item = TensorView> {
         self.pickle.ids().filter_map(|id| self.plain_tensor(id))
     }
 
-    /// Returns a non-negative integer and its byte range in the pickle.
+    /// Returns the non-negative integer at node `id` and its byte range in the pickle; `None` for other nodes.
     fn number(&self, id: NodeId) -> Option<(usize, Range<usize>)> {
         match self.pickle.node(id) {
             Node::Int(value, at) => Some((usize::try_from(*value).ok()?, at.start as usize..at.end as usize)),
@@ -336,15 +343,15 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the integers of a tuple or list and their byte ranges in the pickle.
+    /// Returns the integers of the tuple or list at node `id` and their byte ranges in the pickle.
     fn numbers(&self, id: NodeId) -> Option<(Vec<usize>, Vec<Range<usize>>)> {
         self.pickle.elements(id)?.iter().map(|&id| self.number(id)).collect()
     }
 
-    /// Returns the floating-point tensor at a node; `place` names it in messages.
+    /// Returns the floating-point tensor at node `id` of the object tree; `place` names it in messages.
     ///
     /// # Errors
-    /// Fails if the node is something else, or if its storage is missing or too short.
+    /// Fails if the node is not such a tensor, or if the storage of the tensor is missing or too short.
     pub(crate) fn float_tensor(&self, id: NodeId, place: &str) -> Result<TensorView> {
         let wrong = |expected: &str, found: String| self.wrong(place, expected, found);
         let tensor = self.tensor(id).filter(|tensor| tensor.kind.is_float());
@@ -353,8 +360,8 @@ impl Checkpoint {
         Ok(tensor)
     }
 
-    /// Checks that the storage holds every element of `tensor`, and that the tensor has at most 4 ([`MAX_EXPANSION`])
-    /// elements per stored value.
+    /// Checks that the storage of `tensor` holds all of its elements, and that the tensor has at most 4
+    /// ([`MAX_EXPANSION`]) elements per stored value.
     pub(crate) fn check(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
         self.check_extent(tensor)?;
@@ -364,7 +371,7 @@ impl Checkpoint {
         }
     }
 
-    /// Checks that the storage holds every element of `tensor`.
+    /// Checks that the storage of `tensor` holds all of its elements.
     pub(crate) fn check_extent(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
             return Err(format!("no file data/{}", tensor.storage));
@@ -381,12 +388,13 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the maximum number of elements that all tensors of a storage may have together.
+    /// Returns the maximum number of elements that all tensors in the storage `key` may have together, for values of
+    /// type `kind`.
     pub(crate) fn max_values(&self, key: &str, kind: ValueType) -> usize {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
 
-    /// Reads the bytes of a storage.
+    /// Reads the bytes of the storage `key`.
     ///
     /// # Errors
     /// Fails if the storage is missing or damaged.
@@ -431,7 +439,7 @@ impl Checkpoint {
         Ok(values)
     }
 
-    /// Calls `take` with the name, kind and bytes of every file of the archive in order.
+    /// Calls `take` with the name, kind and content of every file in the checkpoint's zip archive, in order.
     ///
     /// # Errors
     /// Fails if a file is damaged or `take` fails.
@@ -454,36 +462,37 @@ impl Checkpoint {
     }
 }
 
-/// Kind of a file in a checkpoint.
+/// Kind of a file in the zip archive of a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum CheckpointFile<'a> {
-    /// Pickle of the object tree.
+    /// Pickle that describes the objects.
     Pickle,
-    /// Storage with this key.
+    /// Storage (block of tensor values) with this key.
     Storage(&'a str),
-    /// Other file.
+    /// Any other file.
     Other,
 }
 
-/// Name of the pickle in the archive.
+/// Name of the pickle file in the archive.
 const PICKLE: &str = "data.pkl";
 
-/// Returns `name` without its first folder, which PyTorch names after the file or `archive`.
+/// Returns `name`, the path of a file in the archive, without its first folder. PyTorch calls this folder `archive` or
+/// like the file.
 fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
-/// Name of the archive's list of files in messages.
+/// Name of the archive's list of files in error messages.
 const LIST: &str = "list of files";
 
-/// Returns whether the file has the text "big" at `at`.
+/// Returns whether the file contains the text "big" at byte `at`.
 fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     let (mut file, mut text) = (file.clone(), [0; 3]);
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
 }
 
-/// Reads all bytes of an uncompressed entry and checks its checksum. PyTorch writes 0 as checksum if it did not compute
-/// one.
+/// Reads the bytes of file `index` of the archive, which must be uncompressed, and checks its checksum. PyTorch writes
+/// a checksum of 0 if it did not compute one.
 fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;

@@ -1,14 +1,16 @@
-//! A `gseq` container as a source of frames.
+//! `gseq` container (this project's sequence file) as a source of frames.
 //!
-//! Input: the file. Output: the frame state of any Gaussians at any frame. Memory: each reader keeps what `TileReader`
-//! describes, all readers together what `HeldTiles` describes, and each decoding thread has one `Scratch`.
+//! Input: the file. Output: the attributes of any Gaussians at any frame. A tile holds the values of one attribute for
+//! a block of consecutive Gaussians and a block of consecutive frames. Memory: each reader has the buffers of a
+//! `TileReader`, all readers share the decoded tiles in `HeldTiles`, and each decoding thread has one `Scratch`.
 //!
-//! Raw tiles are read in place from the map; compressed tiles are decoded directly from it. Touched pages count as
-//! resident until they are released, so a reader releases the pages of a frame block when it enters another one. If it
-//! may keep less than a frame block, it uses positioned reads, because releasing page by page per frame costs more than
-//! the copy. Throughput of reading raw frames into the caller's buffers (`cargo bench --bench scan`, `raw_frames`; two
-//! threads on two cores of a busy EPYC, so compare the figures only with one another): 1.5 GB/s with release per frame
-//! block, 0.6 with release per frame, 1.4 with positioned reads, 2.3 if pages stay mapped.
+//! Raw (uncompressed) tiles are read in place from the memory-mapped file; compressed tiles are decoded directly from
+//! the mapping. Touched pages count as resident until they are released, so a reader releases the pages of a frame
+//! block when it enters another one. If it may keep less than a frame block, it uses positioned reads, because
+//! releasing page by page per frame costs more than the copy. Throughput of reading raw frames into the caller's
+//! buffers (`cargo bench --bench scan`, `raw_frames`; two threads on two cores of a busy EPYC, so compare the figures
+//! only with one another): 1.5 GB/s with release per frame block, 0.6 with release per frame, 1.4 with positioned
+//! reads, 2.3 if pages stay mapped.
 //!
 //! A file that is in the page cache is read block by block, and the system reads ahead on advice: when a reader that
 //! decodes whole frame blocks enters one, it announces the next one. A file that is not in the page cache is scanned in
@@ -28,7 +30,7 @@ use crate::error::Result;
 use crate::model::{Attributes, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
-/// Number of offsets of the file that are tested to find out whether it is in the page cache.
+/// Number of places in the file that are tested to find out whether the file is in the page cache.
 const CACHE_SAMPLES: u64 = 64;
 
 impl FrameSource for Container {
@@ -45,7 +47,8 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Returns `None` if the file is in the page cache; the figures at the top of this module give the reason.
+    /// Returns the prefetcher of the file, or `None` if the file is in the page cache; the module documentation gives
+    /// the measurements behind this.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,
@@ -71,7 +74,7 @@ impl Prefetch for Container {
                 block(gaussians.start, gaussians_per_block)..=block(gaussians.end - 1, gaussians_per_block)
             {
                 let tiles = || self.unheld(want, gaussian_block, frame_block);
-                // Request all tiles first, then wait for each.
+                // Request all tiles first, then wait for each of them.
                 self.reader.expect(tiles());
                 self.reader.fetch(tiles());
             }

@@ -1,24 +1,26 @@
 //! CSV tables: a header line of names, then one line per row. A missing value is an empty field.
 //!
-//! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. Such text
-//! gets an apostrophe in front, which marks it as text; numbers are unchanged.
+//! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. An
+//! apostrophe is put before such a field, which marks it as text. Numbers are unchanged.
 
 use std::fmt::Display;
 
-/// Formats a value; `None` becomes an empty field.
+/// Formats a value as a CSV field; `None` becomes an empty field.
 pub(crate) fn known(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 
-/// Returns `field`, with an apostrophe in front if a spreadsheet would execute it as a formula.
+/// Returns the CSV field `field`, with an apostrophe put before it if a spreadsheet would execute it as a formula.
 fn without_formula(field: String) -> String {
-    // Spreadsheets skip leading spaces and treat the full-width East Asian forms like the plain ones.
+    // Skip leading spaces as spreadsheets do. They also treat the full-width East Asian forms of these characters like
+    // the plain ones.
     let first = field.chars().find(|&c| c != ' ');
     let runs = matches!(first, Some('=' | '+' | '-' | '@' | '\t' | '\r' | '\n' | '＝' | '＋' | '－' | '＠'));
     if runs && field.parse::<f64>().is_err() { format!("'{field}") } else { field }
 }
 
-/// Returns a table as CSV text. Fields with delimiters are quoted according to RFC 4180.
+/// Returns a table with the column `names` and the fields of `rows` as CSV text. Fields with delimiters are quoted
+/// according to RFC 4180.
 ///
 /// # Panics
 /// Panics if a row does not have as many fields as there are names.

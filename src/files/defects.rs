@@ -1,45 +1,47 @@
-//! Statistics of the rows of a file that violate its format, and of how its reader treated them.
+//! Counts of the rows of a file that violate its format (defective rows), and of how the reader treated them: dropped
+//! or repaired.
 
-/// Number of row ids that a note lists per defect.
+/// Maximum number of row indices that a note to the user lists per kind of defect.
 const LISTED_ROWS: usize = 5;
-/// Fraction of dropped rows above which the total becomes the first note about the file.
+/// Fraction of dropped rows above which the note with the totals is the first one about the file.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
-/// Counts of defective rows of a file and of the reader's treatment of them.
+/// Counts of the defective rows of a file, and of those that the reader dropped.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
     /// Number of rows of the file, without padding.
     pub rows: usize,
     /// Number of rows with at least one defect.
     pub defective: usize,
-    /// Number of dropped rows, each counted once.
+    /// Number of dropped rows; a row with several defects counts once.
     pub dropped: usize,
-    /// One entry per kind of defect that was found. A row with several defects counts in several entries.
+    /// Counts per kind of defect that was found. A row with several defects counts in several entries.
     pub kinds: Vec<DefectCount>,
 }
 
-/// Rows with one kind of defect.
+/// Rows of a file that have one kind of defect.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DefectCount {
     /// Name of the defect, such as "zero quaternion".
     pub what: String,
-    /// Whether these rows are dropped; otherwise they are kept as described by `why`.
+    /// Whether rows with this defect are dropped. Otherwise they are repaired as described by `why`.
     pub dropped: bool,
-    /// Reason for the treatment, and advice for the user.
+    /// Reason why the rows are dropped or repaired, and advice for the user.
     pub why: String,
-    /// Number of rows.
+    /// Number of rows with this defect.
     pub rows: usize,
-    /// Ids of the first few rows.
+    /// Indices of the first five rows with this defect, for the note to the user.
     pub first: Vec<u32>,
 }
 
 impl Defects {
-    /// Returns counts of zero for a file of `rows` rows.
+    /// Returns the record for a file of `rows` rows, with no defects counted yet.
     pub fn new(rows: usize) -> Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts row `row` with its defects `found`: each has a name, whether it drops the row, and the reason.
+    /// Counts the defects `found` in row `row`. Each defect has a name, whether the row is dropped because of it, and
+    /// the reason.
     pub fn add(&mut self, row: u32, found: &[(&str, bool, &str)]) {
         self.defective += usize::from(!found.is_empty());
         self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));
@@ -57,13 +59,13 @@ impl Defects {
         }
     }
 
-    /// Returns whether no row has a defect.
+    /// Returns whether no row with a defect has been counted.
     pub fn is_empty(&self) -> bool {
         self.defective == 0
     }
 
-    /// Returns one note per kind of defect and one with the totals. The totals come first if more than 1% of the rows
-    /// were dropped, otherwise last.
+    /// Returns the notes for the user: one per kind of defect and one with the totals. The totals come first if more
+    /// than 1% of the rows were dropped, otherwise last.
     pub fn notes(&self) -> Vec<String> {
         if self.is_empty() {
             return Vec::new();

@@ -1,4 +1,4 @@
-//! Hashing of files in chunks, so that the memory does not depend on their length.
+//! Hashing of files in chunks, so that the memory does not depend on the length of a file.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Number of bytes read at a time.
+/// Number of bytes that are read and hashed at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.

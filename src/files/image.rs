@@ -1,8 +1,8 @@
 //! Reader of photographs and renders in PNG files.
 //!
 //! Input: a PNG of any color type and bit depth, and the size it must have. Output: an [`Image`] with values in [0, 1],
-//! transparent pixels blended over a background. Memory: the decoded rows and the result; the size is checked before
-//! either is allocated.
+//! transparent pixels blended over a background. Memory: the decoded rows and the result; the image size is checked
+//! before memory for them is allocated.
 
 pub mod write;
 
@@ -17,8 +17,8 @@ use crate::render::Image;
 
 /// Reads the PNG at `path`, which must have `width` × `height` pixels.
 ///
-/// Gray is repeated into the three channels. Transparent pixels are blended over `background`: c·a + background·(1 −
-/// a), as the D-NeRF loaders do.
+/// Gray values are copied to the three channels. Transparent pixels (color c, opacity a) are blended over `background`
+/// as c·a + background·(1 − a), as in the D-NeRF loaders.
 ///
 /// # Errors
 /// Fails if the file is not a PNG, is damaged, or has another size.
@@ -26,7 +26,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
     let file = open_file(path)?;
     let mut decoder = Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND);
-    // Text chunks and color profiles are not used and could decompress to any length.
+    // Ignore text chunks and color profiles: they are not used and could decompress to any length.
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(malformed(path))?;
@@ -37,7 +37,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
             .hint("give images of the cameras' size, or the cameras of these images"));
     }
     let (color, depth) = reader.output_color_type();
-    // The size is `None` only on overflow, which the limits on cameras exclude.
+    // The size is `None` only if it overflows `usize`, which the limits on camera sizes exclude.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
     reader.next_frame(&mut bytes).map_err(malformed(path))?;
     let values: Vec<f32> = match depth {
@@ -53,7 +53,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         ColorType::Grayscale => values.iter().flat_map(|&gray| [gray; 3]).collect(),
         ColorType::GrayscaleAlpha => values.chunks_exact(2).flat_map(|p| over([p[0]; 3], p[1])).collect(),
         ColorType::Rgba => values.chunks_exact(4).flat_map(|p| over([p[0], p[1], p[2]], p[3])).collect(),
-        // Palettes are already expanded by the decoder.
+        // The decoder has already replaced palette indices by colors.
         ColorType::Rgb | ColorType::Indexed => values,
     };
     Ok(Image { width, height, data })
@@ -65,7 +65,7 @@ pub(crate) fn measure(path: &Path) -> Option<(u32, u32)> {
     Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?))
 }
 
-/// Returns a closure that turns decoding errors of the file at `path` into errors of this crate.
+/// Returns a closure that turns a PNG decoding error of the file at `path` into an error of this crate.
 fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
     move |error| match error {
         DecodingError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
@@ -79,7 +79,7 @@ fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
 mod tests {
     use super::*;
 
-    /// Writes a PNG of 2 × 1 pixels.
+    /// Writes `bytes` as a PNG of 2 × 1 pixels to a temporary file.
     fn written(color: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut encoder = png::Encoder::new(file.reopen().unwrap(), 2, 1);

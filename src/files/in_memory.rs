@@ -1,4 +1,4 @@
-//! Readers of bytes in memory for the fuzz targets, which run millions of inputs and must not write files.
+//! Functions that read bytes in memory, for the fuzz targets: these run millions of inputs and must not write files.
 
 use std::path::Path;
 
@@ -8,8 +8,8 @@ use super::json::{ParseAbort, read_from};
 use super::pickle::Pickle;
 use crate::error::Result;
 
-/// Reads a pickle within `memory` bytes and describes each of its values. Returns the number of values, or `None` if it
-/// is malformed.
+/// Reads a pickle, using at most `memory` bytes of memory, and formats a description of each of its values as a test.
+/// Returns the number of values, or `None` if the pickle cannot be read.
 pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     let pickle = Pickle::read(bytes, memory).ok()?;
     let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();
@@ -17,11 +17,11 @@ pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     Some(described)
 }
 
-/// Reads JSON like a camera file: the values outside the frames, and each frame. Returns the number of frames and other
-/// values found.
+/// Reads `bytes` as the JSON of a camera file: first the values outside the list of frames, then each frame. Returns
+/// the number of values found.
 ///
 /// # Errors
-/// Fails if the text is not JSON or exceeds the limits.
+/// Fails if the text is not JSON or exceeds the limits on strings, numbers and nesting.
 pub fn cameras_json(bytes: &[u8]) -> Result<usize> {
     let path = Path::new("cameras.json");
     let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };

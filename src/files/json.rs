@@ -1,8 +1,8 @@
 //! Streaming reader of JSON files.
 //!
 //! Input: the path of a file of any length. Output: the value built by a [`DeserializeSeed`]. Memory: a buffer of 64
-//! KiB, one string, and what the seed keeps. Strings, numbers and nesting beyond what a camera file contains are
-//! refused before the parser sees them, because the parser keeps the string it reads in memory.
+//! KiB, one string, and the values that the seed keeps. Strings, numbers and nesting depths larger than those of any
+//! camera file are refused before the parser sees them, because the parser keeps a whole string in memory.
 
 mod checked;
 pub(crate) mod lists;
@@ -21,23 +21,25 @@ use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::CheckedReader;
 
-/// Error of a seed, kept here while the parser unwinds because the parser's own error type cannot hold it.
+/// Error of a seed (builder of the value). It is stored here while the parser unwinds, because the error type of the
+/// parser cannot hold it.
 #[derive(Debug, Default)]
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
 impl ParseAbort {
-    /// Stores `error` and returns the parser error that ends the reading.
+    /// Stores `error` and returns a parser error, which ends the reading.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")
     }
 }
 
-/// Reads the JSON document in the file at `path` with `seed`, which leaves its own errors in `stopped`.
+/// Reads the JSON document in the file at `path` and returns the value that `seed` builds from it. `seed` stores its
+/// own errors in `stopped`.
 ///
 /// # Errors
 /// Fails if the seed fails, the file cannot be read, the text is not UTF-8 or not JSON (the message names the place),
-/// or a string, number or nesting exceeds the limits.
+/// or if a string, a number or the nesting depth exceeds its limit.
 pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     path: &Path,
     stopped: &ParseAbort,
@@ -46,7 +48,7 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     read_from(open_file(path)?, path, stopped, seed)
 }
 
-/// Reads the JSON document in `file` as [`read`] does; messages name it `path`.
+/// Reads the JSON document in `file` as [`read`] does; error messages call the file `path`.
 ///
 /// # Errors
 /// Fails like [`read`].
@@ -86,7 +88,7 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     })
 }
 
-/// Reads the whole JSON document in the file at `path`, which may hold at most `most_bytes`.
+/// Reads the whole JSON document in the file at `path`, which may have at most `most_bytes` bytes.
 ///
 /// # Errors
 /// Fails like [`read_small`] and [`read`].

@@ -1,7 +1,8 @@
 //! Memory-mapped files. No other module of this crate maps files.
 //!
-//! Input: a path. Output: the bytes as a slice. Mapped pages count as memory of this process until they are released,
-//! so readers report the ranges they read ([`FileMap::touched`]), and about 2 MiB of a map stay resident at most.
+//! Input: a path. Output: the bytes of the file as a slice. Mapped pages count as memory of this process until they are
+//! released. So readers report the ranges that they read ([`FileMap::touched`]), and at most about 2 MiB of a mapped
+//! file stay resident.
 
 use std::fs::File;
 use std::ops::{Deref, Range};
@@ -14,19 +15,19 @@ use splat_platform::{FileIdentity, FileStatus, release_pages};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Number of bytes of a map that may be resident before its pages are released. Releasing takes about 2 µs.
+/// Number of bytes of a mapped file that may be resident before its pages are released. A release takes about 2 µs.
 const MAX_RESIDENT_BYTES: usize = 2 << 20;
-/// Bytes around a touched page that the system may map together with it (Linux: fault-around of 64 KiB).
+/// Bytes around a page read by this process that the system may map together with it (Linux: fault-around of 64 KiB).
 const FAULT_AROUND_BYTES: usize = 1 << 16;
 
-/// Read-only map of a whole file, or of a part of a scratch file. Keeps no file descriptor open.
+/// Read-only memory map of a whole file, or of a range of a scratch file. Keeps no file descriptor open.
 #[derive(Debug)]
 pub(crate) struct FileMap {
     path: PathBuf,
     /// Identity of the file; `None` for a scratch file, which no other process can reach.
     identity: Option<FileIdentity>,
     map: Mmap,
-    /// Number of bytes touched since the last release, and end of the last touched range.
+    /// Number of bytes reported as read since the last release, and (`last_end`) end of the last reported range.
     resident: AtomicUsize,
     last_end: AtomicUsize,
 }
@@ -47,7 +48,7 @@ impl FileMap {
         Ok(FileMap::new(path, Some(identity), map))
     }
 
-    /// Maps `range` of an unnamed scratch file that holds data of the file at `path`.
+    /// Maps the bytes `range` of an unnamed scratch file, which hold converted data of the file at `path`.
     ///
     /// # Errors
     /// Fails if the file cannot be mapped.
@@ -60,14 +61,14 @@ impl FileMap {
         Ok(FileMap::new(path, None, map))
     }
 
-    /// Wraps a map without touched pages.
+    /// Wraps a memory map of which no page has been read yet.
     fn new(path: &Path, identity: Option<FileIdentity>, map: Mmap) -> FileMap {
         let (resident, last_end) = (AtomicUsize::new(0), AtomicUsize::new(0));
         FileMap { path: path.to_owned(), identity, map, resident, last_end }
     }
 
-    /// Checks that the file has not been cut short since it was mapped; to be called before each block is read. A file
-    /// that was replaced or removed meanwhile is fine, because the map keeps the old one.
+    /// Checks that the file has not been cut short since it was mapped. Readers call this before they read each block.
+    /// A file that was replaced or removed meanwhile is no error, because the map keeps the old file.
     pub(crate) fn check(&self) -> Result<()> {
         let Some(identity) = &self.identity else { return Ok(()) };
         match FileStatus::from_path(&self.path) {
@@ -82,8 +83,8 @@ impl FileMap {
         }
     }
 
-    /// Records that the bytes of `range` were or will be read, and releases the pages of the map once about 2 MiB of
-    /// them may be resident. Slices of the map stay valid: their pages are read from the file again.
+    /// Records that the bytes of `range` were or will be read. Releases the pages of the map once about 2 MiB of them
+    /// may be resident. Slices of the map stay valid, because released pages are read from the file again on access.
     pub(crate) fn touched(&self, range: Range<usize>) {
         let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(FAULT_AROUND_BYTES);
         let more = gap + range.len();
@@ -93,7 +94,7 @@ impl FileMap {
         }
     }
 
-    /// Calls `each` with the bytes of `range` in chunks of at most 1 MiB.
+    /// Calls `each` with the bytes of `range` of the mapped file, in chunks of at most 1 MiB.
     pub(crate) fn pieces<E>(
         &self,
         range: Range<usize>,
@@ -107,10 +108,10 @@ impl FileMap {
         Ok(())
     }
 
-    /// Releases the pages of the map.
+    /// Releases all resident pages of the map.
     fn release(&self) {
-        // SAFETY: the map is backed by a file, so released pages are read from it again; this holds for scratch files
-        // too.
+        // SAFETY: the map is backed by a file, so released pages are read from this file again. This also holds for
+        // scratch files.
         unsafe { release_pages(&self.map, 0..self.map.len()) };
     }
 }

@@ -1,5 +1,6 @@
-//! Names of files as recorded in outputs. Outputs are published, so they contain no folder of the user's machine: an
-//! input is recorded by its last name, and a file that a recipe needs again by its path relative to the recipe.
+//! Names by which outputs record other files. Outputs are published, so they must not contain folder names of the
+//! user's machine. An input is recorded by its last name only. A file that a recipe (file of all parameters) needs
+//! again is recorded by its path relative to the recipe.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
@@ -7,23 +8,23 @@ use std::path::{Component, Path, PathBuf};
 use crate::error::ShowPath;
 
 /// Number of leading folders that a recipe and the files it names must have in common, unless all are below the working
-/// directory. With fewer, a relative path could reveal a name: from `/home/a/small` to `/home/b/data` it would contain
-/// `b`.
+/// directory. With fewer common folders, a relative path could reveal a folder name: from `/home/a/small` to
+/// `/home/b/data` it would contain `b`.
 const MIN_SHARED_FOLDERS: usize = 2;
 
-/// Returns the last name of `path`; for `.` and paths ending in `..` the name of the folder itself.
+/// Returns the last component of `path`; for `.` and paths that end in `..`, the name of the folder they stand for.
 pub fn name_of(path: &Path) -> String {
     let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
     name(path).or_else(|| name(&fs::canonicalize(path).ok()?)).unwrap_or_else(|| path.to_string_lossy().into_owned())
 }
 
-/// Returns [`name_of`] `path`, escaped for display.
+/// Returns the last component of `path` (see [`name_of`]), escaped for display.
 pub fn shown_name(path: &Path) -> String {
     Path::new(&name_of(path)).shown().to_string()
 }
 
-/// Returns `path` relative to `folder`, which need not exist yet, or only its last name if the two are too far apart
-/// ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
+/// Returns `path` relative to `folder`, which need not exist yet. Returns only the last component of `path` if the two
+/// have too few folders in common ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
 pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     let found = (|| {
         let (path, folder) = (real_path(path)?, real_path(folder)?);
@@ -44,12 +45,12 @@ pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     found.map_or_else(|| name_of(path).into(), PathBuf::from)
 }
 
-/// Returns `path` as an absolute path whose folders contain no links and no `..`.
+/// Returns `path` as an absolute path without links and `..` in its folders; `None` if it cannot be resolved.
 fn real_path(path: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(path).ok()?;
     match (absolute.parent(), absolute.file_name()) {
         (Some(parent), Some(name)) => {
-            // A folder that does not exist yet lies below one that does.
+            // If the folder does not exist yet, resolve the nearest existing folder above it.
             let parent = fs::canonicalize(parent).ok().or_else(|| real_path(parent))?;
             Some(parent.join(name))
         }

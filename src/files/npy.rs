@@ -1,19 +1,20 @@
-//! Checks of the header of a NumPy array that must pass before a reader may parse it.
+//! Checks that the header of a NumPy array must pass before it is given to a parser.
 
-/// Maximum length of a header in bytes. Headers of arrays of numbers have 118 bytes, or 54 more for every axis.
+/// Maximum length of a header in bytes. The header of an array of numbers has 118 bytes, or 54 more for every axis.
 const MAX_HEADER_BYTES: u64 = 4096;
-/// Number of bytes of a file that contain its header, if its length is legal.
+/// Number of bytes from the start of a file that contain the whole header, if the header is not too long.
 pub(crate) const HEAD: u64 = MAX_HEADER_BYTES + 12;
 /// Maximum number of digits in a shape, so that the product of its lengths stays below 2⁶³.
 const MAX_SHAPE_DIGITS: usize = 18;
-/// Maximum bracket depth: a shape within the dictionary, and one more.
+/// Maximum nesting depth of brackets: the dictionary, the shape in it, and one more level.
 const MAX_BRACKET_DEPTH: usize = 3;
 
-/// Returns whether the header of an array file of `bytes` bytes may be passed to the parser. `head` holds the first
-/// [`HEAD`] bytes, or all.
+/// Returns whether the header of an array file may be given to the parser. `head` holds the first [`HEAD`] bytes of the
+/// file, or all if it is shorter; `bytes` is the length of the file.
 ///
-/// The parser itself is unsafe for forged headers: it allocates the declared length (up to 4 GiB) before reading, its
-/// time doubles with every open bracket, and it multiplies the lengths of a shape without a check.
+/// The parser itself is unsafe for forged headers. It allocates the declared header length (up to 4 GiB) before
+/// reading, its time doubles with every open bracket, and it multiplies the lengths of a shape without a check for
+/// overflow.
 pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
     let start = if head.get(6) == Some(&1) { 10 } else { 12 };
     let Some(digits) = head.get(8..start) else { return false };
@@ -34,7 +35,7 @@ pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
         })
 }
 
-/// Returns the number of digits in the first tuple of lengths; 0 if the header has none.
+/// Returns the number of digits in the shape that the header `text` states; 0 if it states none.
 fn digits_of_shape(text: &[u8]) -> usize {
     const KEY: &[u8] = b"'shape'";
     let Some(at) = text.windows(KEY.len()).position(|some| some == KEY) else { return 0 };

@@ -1,8 +1,8 @@
-//! NumPy `.npz` archives, whose arrays are read in place from a map where possible.
+//! NumPy `.npz` archives, whose arrays are read directly from the memory-mapped file where possible.
 //!
 //! Input: a path. Output: the shape of every array, and the values of requested arrays. Memory: at most about 2 MiB of
-//! the mapped file. An array that is compressed or not f32 is decoded once into an unnamed scratch file, which is then
-//! mapped instead.
+//! the mapped file. An array that is compressed or not f32 is decoded once into an unnamed scratch file, and this file
+//! is mapped.
 
 pub(crate) mod write;
 
@@ -23,19 +23,19 @@ use super::open::open_file;
 use super::zip_directory::{DeclaredDirectory, declared_directory};
 use crate::error::{Error, Result};
 
-/// Maximum number of arrays in an archive.
+/// Maximum number of arrays in an `.npz` archive.
 const MAX_ARRAYS: usize = 4096;
-/// Maximum size in bytes of the list of files at the end of an archive.
+/// Maximum size in bytes of the list of files that an archive has at its end.
 const MAX_LIST: u64 = 4 << 20;
-/// Maximum number of bytes of decoded arrays per byte of the archive, in addition to [`BASE_SCRATCH_BYTES`]. Trained
-/// models have 1 to 2.
+/// Maximum number of bytes of decoded arrays, in the scratch file, per byte of the archive; [`BASE_SCRATCH_BYTES`] are
+/// allowed in addition. Trained models need 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Number of bytes of decoded arrays that any archive may have.
+/// Number of bytes of decoded arrays that an archive of any size may have.
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
-/// Maximum compression factor of DEFLATE.
+/// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;
 
-/// Open archive.
+/// Open `.npz` archive.
 #[derive(Debug)]
 pub(crate) struct Npz {
     path: PathBuf,
@@ -43,26 +43,26 @@ pub(crate) struct Npz {
     entries: Vec<NpzArray>,
 }
 
-/// Array of an archive.
+/// Array in an `.npz` archive.
 #[derive(Debug, Clone)]
 pub(crate) struct NpzArray {
     /// Name of the array, without `.npy`.
     pub(crate) name: String,
     /// Length of every axis, the slowest axis first.
     pub(crate) shape: Vec<usize>,
-    /// Floating-point type of the values; `None` for other types and for Fortran order.
+    /// Floating-point type of the values; `None` if they are not floating-point, or are in Fortran order.
     pub(crate) float: Option<Float>,
-    /// Type of the values in NumPy's notation.
+    /// Type of the values in NumPy's notation, such as `<f4`.
     pub(crate) descr: String,
     /// Whether the first axis is the fastest (Fortran order).
     pub(crate) is_fortran: bool,
-    /// Whether the array is compressed.
+    /// Whether the array is compressed in the archive.
     pub(crate) is_compressed: bool,
-    /// Size in the archive, in bytes.
+    /// Size of the array in the archive, in bytes.
     stored: u64,
-    /// Index in the archive.
+    /// Index of the array among the files of the archive.
     index: usize,
-    /// Length of the header in bytes, and offset of the values in the file if they are not compressed.
+    /// Length of the header in bytes, and (`start`) offset of the values in the file if they are not compressed.
     header: usize,
     start: usize,
 }
@@ -76,10 +76,10 @@ pub(crate) struct Float {
 }
 
 impl Float {
-    /// Little-endian float32.
+    /// The type that can be read without decoding: little-endian float32.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
-    /// Returns the type of an array if it holds floating-point numbers in C order.
+    /// Returns the type of the values if the header describes floating-point numbers in C order, else `None`.
     fn from_header(header: &NpyHeader) -> Option<Float> {
         let DType::Plain(plain) = header.dtype() else { return None };
         let bytes = plain.num_bytes().filter(|bytes| [2, 4, 8].contains(bytes))?;
@@ -87,7 +87,7 @@ impl Float {
         is_float.then_some(Float { bytes, big_endian: plain.endianness() == Endianness::Big })
     }
 
-    /// Decodes the value in `stored`, which must have [`Float::bytes`] bytes.
+    /// Decodes one value from its bytes `stored`, which must be [`Float::bytes`] many.
     pub(crate) fn decode(self, stored: &[u8]) -> f32 {
         let mut bytes = [0; 8];
         bytes[..self.bytes].copy_from_slice(stored);
@@ -102,7 +102,7 @@ impl Float {
         }
     }
 
-    /// Encodes `value` into `stored`, which must have [`Float::bytes`] bytes.
+    /// Encodes `value` into the bytes `stored`, which must be [`Float::bytes`] many.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self.bytes {
             2 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
@@ -116,7 +116,7 @@ impl Float {
 }
 
 impl NpzArray {
-    /// Returns the number of values.
+    /// Returns the number of values of the array.
     pub(crate) fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -126,7 +126,7 @@ impl Npz {
     /// Opens the archive at `path` and reads the headers of its arrays.
     ///
     /// # Errors
-    /// Fails if the file is not an archive or is cut short, if a header is malformed, or if values of an array are
+    /// Fails if the file is not a zip archive or is cut short, if a header is malformed, or if values of an array are
     /// missing.
     pub(crate) fn open(path: &Path) -> Result<Npz> {
         let map = FileMap::open(path)?;
@@ -164,23 +164,23 @@ impl Npz {
         Ok(Npz { path: path.to_owned(), map: Arc::new(map), entries })
     }
 
-    /// Returns the path of the file.
+    /// Returns the path of the archive.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the arrays in the order of the file.
+    /// Returns the arrays in the order of the archive.
     pub(crate) fn entries(&self) -> &[NpzArray] {
         &self.entries
     }
 
-    /// Returns the array called `name`, or `None`.
+    /// Returns the array called `name`; `None` if the archive has no such array.
     pub(crate) fn entry(&self, name: &str) -> Option<&NpzArray> {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
     /// Checks that the arrays called `names` exist, hold floating-point numbers in C order, and need no more scratch
-    /// bytes than an archive of this length may have. Decodes nothing.
+    /// space than is allowed for an archive of this length. Decodes no values.
     ///
     /// # Errors
     /// Fails if one of these conditions does not hold; the message names the array.
@@ -201,8 +201,8 @@ impl Npz {
         Ok(())
     }
 
-    /// Returns the array called `name` and the type of its values. Fails if it is missing or not floating-point in C
-    /// order.
+    /// Returns the array called `name` and the type of its values. Fails if there is no such array, or if it does not
+    /// hold floating-point numbers in C order.
     fn float(&self, name: &str) -> Result<(&NpzArray, Float)> {
         let Some(entry) = self.entry(name) else {
             let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
@@ -215,8 +215,8 @@ impl Npz {
         Ok((entry, float))
     }
 
-    /// Returns the values of the array called `name`. If they cannot be read in place, decodes them into a file in the
-    /// folder `scratch`.
+    /// Returns the values of the array called `name`. If they cannot be read directly from the mapped archive, decodes
+    /// them into an unnamed file in the folder `scratch`.
     ///
     /// # Errors
     /// Fails if the array is missing, holds no floating-point numbers in C order or cannot be decoded, or if the
@@ -248,10 +248,10 @@ impl Npz {
         Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
     }
 
-    /// Calls `take` with a reader of the stored values of `entry`.
+    /// Calls `take` with a reader of the decompressed bytes of the values of `entry`.
     ///
     /// # Errors
-    /// Fails if `take` fails or the file was cut short since it was opened.
+    /// Fails if `take` fails, or if the file was cut short since it was opened.
     pub(crate) fn read(&self, entry: &NpzArray, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
         let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
@@ -261,13 +261,13 @@ impl Npz {
         take(&mut file)
     }
 
-    /// Builds the error for damaged values of `entry`.
+    /// Builds the error that says that the values of `entry` are damaged.
     pub(crate) fn damaged(&self, entry: &NpzArray, error: &dyn std::fmt::Display) -> Error {
         Error::input(&self.path, &entry.name, "the values as they were written", error.to_string())
     }
 }
 
-/// Opens the zip archive at `path`. The inner error says what is wrong with its content.
+/// Opens the zip archive at `path`. The inner error describes what is wrong with the content of the archive.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
     let directory = match declared_directory(&mut file) {
@@ -284,13 +284,13 @@ fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File
 }
 
 impl NpzArray {
-    /// Returns whether the values, which have the type `float`, can be read in place.
+    /// Returns whether the values, which have the type `float`, can be read directly from the mapped archive.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }
 
-    /// Reads the header of the array in `file`, which is entry `index` of the archive. The error text says what was
-    /// found.
+    /// Reads the header of the array in `file`, which is file `index` of the archive. The error text describes what was
+    /// found instead.
     fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<NpzArray, String> {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();
@@ -317,7 +317,7 @@ impl NpzArray {
     }
 }
 
-/// Values of an array as f32, in the order of the array.
+/// Values of an array as f32, in the order of the array, in a mapped file.
 #[derive(Debug, Clone)]
 pub(crate) struct Floats {
     map: Arc<FileMap>,
@@ -326,12 +326,12 @@ pub(crate) struct Floats {
 }
 
 impl Floats {
-    /// Checks that the file has not been cut short; to be called before each block is read.
+    /// Checks that the mapped file has not been cut short. Readers call this before they read each block.
     pub(crate) fn check(&self) -> Result<()> {
         self.map.check()
     }
 
-    /// Records that the values of `range` were read, so that their pages can be released.
+    /// Records that the values with the indices `range` were read, so that their pages can be released from memory.
     pub(crate) fn touched(&self, range: Range<usize>) {
         self.map.touched(self.start + 4 * range.start..self.start + 4 * range.end);
     }
@@ -339,7 +339,7 @@ impl Floats {
     /// Returns `W` values starting at index `first`.
     ///
     /// # Panics
-    /// Panics if there are fewer than `W`.
+    /// Panics if fewer than `W` values follow.
     pub(crate) fn row<const W: usize>(&self, first: usize) -> [f32; W] {
         assert!(first + W <= self.len, "values {first} to {} of {}", first + W, self.len);
         let (stored, _) = self.map[self.start + 4 * first..][..4 * W].as_chunks::<4>();

@@ -1,7 +1,7 @@
 //! Opening of input files. Only regular files are opened.
 //!
-//! Opening a named pipe waits for its writer, a device such as `/dev/zero` never ends, and reading one may have side
-//! effects. Every reader of a file that a user names opens it with [`open_file`].
+//! Opening a named pipe waits until another program writes to it, a device such as `/dev/zero` never ends, and reading
+//! a device may have side effects. Every reader of a file that a user names opens it with [`open_file`].
 
 use std::fs::{self, File, FileType};
 use std::io::{self, Read};
@@ -11,15 +11,15 @@ use splat_platform::{FileKind, open_without_waiting};
 
 use crate::error::{Error, Result};
 
-/// Opens the regular file at `path`, or the regular file it links to, for reading.
+/// Opens the regular file at `path` for reading. `path` may be a link to a regular file.
 ///
 /// # Errors
-/// Fails if nothing is there, and for folders, named pipes, sockets and devices, which are not opened.
+/// Fails if nothing exists at `path`. Also fails for folders, named pipes, sockets and devices, without opening them.
 pub(crate) fn open_file(path: &Path) -> Result<File> {
-    // Check before opening, because opening a device may have side effects, and after it, because the file may have
-    // been replaced in between.
+    // Check the kind of file before opening, because opening a device may have side effects, and again afterwards,
+    // because the file may have been replaced meanwhile.
     check_regular(path, fs::metadata(path).map_err(Error::io("open", path))?.file_type())?;
-    // Do not wait if a named pipe has replaced the file.
+    // Open without waiting, in case a named pipe has replaced the file since the check.
     let file = open_without_waiting(path).map_err(Error::io("open", path))?;
     check_regular(path, file.metadata().map_err(Error::io("open", path))?.file_type())?;
     Ok(file)
@@ -29,7 +29,7 @@ pub(crate) fn open_file(path: &Path) -> Result<File> {
 /// messages, as in "a configuration".
 ///
 /// # Errors
-/// Fails like [`open_file`], if the file is larger (nothing of it is read then), or if reading fails.
+/// Fails like [`open_file`], if the file is larger than `most_bytes` (it is then not read), or if reading fails.
 pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec<u8>> {
     let file = open_file(path)?;
     let length = file.metadata().map_err(Error::io("read the size of", path))?.len();
@@ -41,7 +41,8 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
         return Err(larger(format!("{length} bytes")));
     }
     let mut bytes = Vec::with_capacity(length as usize);
-    // Some file systems report a length of 0 for files with content, and the file may grow.
+    // Read at most one byte more than allowed: some file systems report a length of 0 for files with content, and the
+    // file may grow.
     file.take(most_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
     if bytes.len() as u64 > most_bytes {
         return Err(larger("more".to_owned()));
@@ -49,7 +50,7 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
     Ok(bytes)
 }
 
-/// Fails if a file is not a regular one.
+/// Checks that a file of the type `found` is a regular one.
 fn check_regular(path: &Path, found: FileType) -> Result<()> {
     let kind = match FileKind::from_type(found) {
         FileKind::File => return Ok(()),

@@ -1,16 +1,18 @@
-//! Content security policies of the HTML pages this program writes. The browser runs only scripts named by their
-//! digests and makes no network request, whatever text from a file is in the page.
+//! Content security policies of the HTML pages this program writes. With such a policy the browser runs only scripts
+//! whose digests are listed and makes no network requests, whatever text from an input file the page contains.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha2::{Digest, Sha256};
 
-/// Returns the source expression of an inline script or style; `content` is all bytes between its tags.
+/// Returns the policy entry (a digest in quotes) that allows an inline script or style. `content` is the text between
+/// its tags.
 pub fn digest_of(content: &str) -> String {
     format!("'sha256-{}'", STANDARD.encode(Sha256::digest(content)))
 }
 
-/// Returns the `<meta>` element of a policy that allows only `directives`, each with a name and its sources.
+/// Returns the `<meta>` element of a content security policy that allows only `directives`. Each directive is a name
+/// with its allowed sources.
 pub fn policy(directives: &[(&str, &[String])]) -> String {
     let mut content = "default-src 'none'; base-uri 'none'; form-action 'none'".to_owned();
     for (name, sources) in directives.iter().filter(|(_, sources)| !sources.is_empty()) {

@@ -1,10 +1,10 @@
-//! Pickles as data: the object tree that a pickle builds, and the byte range of every integer, so that some integers
-//! can be replaced while all other content stays unchanged. Nothing is executed: functions and classes that a pickle
-//! would call are only names.
+//! Reads pickles (serialized Python objects) as data: the object tree that a pickle builds, and the byte range of every
+//! integer in it, so that some integers can be replaced while all other bytes stay unchanged. Nothing is executed:
+//! functions and classes that a pickle would call appear only as names in the tree.
 //!
-//! Input: the bytes of a pickle of protocol 2 to 5, as written by `torch.save`. Output: nodes that refer to each other
-//! by number. A shared value is one node, and no code here recurses, so cycles are harmless. Source: CPython's
-//! `pickletools`.
+//! Input: the bytes of a pickle of protocol 2 to 5, as written by `torch.save`. Output: the nodes of the object tree,
+//! which refer to each other by index. A value that is used several times is one node. This module does not recurse, so
+//! cycles are harmless. Source: CPython's `pickletools`.
 //!
 //! Memory: every allocation is counted before it is made (`read.rs`). The number of instructions, the nesting depth and
 //! the counted bytes are limited, whatever the pickle declares.
@@ -20,18 +20,19 @@ mod tests;
 
 use read::PickleMachine;
 
-/// Maximum nesting depth of containers. Checkpoints of trained models reach about 10.
+/// Maximum nesting depth of containers (lists, tuples, dicts). Checkpoints of trained models reach about 10.
 pub(crate) const MAX_DEPTH: u8 = 100;
-/// Maximum memory in bytes, whatever the caller allows. A pickle of ten thousand tensors takes about 30 MB.
+/// Maximum memory in bytes for reading a pickle, even if the caller allows more. A pickle that describes ten thousand
+/// tensors takes about 30 MB.
 const MAX_MEMORY: u64 = 128 << 20;
 
-/// Index of a node in [`Pickle`].
+/// Index of a node in the object tree of a [`Pickle`].
 pub(crate) type NodeId = u32;
 
-/// Node of the object tree.
+/// Node of the object tree of a pickle: one Python value.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Node {
-    /// The value `None`.
+    /// The Python value `None`.
     None,
     /// A boolean.
     Bool(bool),
@@ -41,7 +42,7 @@ pub(crate) enum Node {
     Float(f64),
     /// A string.
     Text(Box<str>),
-    /// Bytes, or an integer of more than eight bytes. No reader needs the value.
+    /// Bytes, or an integer of more than eight bytes. The value is not kept, because no reader needs it.
     Opaque,
     /// A function or class of a module, by its full name.
     Global(Box<str>),
@@ -51,34 +52,34 @@ pub(crate) enum Node {
     List(Vec<NodeId>),
     /// Keys and values of a dict, in order.
     Dict(Vec<(NodeId, NodeId)>),
-    /// Result of calling `callee` with `arguments`, and the items set in it afterwards.
+    /// Result of calling `callee` with `arguments`, and the items that are set in the result afterwards.
     Called { callee: NodeId, arguments: NodeId, items: Vec<(NodeId, NodeId)> },
-    /// An object outside the pickle (persistent id); the node that identifies it.
+    /// An object that is stored outside the pickle (persistent id). Holds the node that identifies the object.
     Outside(NodeId),
 }
 
-/// Object tree of a pickle.
+/// Object tree that a pickle builds.
 #[derive(Debug)]
 pub(crate) struct Pickle {
     nodes: Vec<Node>,
     root: NodeId,
-    /// Byte ranges of the instructions that announce the length of the following bytes.
+    /// Byte ranges of the instructions that only announce the length of the bytes after them (FRAME).
     frames: Vec<Range<usize>>,
 }
 
 /// Reason why a pickle cannot be read.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Wrong {
-    /// Malformed or unsupported content: its byte offset, and a description of it.
+    /// The pickle is malformed or contains an unsupported instruction: byte offset and description.
     Malformed(usize, String),
-    /// Content beyond a fixed limit: its byte offset, the limit, and a description of what was found.
+    /// The pickle exceeds a fixed limit: byte offset, the limit, and a description of what was found.
     TooMuch(usize, String, String),
-    /// More memory than allowed: the byte offset, and the number of bytes of memory needed up to there.
+    /// The pickle needs more memory than allowed: byte offset, and the bytes of memory needed up to there.
     Memory(usize, u64),
 }
 
 impl Wrong {
-    /// Builds the error for malformed content at byte `at`.
+    /// Builds the error for malformed content at byte `at` of the pickle.
     fn at(at: usize, found: impl Into<String>) -> Wrong {
         Wrong::Malformed(at, found.into())
     }
@@ -89,7 +90,7 @@ impl Pickle {
     ///
     /// # Errors
     /// Fails if the bytes end too early, refer to values that do not exist, or contain an instruction that no tensor
-    /// needs, or if instructions, depth or memory exceed their limits.
+    /// needs, or if the number of instructions, the nesting depth or the memory exceeds its limit.
     pub(crate) fn read(bytes: &[u8], memory: u64) -> Result<Pickle, Wrong> {
         if u32::try_from(bytes.len()).is_err() {
             return Err(Wrong::TooMuch(0, "a pickle below 4 GiB".into(), format!("{} bytes", bytes.len())));
@@ -97,22 +98,23 @@ impl Pickle {
         PickleMachine::new(bytes, memory.min(MAX_MEMORY)).read()
     }
 
-    /// Returns the node of the whole value.
+    /// Returns the root node, which stands for the whole value of the pickle.
     pub(crate) fn root(&self) -> NodeId {
         self.root
     }
 
-    /// Returns node `id`.
+    /// Returns the node with index `id`.
     pub(crate) fn node(&self, id: NodeId) -> &Node {
         &self.nodes[id as usize]
     }
 
-    /// Returns the ids of all nodes.
+    /// Returns the indices of all nodes.
     pub(crate) fn ids(&self) -> std::ops::Range<NodeId> {
         0..self.nodes.len() as NodeId
     }
 
-    /// Returns keys and values of a dict or an `OrderedDict`, in order; `None` for other nodes.
+    /// Returns the (key, value) pairs of node `id` in order if it is a dict or an `OrderedDict`; `None` for other
+    /// nodes.
     pub(crate) fn pairs(&self, id: NodeId) -> Option<&[(NodeId, NodeId)]> {
         match self.node(id) {
             Node::Dict(items) => Some(items),
@@ -124,19 +126,20 @@ impl Pickle {
         }
     }
 
-    /// Returns the string keys and their values of a dict or an `OrderedDict`; `None` for other nodes.
+    /// Returns the (key, value) pairs of node `id` whose keys are strings if it is a dict or an `OrderedDict`; `None`
+    /// for other nodes.
     pub(crate) fn items(&self, id: NodeId) -> Option<impl Iterator<Item = (&str, NodeId)>> {
         let named = |&(key, value): &(NodeId, NodeId)| Some((self.text(key)?, value));
         Some(self.pairs(id)?.iter().filter_map(named))
     }
 
-    /// Returns the value of a dict under a string key. If the key was set more than once, the last value counts, as in
-    /// Python.
+    /// Returns the value of the dict `id` under the string `key`. If the key was set more than once, the last value
+    /// counts, as in Python.
     pub(crate) fn item(&self, id: NodeId, key: &str) -> Option<NodeId> {
         self.items(id)?.filter(|(name, _)| *name == key).last().map(|(_, value)| value)
     }
 
-    /// Returns the elements of a tuple or a list; `None` for other nodes.
+    /// Returns the elements of node `id` if it is a tuple or a list; `None` for other nodes.
     pub(crate) fn elements(&self, id: NodeId) -> Option<&[NodeId]> {
         match self.node(id) {
             Node::Tuple(elements) | Node::List(elements) => Some(elements),
@@ -144,7 +147,7 @@ impl Pickle {
         }
     }
 
-    /// Returns a string; `None` for other nodes.
+    /// Returns the text of node `id` if it is a string; `None` for other nodes.
     pub(crate) fn text(&self, id: NodeId) -> Option<&str> {
         match self.node(id) {
             Node::Text(text) => Some(text),
@@ -152,7 +155,7 @@ impl Pickle {
         }
     }
 
-    /// Returns an integer; `None` for other nodes.
+    /// Returns the value of node `id` if it is an integer; `None` for other nodes.
     pub(crate) fn int(&self, id: NodeId) -> Option<i64> {
         match self.node(id) {
             Node::Int(value, _) => Some(*value),
@@ -160,7 +163,8 @@ impl Pickle {
         }
     }
 
-    /// Returns name and arguments of a call; `None` for other nodes.
+    /// Returns the name of the called function and the arguments if node `id` is the result of a call; `None` for other
+    /// nodes.
     pub(crate) fn call(&self, id: NodeId) -> Option<(&str, &[NodeId])> {
         let Node::Called { callee, arguments, .. } = self.node(id) else { return None };
         match self.node(*callee) {
@@ -169,7 +173,7 @@ impl Pickle {
         }
     }
 
-    /// Describes a node for messages.
+    /// Returns a description of node `id` for messages.
     pub(crate) fn describe(&self, id: NodeId) -> String {
         const MOST: usize = 12;
         match self.node(id) {
@@ -195,9 +199,9 @@ impl Pickle {
         }
     }
 
-    /// Returns the pickle with some integers replaced. `bytes` are the bytes this was read from; `numbers` maps byte
-    /// ranges of integers to their new values. Instructions that announce lengths are left out, as readers do not need
-    /// them.
+    /// Returns the bytes of the pickle with some integers replaced. `bytes` are the bytes from which this pickle was
+    /// read; `numbers` maps byte ranges of integers to their new values. Instructions that only announce lengths
+    /// (FRAME) are left out, because readers do not need them.
     pub(crate) fn with_numbers(&self, bytes: &[u8], numbers: &BTreeMap<(usize, usize), u64>) -> Vec<u8> {
         let mut edits: Vec<(Range<usize>, Vec<u8>)> =
             numbers.iter().map(|(&(start, end), &number)| (start..end, int(number))).collect();
@@ -214,13 +218,13 @@ impl Pickle {
     }
 }
 
-/// Encodes the instruction that pushes `value`.
+/// Encodes the pickle instruction that pushes the integer `value`.
 fn int(value: u64) -> Vec<u8> {
     match value {
         0..=0xff => vec![b'K', value as u8],
         0x100..=0xffff => [&[b'M'][..], &(value as u16).to_le_bytes()].concat(),
         0x1_0000..=0x7fff_ffff => [&[b'J'][..], &(value as u32).to_le_bytes()].concat(),
-        // Long integer of nine bytes; the last byte is 0, so the number is not negative.
+        // Encode as a long integer of nine bytes; the last byte is 0, so that the number is not negative.
         _ => [&[0x8a, 9][..], &value.to_le_bytes(), &[0]].concat(),
     }
 }

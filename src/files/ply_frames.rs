@@ -1,9 +1,10 @@
 //! PLY files of a sequence, one per frame: their order and their common properties.
 //!
-//! Input: a folder with one PLY file per frame, or a single file. Output: their paths in order, the number of Gaussians
-//! in each, and each file opened on request. Memory: path and count of every frame. A file is mapped only while it is
-//! read, so thousands of frames need neither thousands of maps nor of file descriptors. Text files are converted once,
-//! when they are opened, into a shared scratch file.
+//! Input: a folder with one PLY file per frame, or a single file. Output: the paths in frame order, the number of
+//! Gaussians in each file, and any of the files opened on request. Memory: the path and the number of Gaussians of
+//! every frame. A file is mapped into memory only while it is read, so thousands of frames need neither thousands of
+//! memory maps nor thousands of file descriptors. Text files are converted once, when they are opened, into a shared
+//! scratch file.
 
 use std::cmp::Ordering;
 use std::ffi::OsStr;
@@ -17,20 +18,21 @@ use super::ply::{Ply, PlyOptions, Property, TextRows, TextStore};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::limits::ReadLimit;
 
-/// PLY files with the same properties, one per frame.
+/// PLY files of a sequence, one per frame, all with the same properties.
 #[derive(Debug, Clone)]
 pub struct PlyFrames {
     paths: Vec<PathBuf>,
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
-    /// Converted rows of each text file; `None` for binary files.
+    /// Converted rows of each frame that is a text file; `None` for binary files.
     texts: Vec<Option<TextRows>>,
     memory: ReadLimit,
 }
 
 impl PlyFrames {
-    /// Opens all `.ply` files of `folder` except hidden ones, in natural order (`frame_2` before `frame_10`).
+    /// Opens all `.ply` files in `folder`, one per frame, except hidden ones, in natural order (`frame_2` before
+    /// `frame_10`).
     ///
     /// # Errors
     /// Fails if the numbers of the frames have a gap, if an entry is named like a frame but is not a file, if the
@@ -64,7 +66,7 @@ impl PlyFrames {
         Self::from_paths(path, vec![path.to_owned()], options)
     }
 
-    /// Opens the files at `paths`; `origin` names the sequence in messages.
+    /// Opens the PLY files at `paths` as frames. Error messages call the sequence `origin`.
     fn from_paths(origin: &Path, paths: Vec<PathBuf>, options: &PlyOptions) -> Result<PlyFrames> {
         let Some(first_path) = paths.first() else {
             return Err(Error::input(origin, "", "a folder with one .ply file per frame", "no .ply file in it"));
@@ -103,7 +105,7 @@ impl PlyFrames {
         self.sh_degree
     }
 
-    /// Returns the first frame whose number of Gaussians differs from frame 0, or `None`.
+    /// Returns the first frame whose number of Gaussians differs from that of frame 0; `None` if all are equal.
     pub fn other_count(&self) -> Option<usize> {
         self.counts.iter().position(|count| *count != self.counts[0])
     }
@@ -113,7 +115,7 @@ impl PlyFrames {
         (0..self.paths.len()).map(|i| i as f64 / self.paths.len() as f64).collect()
     }
 
-    /// Opens the file of one frame.
+    /// Opens the PLY file of frame `frame`.
     ///
     /// # Errors
     /// Fails if there is no such frame, or if the file has changed since the frames were opened.
@@ -135,8 +137,8 @@ impl PlyFrames {
         Ok(ply)
     }
 
-    /// Returns the XXH3-128 hash over names and bytes of all files in frame order. Reads all files once. Folder names
-    /// are not included, so a sequence that was moved keeps its digest.
+    /// Returns the XXH3-128 hash of the names and contents of all files in frame order. Reads all files once. Folder
+    /// names are not included, so a sequence that was moved keeps its digest.
     ///
     /// # Errors
     /// Fails if a file cannot be read.
@@ -155,15 +157,16 @@ impl PlyFrames {
     }
 }
 
-/// Returns the last name of `path`.
+/// Returns the last component of `path`, the file name.
 fn file_name(path: &Path) -> &OsStr {
     path.file_name().unwrap_or_default()
 }
 
-/// Hint for a refused sequence.
+/// Hint for a sequence that is refused because frames are missing.
 const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the whole sequence";
 
-/// Returns the files of a folder's frames in natural order, and entries that are named like frames but are not files.
+/// Lists the `.ply` entries of `folder` in natural order. Returns those that are files (the frames), and those that are
+/// not files.
 fn list_frames(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
@@ -176,8 +179,11 @@ fn list_frames(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     Ok(found.into_iter().partition(|path| path.is_file()))
 }
 
-/// Finds the first gap in the frame numbers, if the file names differ in one number only. A gap is a step larger than
-/// the smallest step. Returns the expected name of the missing frame and the names before and after the gap.
+/// Finds the first gap in the frame numbers. Returns the expected name of the missing frame and the names before and
+/// after the gap.
+///
+/// A gap is a step between successive numbers that is larger than the smallest step. Returns `None` if there is no gap,
+/// or if the file names differ in more than their last number.
 fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     let parts = |path: &PathBuf| -> Option<(String, u64, String, usize)> {
         let name = file_name(path).to_str()?;
@@ -200,20 +206,20 @@ fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     Some((missing, name(at), name(at + 1)))
 }
 
-/// Returns whether a file is named like a frame. Hidden files are excluded: a file manager's `._frame_1.ply` is not a
+/// Returns whether `path` has the extension `.ply` and is not hidden: `._frame_1.ply`, written by a file manager, is no
 /// frame.
 fn is_named_like_frame(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
         && !file_name(path).as_encoded_bytes().starts_with(b".")
 }
 
-/// Compares names with numbers by value, then by bytes, so that names equal in the natural comparison (`a 1`, `a1`)
-/// have a fixed order.
+/// Compares names in natural order (numbers in them by value), then by bytes, so that names equal in the natural
+/// comparison (`a 1`, `a1`) have a fixed order.
 fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }
 
-/// Checks that a frame has the same properties as the first frame.
+/// Checks that a frame has the same properties as the first frame, which is the file `first`.
 fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<()> {
     if ply.properties() == properties {
         return Ok(());

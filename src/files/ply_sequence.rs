@@ -1,6 +1,7 @@
-//! A dynamic scene as one PLY file per frame.
+//! A dynamic scene stored as one PLY file per frame.
 //!
-//! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`]. Memory: as in [`PlyFrames`].
+//! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`], which reads any Gaussians at
+//! any frame. Memory: that of [`PlyFrames`].
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
-/// PLY files of the same Gaussians, one per frame.
+/// Dynamic scene stored as one PLY file per frame, with the same Gaussians in every file.
 #[derive(Debug)]
 pub struct PlySequence {
     frames: PlyFrames,
@@ -22,7 +23,8 @@ pub struct PlySequence {
 }
 
 impl PlySequence {
-    /// Opens a folder like [`PlyFrames::open`] and requires the same Gaussians in every frame.
+    /// Opens the PLY files in `folder`, one per frame, like [`PlyFrames::open`]. Every frame must have the same number
+    /// of Gaussians.
     ///
     /// # Errors
     /// Fails like [`PlyFrames::open`] and [`PlySequence::new`].
@@ -61,7 +63,7 @@ impl PlySequence {
         Ok(PlySequence { frames, info, note: None, bytes, states })
     }
 
-    /// Adds a note for the user about these files.
+    /// Sets the note for the user about the files of this sequence.
     pub fn with_note(self, note: String) -> PlySequence {
         PlySequence { note: Some(note), ..self }
     }
@@ -71,7 +73,7 @@ impl PlySequence {
         self.note.as_deref()
     }
 
-    /// Replaces the times of the frames; there must be one per frame.
+    /// Replaces the time stamps of the T frames by `times`, one per frame.
     ///
     /// # Errors
     /// Fails if the number of times is not T, or if times are not finite or not strictly increasing; the message names
@@ -86,7 +88,7 @@ impl PlySequence {
         self.frames.paths()
     }
 
-    /// Opens the file of one frame.
+    /// Opens the PLY file of frame `frame`.
     ///
     /// # Errors
     /// Fails like [`PlyFrames::frame`].
@@ -94,7 +96,7 @@ impl PlySequence {
         self.frames.frame(frame)
     }
 
-    /// Returns [`PlyFrames::digest`] as 32 hexadecimal digits.
+    /// Returns the hash of all files ([`PlyFrames::digest`]) as 32 hexadecimal digits.
     ///
     /// # Errors
     /// Fails if a file cannot be read.
@@ -118,7 +120,7 @@ impl FrameSource for PlySequence {
     }
 }
 
-/// Reader of some Gaussians of a sequence of PLY files.
+/// Reader of some of the Gaussians of a [`PlySequence`].
 struct PlyBlock<'a> {
     sequence: &'a PlySequence,
     ids: OwnedIds,
@@ -133,14 +135,14 @@ impl BlockReader for PlyBlock<'_> {
     }
 }
 
-/// Owned copy of [`Ids`].
+/// Copy of [`Ids`] (indices of Gaussians) that owns its list.
 enum OwnedIds {
     Range(Range<usize>),
     List(Vec<u32>),
 }
 
 impl OwnedIds {
-    /// Copies the ids.
+    /// Copies the indices `ids`.
     fn from_ids(ids: Ids<'_>) -> OwnedIds {
         match ids {
             Ids::Range(range) => OwnedIds::Range(range),
@@ -148,7 +150,7 @@ impl OwnedIds {
         }
     }
 
-    /// Returns the ids as [`Ids`].
+    /// Returns the indices as [`Ids`], which borrows them.
     fn borrow(&self) -> Ids<'_> {
         match self {
             OwnedIds::Range(range) => Ids::Range(range.clone()),

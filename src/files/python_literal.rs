@@ -6,10 +6,10 @@ use std::path::Path;
 
 use crate::error::{Error, quoted};
 
-/// Maximum nesting depth. Each level takes a stack frame.
+/// Maximum nesting depth of a literal. The parser recurses, so each level takes space on the call stack.
 const MAX_DEPTH: usize = 32;
 
-/// Literal, or text that is not one.
+/// Parsed Python literal, or text that is no literal.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Literal {
     None,
@@ -20,7 +20,7 @@ pub(crate) enum Literal {
     /// Elements of a list or a tuple.
     Sequence(Vec<Literal>),
     Dict(Vec<(Literal, Literal)>),
-    /// Text with balanced brackets that is not a literal, such as `device(type='cuda')` or `PosixPath('x')`.
+    /// Text with balanced brackets that is no literal, such as `device(type='cuda')` or `PosixPath('x')`.
     Opaque(String),
 }
 
@@ -40,16 +40,16 @@ impl fmt::Display for Literal {
     }
 }
 
-/// Keyword argument of a call.
+/// Keyword argument `key=value` of a call.
 #[derive(Debug)]
 pub(crate) struct Argument {
     pub(crate) name: String,
     pub(crate) value: Literal,
-    /// Byte range of the value in the text.
+    /// Byte range of the value in the parsed text.
     pub(crate) place: Range<usize>,
 }
 
-/// Byte at which parsing stopped, and the token that was expected there.
+/// Parse error: byte at which parsing stopped, and a description of the token expected there.
 #[derive(Debug, PartialEq)]
 pub(crate) struct ParseError {
     byte: usize,
@@ -57,7 +57,7 @@ pub(crate) struct ParseError {
 }
 
 impl ParseError {
-    /// Converts the error into one about the file `path`, whose content is `text`.
+    /// Converts the parse error into an error about the file at `path`, whose content is `text`.
     pub(crate) fn in_file(self, path: &Path, text: &str) -> Error {
         let before = &text[..self.byte];
         let line = 1 + before.matches('\n').count();
@@ -73,7 +73,7 @@ impl ParseError {
 
 type Parsed<T> = std::result::Result<T, ParseError>;
 
-/// Parses `name(key=value, …)` and returns its arguments in order.
+/// Parses a call `name(key=value, …)` and returns its keyword arguments in order.
 pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
     let mut parser = Parser { text, at: 0 };
     parser.skip_space();
@@ -103,7 +103,7 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
 
 struct Parser<'a> {
     text: &'a str,
-    /// Byte offset of the next character; always at a character boundary.
+    /// Byte offset in the text of the next character; always at a character boundary.
     at: usize,
 }
 
@@ -113,7 +113,7 @@ impl<'a> Parser<'a> {
         &self.text[self.at..]
     }
 
-    /// Builds an error at the current position.
+    /// Builds a parse error at the current position.
     fn error(&self, expected: &'static str) -> ParseError {
         ParseError { byte: self.at, expected }
     }
@@ -138,12 +138,13 @@ impl<'a> Parser<'a> {
         self.take(token)
     }
 
-    /// Skips white space and `token`. Fails if another token comes next.
+    /// Skips white space and `token`. Fails if something else than `token` comes next; `expected` describes it in the
+    /// error.
     fn expect(&mut self, token: &str, expected: &'static str) -> Parsed<()> {
         if self.take_token(token) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// Takes the longest run of characters that occur in names, keywords and numbers.
+    /// Reads the longest run of characters that can occur in names, keywords and numbers.
     fn word(&mut self) -> &'a str {
         self.skip_space();
         let rest = self.rest();
@@ -152,7 +153,8 @@ impl<'a> Parser<'a> {
         &rest[..end]
     }
 
-    /// Parses a literal that ends at a separator; other text becomes [`Literal::Opaque`] up to the next separator.
+    /// Parses a value that ends at a separator. If it is no literal, the text up to the next separator becomes
+    /// [`Literal::Opaque`].
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
         self.skip_space();
         let start = self.at;
@@ -161,7 +163,7 @@ impl<'a> Parser<'a> {
         }
         match self.literal(depth) {
             Ok(Some(literal)) if self.at_separator() => Ok(literal),
-            // Return inner errors: continuing as opaque text would hide their place.
+            // Return errors from inside the value: treating the text as opaque would hide where the error is.
             Err(error) => Err(error),
             Ok(_) => {
                 self.at = start;
@@ -180,7 +182,7 @@ impl<'a> Parser<'a> {
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 
-    /// Parses a literal; returns `None` if the next token does not begin one.
+    /// Parses a literal. Returns `None` if the next token does not begin a literal.
     fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         Ok(match self.rest().chars().next() {
             Some('\'' | '"') => Some(Literal::Str(self.string()?)),
@@ -230,7 +232,7 @@ impl<'a> Parser<'a> {
         Ok(Some(Literal::Dict(entries)))
     }
 
-    /// Parses a string with its escape sequences.
+    /// Parses a string and replaces its escape sequences.
     fn string(&mut self) -> Parsed<String> {
         let open = self.at;
         let unterminated = ParseError { byte: open, expected: "a string with a closing quote" };
@@ -268,7 +270,7 @@ impl<'a> Parser<'a> {
                     value.push(c);
                     0
                 }
-                // Python keeps unknown escape sequences unchanged.
+                // Keep unknown escape sequences unchanged, as Python does.
                 Some((_, c)) => {
                     value.extend(['\\', c]);
                     0
@@ -281,14 +283,14 @@ impl<'a> Parser<'a> {
                     let Some(digit) = digit else { return Err(bad) };
                     code = code << 4 | digit;
                 }
-                // A lone surrogate, from a path that was not UTF-8, is not a char.
+                // A lone surrogate, as Python writes for a path that is not UTF-8, cannot be a char.
                 value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
             }
         }
         Err(unterminated)
     }
 
-    /// Skips to the next `,`, `:`, `=` or closing bracket of the enclosing construct.
+    /// Skips text with balanced brackets up to the next `,`, `:`, `=` or closing bracket of the enclosing construct.
     fn skip_balanced(&mut self) -> Parsed<()> {
         let mut open = Vec::new();
         while let Some(c) = self.rest().chars().next() {
@@ -305,7 +307,7 @@ impl<'a> Parser<'a> {
                     Some(close) if close == c => {}
                     Some(_) => return Err(self.error("brackets that match")),
                 },
-                // Stop at `=`: it belongs to the next key after a missing comma, and skipping it would lose that key.
+                // Stop at `=`: after a missing comma it belongs to the next key, and skipping it would lose this key.
                 ',' | ':' | '=' if open.is_empty() => return Ok(()),
                 _ => {}
             }
@@ -315,7 +317,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// Parses an integer or a float as Python prints it. An integer beyond i64 becomes a float.
+/// Parses an integer or a float as Python prints it. An integer that does not fit into i64 becomes a float.
 fn number(word: &str) -> Option<Literal> {
     let digits = word.trim_start_matches(['+', '-']);
     if matches!(digits, "inf" | "nan") {

@@ -1,4 +1,4 @@
-//! An open file shared by several readers, each with its own position.
+//! An open file that several readers share, each with its own position.
 
 use std::fs::File;
 use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult, Seek, SeekFrom};
@@ -8,23 +8,24 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Size of a reader's buffer in bytes. Zip readers read headers in parts of two and four bytes.
+/// Size in bytes of the buffer of a reader. It is small because zip readers read headers in parts of two and four
+/// bytes.
 const BUFFER_BYTES: usize = 512;
 
-/// Reader of an open file. Clones read the same file independently. The file is not mapped, so bytes that were read do
-/// not count as memory of the process.
+/// Reader of an open file. Clones share the open file but have their own positions. The file is not memory-mapped, so
+/// bytes that were read do not count as memory of the process.
 #[derive(Debug, Clone)]
 pub(crate) struct SharedFile {
     file: Arc<Mutex<File>>,
     len: u64,
     at: u64,
     buffer: [u8; BUFFER_BYTES],
-    /// Offset in the file of the buffer, and number of bytes it holds.
+    /// Offset in the file of the first byte in the buffer, and number of bytes in the buffer.
     buffered: (u64, usize),
 }
 
 impl SharedFile {
-    /// Opens the file at `path`.
+    /// Opens the regular file at `path`.
     ///
     /// # Errors
     /// Fails if the file cannot be opened.
@@ -35,12 +36,12 @@ impl SharedFile {
         Ok(SharedFile { file, len, at: 0, buffer: [0; BUFFER_BYTES], buffered: (0, 0) })
     }
 
-    /// Returns the length of the file in bytes at opening.
+    /// Returns the length in bytes that the file had when it was opened.
     pub(crate) fn len(&self) -> u64 {
         self.len
     }
 
-    /// Reads bytes at offset `at` of the file into `out` and returns their number.
+    /// Reads bytes of the file from offset `at` into `out`. Returns the number of bytes read.
     fn read_from(&self, at: u64, out: &mut [u8]) -> IoResult<usize> {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         file.seek(SeekFrom::Start(at))?;

@@ -1,8 +1,10 @@
-//! `.splatv` files: Gaussians with cubic trajectories and Gaussian windows in time, as read by splaTV and WebGS.
+//! `.splatv` files: Gaussians that move on cubic polynomials in time and whose opacity follows a Gaussian window in
+//! time, as read by the players splaTV and WebGS.
 //!
-//! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the text, the texture it describes. The text is a
-//! list; its entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The
-//! texture holds [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
+//! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the JSON text, and the texture that this text
+//! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth`,
+//! `texheight` and `cameras`. The texture holds one row of [`ROW_BYTES`] bytes per Gaussian ([`SplatvGaussian`]), then
+//! zeros. Source: antmatter15/splaTV.
 
 pub mod rows;
 pub mod write;
@@ -16,46 +18,47 @@ use serde_json::Value;
 use super::map::FileMap;
 use crate::error::{Error, Result, quoted};
 
-/// First word of every file.
+/// First 32-bit word of every `.splatv` file.
 pub const MAGIC: u32 = 0x674b;
-/// Number of texels per row of the texture.
+/// Number of texels in a row of the texture.
 pub const TEXELS: usize = 4096;
-/// Number of bytes per Gaussian: four texels.
+/// Number of bytes that store one Gaussian: four texels.
 pub const ROW_BYTES: usize = 64;
-/// Number of bytes per texel: four words.
+/// Number of bytes per texel: four 32-bit words.
 const TEXEL_BYTES: usize = 16;
-/// Maximum length of the JSON text in bytes: about 3000 cameras. Its parsed values take up to 30 times as much memory.
+/// Maximum length of the JSON text in bytes: enough for about 3000 cameras. The parsed values take up to 30 times as
+/// much memory.
 const MAX_TEXT_BYTES: usize = 1 << 20;
-/// Number of 32-bit words per Gaussian.
+/// Number of 32-bit words that store one Gaussian.
 pub const WORDS: usize = 16;
 
 /// Gaussian whose position is a cubic polynomial of dt = time − center and whose quaternion is linear in dt. Its
 /// opacity is multiplied by exp(−(dt/width)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SplatvGaussian {
-    /// Position at dt = 0, in scene units.
+    /// Position at dt = 0 (the center of the temporal window), in scene units.
     pub position: [f32; 3],
-    /// Coefficients of dt, dt², dt³; x, y, z of each.
+    /// Coefficients of dt, dt² and dt³ in the position, x, y, z for each, in scene units.
     pub motion: [f32; 9],
-    /// Quaternion wxyz of any length at dt = 0.
+    /// Quaternion wxyz at dt = 0; its length may be any.
     pub rotation: [f32; 4],
-    /// Change of `rotation` per unit of time.
+    /// Change of the quaternion `rotation` per unit of time.
     pub omega: [f32; 4],
     /// Standard deviations along the three axes, in scene units.
     pub scale: [f32; 3],
-    /// View-independent color in [0, 1]. f64, because the writer truncates to bytes instead of rounding, so the last
-    /// digit matters.
+    /// View-independent color in [0, 1]. It is f64, because the writer truncates it to a byte instead of rounding, so
+    /// that the last digit matters.
     pub rgb: [f64; 3],
-    /// Opacity at dt = 0, in [0, 1].
+    /// Opacity at dt = 0, its maximum over time, in [0, 1].
     pub opacity: f64,
     /// Time at which the opacity is highest.
     pub center: f32,
-    /// Width of the window in time: √2 × its standard deviation.
+    /// Width of the temporal window: √2 × its standard deviation.
     pub width: f32,
 }
 
 impl SplatvGaussian {
-    /// Decodes a Gaussian from its words.
+    /// Decodes a Gaussian from the words that store it.
     pub fn from_words(words: &[u32; WORDS]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
@@ -74,7 +77,7 @@ impl SplatvGaussian {
     }
 }
 
-/// Returns the number of bytes of `texture` up to the last nonzero one.
+/// Returns the number of bytes of the texture (bytes `texture` of the file) up to the last nonzero one.
 fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     let mut end = texture.end;
     while end > texture.start {
@@ -88,25 +91,26 @@ fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     0
 }
 
-/// Open `.splatv` file.
+/// Open `.splatv` file of moving Gaussians.
 #[derive(Debug)]
 pub struct Splatv {
     path: PathBuf,
     map: FileMap,
-    /// Offset of the texture in the file.
+    /// Offset in bytes of the texture in the file.
     start: usize,
     count: usize,
-    /// Number of rows that the texture should have, if the file ends before that.
+    /// If the file ends before the texture does, the number of rows (Gaussians) that the texture should have.
     declared: Option<usize>,
     cameras: Value,
 }
 
 impl Splatv {
-    /// Opens the file at `path`. Rows of zeros at the end are padding, which some converters leave out.
+    /// Opens the `.splatv` file at `path`. Rows of zeros at the end of the texture are padding, which some converters
+    /// leave out.
     ///
     /// # Errors
-    /// Fails if the magic differs, if the text is not a list with an entry of type `splat`, if sizes contradict each
-    /// other, or if the data end within a Gaussian.
+    /// Fails if the first word is not [`MAGIC`], if the text is not a list with an entry of type `splat`, if the stated
+    /// sizes contradict each other, or if the file ends within a Gaussian.
     pub fn open(path: &Path) -> Result<Splatv> {
         let map = FileMap::open(path)?;
         let cut = |expected: String| {
@@ -173,18 +177,18 @@ impl Splatv {
         self.count
     }
 
-    /// Returns a note if the file ends before its texture does.
+    /// Returns a note for the user if the file ends before its texture does.
     pub fn note(&self) -> Option<String> {
         let (declared, rows) = (self.declared?, (self.map.len() - self.start) / ROW_BYTES);
         Some(format!("{rows} rows of {declared} declared: the file ends before its texture is complete"))
     }
 
-    /// Returns the cameras as JSON, unchanged from the file.
+    /// Returns the list of cameras as JSON, unchanged from the file.
     pub fn cameras(&self) -> &Value {
         &self.cameras
     }
 
-    /// Returns the words of Gaussian `i`.
+    /// Returns the 32-bit words that store Gaussian `i`.
     pub fn words(&self, i: usize) -> [u32; WORDS] {
         self.map.touched(self.start + i * ROW_BYTES..self.start + (i + 1) * ROW_BYTES);
         let row = &self.map[self.start + i * ROW_BYTES..][..ROW_BYTES];

@@ -10,8 +10,8 @@
 //! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; then sign and 9 bits of 511·√2·value each |
 //! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
-//! The maintained crate for this format depends on an asynchronous runtime; the format itself needs only the lines
-//! below.
+//! The maintained crate for this format is not used, because it depends on an asynchronous runtime; writing the format
+//! takes only the code below.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -25,14 +25,15 @@ use crate::model::{Gaussians, color, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
-/// Largest magnitude of a position in units of the last bit (24 bits, signed).
+/// Largest magnitude of a stored position, in units of the last bit (24 bits, signed).
 const MAX_FIXED: f64 = 8_388_607.0;
-/// Maximum number of fractional bits of positions; finer bits are noise of f32.
+/// Maximum number of fractional bits of positions; more bits would only store rounding noise of f32.
 const MAX_FRACTION_BITS: i32 = 20;
-/// Signs of the SH coefficients above degree 0 after the y and z axes are reversed.
+/// Sign by which each SH coefficient above degree 0 is multiplied when the y and z axes are reversed.
 const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Writes `state` to `path`. Returns the largest error of a position in the file, in scene units.
+/// Writes the Gaussians `state` to an `.spz` file at `path`. Returns the largest error of a position in the file, in
+/// scene units.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
@@ -52,7 +53,7 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let unit = 0.5f64.powi(bits);
     let position_error = check_accuracy(state, unit)?;
     let file = File::create(path).map_err(Error::io("create", path))?;
-    // No time stamp and no name, so that the same scene gives the same bytes.
+    // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
     let mut write = || -> std::io::Result<()> {
         for word in [MAGIC, VERSION, count] {
@@ -96,10 +97,11 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     Ok(position_error)
 }
 
-/// Measures the errors of a file of `state` with positions in units of `unit`. Returns the largest error of a position.
+/// Measures the coding errors of an `.spz` file of `state` whose positions are stored in units of `unit`. Returns the
+/// largest error of a position in scene units.
 ///
 /// # Errors
-/// Fails if an error exceeds its bound.
+/// Fails if an error exceeds its bound in [`accuracy`](super::accuracy).
 fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
@@ -125,36 +127,36 @@ fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     Ok(accuracy.position_error())
 }
 
-/// Returns a coordinate as a 24-bit integer in units of `unit`.
+/// Returns the coordinate `value` as a 24-bit integer in units of `unit`.
 fn fixed(value: f64, unit: f64) -> i32 {
     (value / unit).round().clamp(-MAX_FIXED, MAX_FIXED) as i32
 }
 
-/// Returns the stored byte of an opacity logit.
+/// Returns the byte that stores the opacity with logit `logit`.
 fn opacity_byte(logit: f32) -> u8 {
     byte(255.0 * opacity(logit))
 }
 
-/// Returns the stored byte of the SH coefficient of degree 0.
+/// Returns the byte that stores the SH coefficient `dc` of degree 0.
 fn color_byte(dc: f32) -> u8 {
     byte(255.0 * (0.15 * f64::from(dc) + 0.5))
 }
 
-/// Returns the stored byte of a log scale.
+/// Returns the byte that stores the log scale `log_scale`.
 fn scale_byte(log_scale: f32) -> u8 {
     byte(16.0 * (f64::from(log_scale) + 10.0))
 }
 
-/// Returns the stored byte of SH coefficient `k` (from 1) of one channel, rounded to 5 bits in degree 1 and to 4 bits
-/// above.
+/// Returns the byte that stores the SH coefficient with index `k` (from 1) of one channel. Its value is rounded to 5
+/// bits in degree 1 and to 4 bits above.
 fn sh_byte(k: usize, value: f32) -> u8 {
     let step = if k < 4 { 8.0 } else { 16.0 };
     let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
     byte(nearest.floor() * step)
 }
 
-/// Encodes a unit quaternion xyzw without its largest component. q and −q are the same rotation; the sign is chosen so
-/// that the largest component is positive.
+/// Encodes a unit quaternion xyzw in 32 bits: the index of its largest component, and the other three components. q and
+/// −q are the same rotation; the sign is chosen so that the omitted largest component is positive.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);
@@ -164,7 +166,7 @@ fn smallest_three(q: [f64; 4]) -> u32 {
     })
 }
 
-/// Rounds to the nearest byte value, clamped to 0–255; NaN becomes 0.
+/// Rounds to the nearest integer and clamps to 0–255; NaN becomes 0.
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }
@@ -180,10 +182,10 @@ mod tests {
     use crate::model::Attributes;
     use crate::passes::gather_all;
 
-    /// Position, opacity, color, scales, rotation wxyz and SH coefficients of a Gaussian.
+    /// One Gaussian as read: position, opacity, color, scales, rotation wxyz and SH coefficients.
     type Row = (Vec<f64>, f64, Vec<f64>, Vec<f64>, [f64; 4], Vec<f64>);
 
-    /// Reads a file independently of the writer, as the format specifies.
+    /// Reads an `.spz` file as the format specifies, without code shared with the writer.
     fn read(path: &Path) -> Vec<Row> {
         let mut bytes = Vec::new();
         GzDecoder::new(File::open(path).unwrap()).read_to_end(&mut bytes).unwrap();
@@ -204,7 +206,7 @@ mod tests {
         (0..count)
             .map(|i| {
                 let place = row_bytes(0, 9, i).as_chunks::<3>().0;
-                // The highest byte holds the sign.
+                // Extend the sign, which is in the highest of the three bytes.
                 let place =
                     place.iter().map(|b| f64::from(i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) / 2f64.powi(bits));
                 let mut bits_left = u32::from_le_bytes(row_bytes(4, 4, i).try_into().unwrap());
@@ -272,7 +274,8 @@ mod tests {
         assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// Evaluates a color in a direction in both coordinate systems; the signs in [`AXIS_SIGNS`] must make both equal.
+    /// Evaluates a color in the same direction in the original and in the reversed coordinate system; the signs in
+    /// [`AXIS_SIGNS`] must make both equal.
     #[test]
     fn sh_signs_match_the_reversed_axes() {
         let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {

@@ -1,4 +1,4 @@
-//! Reader of text files in UTF-8, with or without a byte order mark.
+//! Readers of text files in UTF-8, with or without a byte order mark.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 
-/// Reads a text file of at most `most_bytes` and removes its byte order mark.
+/// Reads the text file at `path`, which may have at most `most_bytes` bytes, and removes a byte order mark.
 ///
 /// # Errors
-/// Fails like [`read_small`], and if bytes are not UTF-8; the message names the first such byte.
+/// Fails like [`read_small`], and if the text is not UTF-8; the message then names the first invalid byte.
 pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
     let bytes = read_small(path, most_bytes, "a text")?;
     let text = without_mark(path, &bytes)?;
@@ -20,7 +20,7 @@ pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
 /// Removes a UTF-8 byte order mark from `bytes`, the first bytes of the file at `path`.
 ///
 /// # Errors
-/// Fails if there is a UTF-16 byte order mark.
+/// Fails if `bytes` begin with a UTF-16 byte order mark.
 pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
     if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = bytes {
         let found = "the byte order mark of UTF-16";
@@ -29,13 +29,13 @@ pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]>
     Ok(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
-/// Returns the error for `byte` at offset `place` of the file at `path`, which is not valid in UTF-8.
+/// Returns the error for `byte`, at offset `place` of the file at `path`, which makes the text invalid in UTF-8.
 pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
     Error::input(path, format!("byte {place}"), "text in UTF-8", format!("the byte 0x{byte:02x}"))
         .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
 }
 
-/// Converts `bytes`, which begin at offset `start` of the file at `path`, to text. Fails if they are not UTF-8.
+/// Converts `bytes` to text. They begin at offset `start` of the file at `path`. Fails if they are not UTF-8.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();
@@ -43,22 +43,22 @@ fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     })
 }
 
-/// Maximum length of a line in bytes.
+/// Maximum length in bytes of a line that [`TextLines`] returns.
 const MAX_LINE: u64 = 1 << 16;
 
-/// Reader of the lines of a text file of any length.
+/// Reader that returns the lines of a text file one by one; the file may have any length.
 #[derive(Debug)]
 pub(crate) struct TextLines {
     path: PathBuf,
     file: BufReader<File>,
     line: Vec<u8>,
     number: usize,
-    /// Offset in the file of the next line.
+    /// Offset in bytes, in the file, of the next line.
     at: u64,
 }
 
 impl TextLines {
-    /// Opens the file at `path`.
+    /// Opens the text file at `path`.
     ///
     /// # Errors
     /// Fails if the file cannot be opened.
@@ -92,7 +92,7 @@ impl TextLines {
         Ok(Some((self.number, utf_8(&self.path, text, start + (line.len() - text.len()) as u64)?)))
     }
 
-    /// Skips a line of any length.
+    /// Skips the next line, whatever its length is.
     ///
     /// # Errors
     /// Fails if reading fails.

@@ -1,29 +1,29 @@
-//! Reader of the number of files that a zip archive declares, so that it can be checked before memory for them is
-//! allocated.
+//! Reads how many files a zip archive declares, so that this number can be checked before memory for the list of files
+//! is allocated.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
 
-/// Length in bytes of the end record of an archive, without its comment.
+/// Length in bytes of the record at the end of an archive, without the archive's comment.
 const END_BYTES: u64 = 22;
-/// Maximum length of an archive's comment in bytes.
+/// Maximum length in bytes of the comment at the end of a zip archive.
 const MAX_COMMENT: u64 = 0xffff;
-/// Length in bytes of the record that locates the 64-bit end record, and of that record itself.
+/// Length in bytes of the record that locates the 64-bit end record, and ([`END_64_BYTES`]) of that end record itself.
 const LOCATOR_BYTES: u64 = 20;
 const END_64_BYTES: u64 = 56;
 
-/// Size that an archive declares for its list of files.
+/// Size of the list of files that a zip archive declares.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct DeclaredDirectory {
-    /// Number of files.
+    /// Number of files in the archive.
     pub(crate) entries: u64,
-    /// Number of bytes from the start of the list to the end of the archive.
+    /// Number of bytes from the start of the list of files to the end of the archive.
     pub(crate) bytes: u64,
 }
 
-/// Reads the records at the end of the archive in the way of the crate `zip`.
+/// Reads the declared size from the records at the end of the archive, in the same way as the crate `zip`.
 ///
 /// # Errors
-/// Fails if there are no such records or reading fails.
+/// Fails if there are no such records, or if reading fails.
 pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<DeclaredDirectory> {
     let len = file.seek(SeekFrom::End(0))?;
     let missing = || Error::other("no list of files at its end");
@@ -40,7 +40,7 @@ pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<Declar
     };
     let end_at = tail_at + end as u64;
     let comment = number(&tail, end + 20, 2);
-    // The crate finds the 64-bit records from the length of the comment.
+    // Look where the crate `zip` looks: it computes the place of the 64-bit records from the length of the comment.
     let locator = (len - tail_at).checked_sub(LOCATOR_BYTES + END_BYTES + comment).map(|at| &tail[at as usize..]);
     let Some(locator) = locator.filter(|bytes| bytes.starts_with(b"PK\x06\x07")) else {
         let bytes = number(&tail, end + 12, 4) + len - end_at;
@@ -53,7 +53,7 @@ pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<Declar
     let mut record = [0; END_64_BYTES as usize];
     file.seek(SeekFrom::Start(at))?;
     file.read_exact(&mut record)?;
-    // Without a record at this offset the crate would search the whole file for it.
+    // Refuse an archive without a record at this offset: the crate `zip` would search the whole file for it.
     if !record.starts_with(b"PK\x06\x06") {
         return Err(missing());
     }
@@ -80,7 +80,7 @@ mod tests {
         writer.set_comment("a comment");
         let bytes = writer.finish().unwrap().into_inner();
         let found = declared_directory(&mut Cursor::new(&bytes)).unwrap();
-        // Three records of 46 bytes plus names, the end record and the comment.
+        // Size of the list: three records of 46 bytes plus names, the end record and the comment.
         assert_eq!(found, DeclaredDirectory { entries: 3, bytes: 3 * 46 + 7 + 22 + 9 });
         for length in 0..bytes.len() - 9 - 22 {
             assert!(declared_directory(&mut Cursor::new(&bytes[..length])).is_err(), "{length}");

@@ -1,24 +1,24 @@
-//! Output of a zip writer that reports a failed write once, when it is closed.
+//! Output for a zip writer that reports a failed write once, when it is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
-/// Output for a zip writer. After a failed write it accepts and discards all further bytes. A zip writer that is
-/// dropped after an error writes its directory nevertheless, and prints the error it gets for that; with this output it
-/// gets none.
+/// Output for a zip writer that reports a failed write only in [`ZipOutput::close`]. After a failed write it accepts
+/// and discards all further bytes: a zip writer that is dropped after an error still writes the archive's list of files
+/// and prints any error of this write.
 pub(crate) struct ZipOutput<W> {
     inner: W,
     failed: Option<io::Error>,
-    /// Offset of the next byte.
+    /// Offset in the output of the next byte to be written.
     at: u64,
 }
 
 impl<W: Write + Seek> ZipOutput<W> {
-    /// Wraps `inner`, which must be at its start.
+    /// Wraps the output `inner`, which must be at its start.
     pub(crate) fn new(inner: W) -> Self {
         ZipOutput { inner, failed: None, at: 0 }
     }
 
-    /// Flushes the output.
+    /// Flushes the output and reports a failed write.
     ///
     /// # Errors
     /// Fails with the error of the first write that failed.
@@ -27,7 +27,8 @@ impl<W: Write + Seek> ZipOutput<W> {
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// Returns the result of `done`. Returns `fallback` if an earlier operation failed or `done` fails.
+    /// Runs `done` on the inner output and returns its result. Returns `fallback` if an earlier operation failed or
+    /// `done` fails; the first error is kept for [`ZipOutput::close`].
     fn unless_failed<T>(&mut self, fallback: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
             return fallback;

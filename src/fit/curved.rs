@@ -1,63 +1,64 @@
-//! Fit of cubic motion and linear rotation under soft windows in time, the form that players of SpacetimeGaussians
-//! support.
+//! Fit of curves with cubic motion and linear rotation, each visible in a soft window of time: the form that players of
+//! SpacetimeGaussians support.
 //!
 //! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
-//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … curves that
-//! overlap: their centers are evenly spaced over the visible time and each width is three quarters of the spacing. The
-//! sum of such windows is 1 within 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α) add up where Gaussians overlap, so
-//! depths are distributed among the curves, by multiplicative updates that keep them positive (Richardson 1972, Lucy
-//! 1974).
+//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … overlapping
+//! curves. Their centers are evenly spaced over the visible time, and each width is three quarters of the spacing. The
+//! sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the
+//! opacity, add up where Gaussians overlap. So the depth of the Gaussian is distributed among the curves, by
+//! multiplicative updates that keep all depths positive (Richardson 1972, Lucy 1974).
 
 use super::least_squares::polynomial;
 use super::{FittedTrack, MIN_VISIBLE_OPACITY, Misfit, Tolerance};
 
-/// Curve of a Gaussian with cubic motion under a window in time.
+/// Gaussian with cubic motion and linear rotation, visible in a window of time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CubicTrack {
-    /// Center of the window, and origin of time for the polynomials.
+    /// Center of the time window, and time at which dt = 0 in the polynomials of position and rotation.
     pub center: f64,
-    /// Width of the window; infinite for constant opacity.
+    /// Width of the time window, in units of time; infinite for constant opacity.
     pub width: f64,
-    /// Coefficients of dt⁰ to dt³ of the position, scene units.
+    /// Coefficients of the position in scene units, from dt⁰ to dt³, where dt is the time since `center`.
     pub position: [[f64; 3]; 4],
-    /// Coefficients of dt⁰ and dt¹ of the rotation quaternion wxyz.
+    /// Coefficients of the rotation quaternion (w, x, y, z), dt⁰ and dt¹, where dt is the time since `center`.
     pub rotation: [[f64; 4]; 2],
-    /// Log scales, natural logarithms of scene units.
+    /// Natural logarithms of the three scales (scene units).
     pub log_scale: [f64; 3],
-    /// Opacity at the center, in [0, 1].
+    /// Opacity at the center of the time window, in [0, 1].
     pub opacity: f64,
-    /// SH coefficients.
+    /// SH coefficients, constant in time.
     pub sh: Vec<f32>,
 }
 
 impl CubicTrack {
-    /// Returns the position at `time`.
+    /// Returns the position of the curve at `time`, in scene units.
     pub fn position_at(&self, time: f64) -> [f64; 3] {
         let dt = time - self.center;
         std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
     }
 
-    /// Returns the opacity at `time`.
+    /// Returns the opacity of the curve at `time`.
     pub fn opacity_at(&self, time: f64) -> f64 {
         self.opacity * window(time, self.center, self.width)
     }
 }
 
-/// Maximum number of intervals between the centers of overlapping curves.
+/// Maximum number of intervals between the centers of overlapping curves, one less than the number of curves.
 const MAX_INTERVALS: usize = 32;
-/// Maximum number of updates of the distributed optical depths.
+/// Maximum number of iterations that distribute the optical depth among overlapping curves.
 const MAX_UPDATES: usize = 60;
-/// Change of the depths below which the updates stop.
+/// Largest change of an optical depth in one iteration below which the iterations end.
 const CONVERGED: f64 = 1e-3;
-/// Maximum opacity, so that the optical depth stays finite.
+/// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;
-/// Ridge weight for coefficients that the frames do not determine.
+/// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Fraction of the weight below which a frame does not affect a curve.
+/// Value of a curve's time window at a frame below which the frame does not affect the curve. The limit for window ×
+/// opacity is this times the smallest visible opacity.
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns the curves of `track`: as few as meet `tolerance` at every visible frame, or the closest ones tried if none
-/// do. The error of the curves is added to `misfit`.
+/// Returns the curves that represent `track`: as few as meet `tolerance` at every visible frame, or, if none do, the
+/// closest ones that were tried. Adds their errors to `misfit`.
 pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
     let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
     let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
@@ -88,7 +89,7 @@ fn depth(opacity: f64) -> f64 {
     -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
-/// Returns one curve of infinite width.
+/// Returns one curve of constant opacity, whose window is infinitely wide.
 fn constant_curve(track: &FittedTrack) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
@@ -97,7 +98,7 @@ fn constant_curve(track: &FittedTrack) -> CubicTrack {
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// Returns one curve whose window has the mean and the variance of the opacities.
+/// Returns one curve whose time window has the mean and the variance of the opacity over time.
 fn single_window_curve(track: &FittedTrack) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
@@ -106,7 +107,7 @@ fn single_window_curve(track: &FittedTrack) -> CubicTrack {
     let center = moment(&|t| t) / whole;
     let variance = moment(&|t| (t - center).powi(2)) / whole;
     let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
-    // exp(−(dt/w)²) has variance w²/2. Frames one step apart cannot resolve a width below half a step.
+    // exp(−(dt/w)²) has the variance w²/2. Frames one step apart cannot resolve a width below half a step.
     let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9);
     let windows = |frame: usize| window(track.times[frame], center, width);
     let (mut right, mut normal) = (0.0, 0.0);
@@ -118,13 +119,13 @@ fn single_window_curve(track: &FittedTrack) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves over the visible time between two instants.
+/// Returns `count` + 1 overlapping curves for the visible time from `start` to `end`.
 fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = 0.75 * apart;
     let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
     let target_depths: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
-    // For each curve the frames that affect it, with the value of its window.
+    // For each curve, the frames that affect it, each with the value of the curve's window.
     let shares: Vec<Vec<(usize, f64)>> = centers
         .iter()
         .map(|&center| {
@@ -136,7 +137,7 @@ fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize)
     let mut depths = vec![most / 2.0; centers.len()];
     let mut shown = vec![0.0; track.len()];
     for _ in 0..MAX_UPDATES {
-        // Opacities, not depths, are multiplied by windows, so a curve adds the depth of its windowed opacity.
+        // A window multiplies the opacity, not the depth, so each curve adds the depth of its windowed opacity.
         shown.fill(0.0);
         for (shares, d) in shares.iter().zip(&depths) {
             let opacity = 1.0 - (-d).exp();
@@ -162,8 +163,8 @@ fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize)
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// Returns a curve that follows the position and rotation of `track`, by least squares with the given weights. The
-/// opacity is left at 0.
+/// Returns a curve that follows the position and rotation of `track` by least squares; `weight` is multiplied by the
+/// opacity of a frame. The returned opacity is 0.
 fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let samples: Vec<(usize, f64)> = (0..track.len())
@@ -193,8 +194,8 @@ fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usiz
     }
 }
 
-/// Returns the error of `curves`: the largest one in units of `tolerance`, and all errors together. Where several
-/// curves are visible, each must be close to the Gaussian, in proportion to its visibility.
+/// Returns the largest error of `curves` in units of `tolerance`, and the errors over all visible frames. Where several
+/// curves are visible, each must be close to the Gaussian, in proportion to its share of the optical depth.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
     let (mut worst, mut misfit) = (0.0f64, Misfit::default());
     for frame in 0..track.len() {
@@ -219,7 +220,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
                 sh / tolerance.sh,
             ]
             .into_iter()
-            // A curve that is hardly visible need not be as close.
+            // A curve that is hardly visible in this frame need not be as close.
             .map(|excess| excess * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
             .fold(worst, f64::max);
         }

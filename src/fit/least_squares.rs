@@ -1,8 +1,9 @@
-//! Weighted least squares of polynomials of low degree, in f64.
+//! Weighted least squares fit of polynomials of low degree, in f64.
 
-/// Returns the coefficients cₖ, k < `K`, that minimize Σ w·(y − Σ cₖ·uᵏ)² for every component of y, plus `ridge`·Σw·cₖ²
-/// for k ≥ 1. The ridge, proportional to the total weight, keeps coefficients small that the samples do not determine.
-/// Samples are (u, y, w), and `u` should be about within ±1. Returns zeros if the system cannot be solved.
+/// Fits polynomials Σ cₖ·uᵏ with `K` coefficients to `samples` of `C` components. A sample is (u, y, w): argument,
+/// values and weight; u should be about within ±1. Returns the coefficients c₀ … that minimize Σ w·(y − Σ cₖ·uᵏ)² plus
+/// `ridge`·Σw·cₖ² for k ≥ 1, separately for each component. The ridge keeps coefficients small that the samples do not
+/// determine; it is proportional to the total weight. Returns zeros if the system cannot be solved.
 pub(crate) fn polynomial<const K: usize, const C: usize>(
     samples: impl Iterator<Item = (f64, [f64; C], f64)>,
     ridge: f64,
@@ -21,7 +22,7 @@ pub(crate) fn polynomial<const K: usize, const C: usize>(
     for (k, row) in normal.iter_mut().enumerate().skip(1) {
         row[k] += ridge * whole + f64::MIN_POSITIVE;
     }
-    // Gauss-Jordan elimination with pivots: the matrix is positive definite except for rounding.
+    // Gauss-Jordan elimination with pivots. The matrix is positive definite except for rounding errors.
     for k in 0..K {
         let pivot = (k..K).max_by(|&a, &b| normal[a][k].abs().total_cmp(&normal[b][k].abs())).unwrap_or(k);
         normal.swap(k, pivot);

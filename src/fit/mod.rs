@@ -1,7 +1,8 @@
-//! Curves fitted to the states of one Gaussian over all frames, in the forms that compact formats store.
+//! Fits of simple motions to the track of one Gaussian (its states at all frames), in the forms that compact formats
+//! store.
 //!
-//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic motions under soft
-//! windows in time. Both report their error.
+//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic motions in soft windows
+//! of time. Both report their error.
 
 mod curved;
 mod least_squares;
@@ -13,43 +14,44 @@ pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, straight};
 pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 
-/// Maximum error of a fit at every frame where the Gaussian is visible.
+/// Maximum error of a fit at every frame in which the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Maximum error of positions, in units of the middle one of the three scales.
+    /// Maximum distance between positions, in units of the Gaussian's middle scale (of three).
     pub position: f64,
-    /// Maximum error of rotations, radians. Ignored if no two log scales differ by 0.1 or more.
+    /// Maximum angle between rotations, radians. Ignored for a nearly round Gaussian, whose log scales all differ by
+    /// less than 0.1.
     pub rotation: f64,
-    /// Maximum error of log scales (natural logarithm).
+    /// Maximum difference of log scales (natural logarithms).
     pub log_scale: f64,
-    /// Maximum error of opacities.
+    /// Maximum difference of opacities, which are in [0, 1].
     pub opacity: f64,
-    /// Maximum error of SH coefficients.
+    /// Maximum difference of SH coefficients.
     pub sh: f64,
 }
 
 impl Default for Tolerance {
-    /// Returns tolerances of about one quantization step of 8 bits.
+    /// Returns tolerances of about one step of an 8-bit quantization.
     fn default() -> Tolerance {
         Tolerance { position: 0.1, rotation: 0.05, log_scale: 0.05, opacity: 0.02, sh: 0.05 }
     }
 }
 
-/// Error of fits, over all Gaussians and the frames where they are visible.
+/// Error of fits, over all Gaussians and the frames in which they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Misfit {
-    /// Number of compared states.
+    /// Number of compared states (Gaussians × visible frames).
     pub states: u64,
-    /// Sum of squared distances, in units of the middle scale squared.
+    /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
     squares: f64,
-    /// Largest distance, in units of the middle scale.
+    /// Largest distance between positions, in units of the Gaussian's middle scale.
     pub position: f64,
-    /// Largest difference of opacities.
+    /// Largest difference between the opacities of fit and Gaussian.
     pub opacity: f64,
 }
 
 impl Misfit {
-    /// Adds one state with the error of its position, in units of the middle scale, and of its opacity.
+    /// Adds the errors of one Gaussian at one frame: of its position, in units of its middle scale, and of its opacity.
     fn add(&mut self, position: f64, opacity: f64) {
         self.states += 1;
         self.squares += position * position;
@@ -57,7 +59,7 @@ impl Misfit {
         self.opacity = self.opacity.max(opacity.abs());
     }
 
-    /// Returns the combined error of both sets of fits.
+    /// Returns the errors of both sets of fits together.
     pub fn and(self, other: Misfit) -> Misfit {
         Misfit {
             states: self.states + other.states,
@@ -67,7 +69,7 @@ impl Misfit {
         }
     }
 
-    /// Returns the root mean square of the distances, in units of the middle scale.
+    /// Returns the root mean square distance between positions, in units of the Gaussian's middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
     }

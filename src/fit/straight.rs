@@ -1,24 +1,24 @@
-//! Fit of pieces with linear motion; all other attributes are constant within a piece.
+//! Fit of pieces with linear motion to the track of a Gaussian. All other attributes are constant within a piece.
 
 use std::ops::Range;
 
 use super::least_squares::polynomial;
 use super::{FittedTrack, Misfit, Tolerance};
 
-/// Attributes of a Gaussian during some frames.
+/// Piece of a track: linear motion of a Gaussian during consecutive frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LinearPiece {
-    /// Frames of the piece.
+    /// Frames in which the piece represents the Gaussian.
     pub frames: Range<usize>,
-    /// Time at which the Gaussian is at `position`.
+    /// Middle of the piece, the time at which the Gaussian is at `position`.
     pub at: f64,
-    /// Position, scene units.
+    /// Position at the time `at`, in scene units.
     pub position: [f64; 3],
     /// Velocity, scene units per unit of time.
     pub velocity: [f64; 3],
-    /// Rotation, unit quaternion wxyz.
+    /// Rotation, a unit quaternion (w, x, y, z).
     pub rotation: [f64; 4],
-    /// Log scales, natural logarithms of scene units.
+    /// Natural logarithms of the three scales (scene units).
     pub log_scale: [f64; 3],
     /// Opacity in [0, 1].
     pub opacity: f64,
@@ -26,10 +26,10 @@ pub struct LinearPiece {
     pub sh: Vec<f32>,
 }
 
-/// Returns the pieces of `track` in order. Spans are halves of the sequence, halves of those and so on: 2ᵏ frames that
-/// begin at a multiple of 2ᵏ. Each piece is the largest such span that meets `tolerance` at every frame. Frames where
-/// the Gaussian is invisible have no piece. All Gaussians together have at most twice as many different spans as there
-/// are frames. The error of the pieces is added to `misfit`.
+/// Returns the pieces of `track`, in order of time. Each piece covers the largest span of frames that meets `tolerance`
+/// at every frame. Spans are the sequence, its halves, their halves and so on: 2ᵏ frames from a multiple of 2ᵏ.
+/// Therefore all Gaussians together have at most twice as many different spans as there are frames. Frames in which the
+/// Gaussian is invisible have no piece. Adds the errors of the pieces to `misfit`.
 pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
@@ -44,7 +44,8 @@ pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit)
     pieces
 }
 
-/// Adds the pieces of a span of 2ᵏ frames; the last frames of the span may not exist.
+/// Adds the pieces for the frames `span` to `pieces`, halving the span where one piece is not accurate enough. A span
+/// has 2ᵏ frames and may extend beyond the last frame.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
@@ -62,12 +63,13 @@ fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pi
     add_pieces(track, middle..span.end, tolerance, pieces);
 }
 
-/// Returns the position of `piece` at `time`.
+/// Returns the position of the Gaussian at `time` according to `piece`, in scene units.
 fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
-/// Returns the best piece for the given frames: least squares for positions, means for all other attributes.
+/// Returns the best piece for `frames` of `track`: a least squares fit of the positions, and the means of all other
+/// attributes.
 fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
@@ -91,7 +93,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     }
 }
 
-/// Returns whether `piece` is within `tolerance` at every one of its frames.
+/// Returns whether `piece` differs from `track` by at most `tolerance` at each of its frames.
 fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
@@ -107,7 +109,7 @@ fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) ->
 mod tests {
     use super::*;
 
-    /// Returns a track of a Gaussian of scale e⁻³ with the given position and opacity at each time.
+    /// Returns the track of a round Gaussian of scale e⁻³, with its position and opacity given as functions of time.
     pub(super) fn track(
         frames: usize,
         position: impl Fn(f64) -> [f64; 3],
@@ -132,7 +134,7 @@ mod tests {
         assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
         let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
         let pieces = straight(&bent, &Tolerance::default(), &mut misfit);
-        // The bend is in frame 20. Pieces: frames 0 to 15, 16 to 19, and 20 on.
+        // The motion bends in frame 20, so the pieces are frames 0 to 15, 16 to 19, and from 20 on.
         assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
         assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
         assert!(misfit.position <= 0.1 && misfit.states == 100, "{misfit:?}");
@@ -147,7 +149,7 @@ mod tests {
         assert_eq!(frames, [12..16, 16..24, 43..44, 44..48, 48..60]);
         let mut broken = track(5, |_| [0.0; 3], |_| 0.5);
         broken.position[2][1] = f64::NAN;
-        // Pieces: frames 0 and 1, frame 3, frame 4.
+        // The pieces are frames 0 and 1, frame 3, and frame 4.
         assert_eq!(straight(&broken, &Tolerance::default(), &mut misfit).len(), 3);
     }
 

@@ -1,29 +1,29 @@
-//! Track of one Gaussian: its state at every frame.
+//! Track of one Gaussian: its attributes at every frame.
 
 use crate::model::{Gaussians, opacity};
 
 /// Opacity below which a Gaussian is not drawn (1/255). Fits ignore frames below it.
 pub const MIN_VISIBLE_OPACITY: f64 = 1.0 / 255.0;
 
-/// States of one Gaussian at all frames.
+/// Attributes of one Gaussian at all frames.
 #[derive(Debug, Clone, Default)]
 pub struct FittedTrack {
     /// Times of the frames, increasing.
     pub times: Vec<f64>,
-    /// Positions, scene units.
+    /// Position at each frame, in scene units.
     pub position: Vec<[f64; 3]>,
-    /// Rotations, unit quaternions wxyz, each in the hemisphere of the previous one.
+    /// Rotation at each frame: a unit quaternion (w, x, y, z), with the sign that is nearer to the previous one.
     pub rotation: Vec<[f64; 4]>,
-    /// Log scales, natural logarithms of scene units.
+    /// Natural logarithms of the three scales (scene units) at each frame.
     pub log_scale: Vec<[f64; 3]>,
-    /// Opacities in [0, 1].
+    /// Opacity at each frame, in [0, 1].
     pub opacity: Vec<f64>,
-    /// SH coefficients, one row per frame or one row for all frames.
+    /// SH coefficients: one row per frame, or a single row if they are the same in all frames.
     pub sh: Vec<Vec<f32>>,
 }
 
 impl FittedTrack {
-    /// Returns the track of Gaussian `row` from the frame states at `times`, in order.
+    /// Returns the track of Gaussian `row`. `states`: all Gaussians at each of the `times`.
     pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
@@ -68,7 +68,7 @@ impl FittedTrack {
         self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }
 
-    /// Returns the SH coefficients at `frame`.
+    /// Returns the SH coefficients of the Gaussian at `frame`.
     pub fn sh(&self, frame: usize) -> &[f32] {
         &self.sh[frame.min(self.sh.len() - 1)]
     }
@@ -80,14 +80,14 @@ impl FittedTrack {
         scales[1].exp().max(1e-12)
     }
 
-    /// Returns the distance between `position` and the position at `frame`, in units of the middle scale.
+    /// Returns the distance between `position` and the position at `frame`, in units of the middle scale at `frame`.
     pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         apart / self.middle_scale(frame)
     }
 
-    /// Returns the angle between the rotation at `frame` and `rotation`, radians. Returns 0 if no two log scales differ
-    /// by 0.1 or more.
+    /// Returns the angle between `rotation` and the rotation at `frame`, in radians; 0 for a nearly round Gaussian,
+    /// whose log scales all differ by less than 0.1.
     pub fn rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         let scales = self.log_scale[frame];
         let [least, most] =

@@ -1,11 +1,12 @@
-//! Storage of summaries in cache entries.
+//! Storage of summaries in cache entries (files with the result of a stage).
 
 use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// Wrapper that serializes a summary as TOML text. The binary format of cache entries has no optional fields, but
-/// summaries, which are made for JSON, have some. TOML supports them and, unlike JSON, also NaN and infinities.
+/// summaries, which are made for JSON, have some. TOML can leave fields out and, unlike JSON, also stores NaN and
+/// infinities.
 #[derive(Debug)]
 pub(crate) struct AsToml<T>(pub(crate) T);
 
@@ -35,7 +36,7 @@ mod tests {
         postcard::from_bytes::<AsToml<T>>(&postcard::to_stdvec(&AsToml(value)).unwrap()).unwrap().0
     }
 
-    /// Checks that a value is unchanged after storage. Compares texts, because NaN is not equal to itself.
+    /// Checks that `value` is unchanged after storage. Compares texts, because NaN is not equal to itself.
     fn same<T: Serialize + DeserializeOwned + Clone + std::fmt::Debug>(value: &T) {
         assert_eq!(format!("{:?}", kept(value.clone())), format!("{value:?}"));
     }

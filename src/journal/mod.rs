@@ -1,5 +1,5 @@
-//! Journal of a run: stages with their time, memory and reads, omitted stages with reasons, and notes. Each is recorded
-//! where it happens.
+//! Journal of a run: its stages with their time, memory and reads, omitted stages with reasons, and notes. Code adds an
+//! entry at the place where the work happens.
 
 pub(crate) mod as_toml;
 pub mod records;
@@ -19,11 +19,11 @@ use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
 
-/// Start of a measured period.
+/// Clock that measures a period of work, in wall-clock time and processor time.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
     wall: Instant,
-    /// Processor time of the process at the start, seconds; `None` where the system does not report it.
+    /// Processor time that the process had used at the start, seconds; `None` if the system does not report it.
     processors: Option<f64>,
 }
 
@@ -33,51 +33,53 @@ impl Clock {
         Clock { wall: Instant::now(), processors: processor_seconds() }
     }
 
-    /// Returns the wall-clock seconds since the start.
+    /// Returns the wall-clock time since the start, seconds.
     pub fn seconds(&self) -> f64 {
         self.wall.elapsed().as_secs_f64()
     }
 
-    /// Returns the seconds that this process used on all processors since the start; `None` where the system does not
-    /// report them.
+    /// Returns the processor time of this process since the start, summed over all processors, seconds; `None` if the
+    /// system does not report it.
     pub fn processor_seconds(&self) -> Option<f64> {
         processor_seconds().zip(self.processors).map(|(now, before)| now - before)
     }
 }
 
-/// Returns the seconds that this process has used on all processors; `None` where the system does not report them.
+/// Returns the processor time of this process so far, summed over all processors, seconds; `None` if the system does
+/// not report it.
 fn processor_seconds() -> Option<f64> {
     ProcessTime::try_now().ok().map(|time| time.as_duration().as_secs_f64())
 }
 
-/// Record of a run so far, or of a cached stage.
+/// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Size of one full read: the reads of one pass over every frame.
+    /// Amounts read when every frame of the input is read once (one full read). Reads of stages are reported in this
+    /// unit.
     #[serde(skip)]
     pub whole: Reads,
-    /// Records of all stages in order.
+    /// Records of the stages that have run, in order.
     pub stages: Vec<StageRecord>,
     /// Stages that the run omitted, with reasons.
     pub left_out: Vec<LeftOut>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Measured effect of half precision on the deformation field.
+    /// Measured effect on renders of writing the deformation field in half precision.
     pub field: Option<FieldSummary>,
-    /// Measured effect of lower SH degrees.
+    /// Measured effect on renders of dropping SH degrees.
     pub bands: Option<BandsSummary>,
-    /// Quality gained by refinement.
+    /// PSNR before and after refinement.
     pub refined: Option<RefinedSummary>,
-    /// Forecast that was made before the run, if there was one.
+    /// Forecast of time and memory that was made before the run, if there was one.
     pub forecast: Option<Forecast>,
 }
 
 impl Journal {
-    /// Runs `work` as a stage that reads `source`. `work` returns its result and the number of Gaussians after the
-    /// stage.
+    /// Runs `work` as a stage and records its time, memory and reads of `source`. `work` returns its result and the
+    /// number of Gaussians after the stage; the result is returned.
     ///
     /// # Errors
-    /// Fails if `work` fails; nothing is recorded then.
+    /// Fails if `work` fails; the stage is not recorded then.
     pub fn stage<T>(
         &mut self,
         name: &'static str,
@@ -92,11 +94,12 @@ impl Journal {
         Ok(value)
     }
 
-    /// Runs an undivided stage like [`Journal::stage`]. Its result is cached under `key` in the work folder of the
-    /// scene.
+    /// Runs a stage that cannot be divided among processes, like [`Journal::stage`], or returns its result from the
+    /// cache. The result is stored under `key` in the work folder of the scene.
     ///
     /// # Errors
-    /// Fails if `compute` fails or the cache cannot be used. A run of a single shard ends before the stage.
+    /// Fails if `compute` fails or the cache cannot be used. A run that computes only one shard (part of a divided
+    /// stage) ends here with an error.
     pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,
@@ -111,16 +114,16 @@ impl Journal {
         })
     }
 
-    /// Returns the mean PSNR of the result against the original on validation views, dB: that of the last stage that changed
-    /// the result and measured it.
+    /// Returns the mean PSNR of the result against the original on validation views (used to choose, not to fit), dB,
+    /// from the last stage that measured it; `None` if no stage did.
     pub fn result_psnr(&self) -> Option<f64> {
         let bands = self.bands.as_ref().map(|bands| bands.result);
         let field = self.field.as_ref().and_then(|field| field.result);
         bands.or(field).or(self.refined.map(|refined| refined.result))
     }
 
-    /// Returns the cached result of `stage` or computes it, together with everything that `compute` records in the
-    /// journal.
+    /// Returns the result of `stage` for `key` from the cache, or computes it. Also adds the entries that `compute`
+    /// makes in a journal to this journal; they are cached with the result.
     ///
     /// # Errors
     /// Fails if `compute` fails or the cache cannot be used.
@@ -151,7 +154,8 @@ impl Journal {
         Ok(found)
     }
 
-    /// Records the opening of the input: it began at `start`, found `gaussians` Gaussians and did `reads`.
+    /// Records the opening of the input as stage `name`, which began at `start`, found `gaussians` Gaussians and read
+    /// the amounts `reads`.
     pub fn opened(&mut self, name: &'static str, start: Clock, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
     }
@@ -161,7 +165,7 @@ impl Journal {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
     }
 
-    /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost.
+    /// Adds an entry for the omitted work `what` with the reason `why` and the cost `saved` by omitting it.
     pub fn spare(&mut self, what: impl Into<String>, why: impl Into<String>, saved: Saved) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }

@@ -1,4 +1,4 @@
-//! Records for the summary that stages write during a run.
+//! Records that stages write during a run, for the summary of the run.
 
 use bytesize::ByteSize;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -7,7 +7,7 @@ use crate::metrics::decibels_text;
 use crate::progress::duration;
 use crate::source::Reads;
 
-/// Record of one stage of a run.
+/// Time, memory, reads and counts of one stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
     /// Name of the stage.
@@ -16,31 +16,33 @@ pub struct StageRecord {
     pub gaussians_in: usize,
     /// Number of Gaussians after the stage.
     pub gaussians_out: usize,
-    /// Reads of the input, counted where they happened.
+    /// Amounts read from the input, counted by the code that reads.
     pub reads: Reads,
-    /// Reads as a number of full reads of the input: by bytes if it is stored in tiles, otherwise by states.
+    /// Amount read from the input, divided by the amount of reading every frame once; in bytes if the input is stored
+    /// in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
     pub full_reads: f64,
-    /// Bytes read back from scratch files, which are not part of the input.
+    /// Number of bytes read back from scratch files, which are not part of the input.
     pub scratch_bytes: u64,
     /// Whether the result came from the cache. Times and reads are then those of the run that computed it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub kept: bool,
     /// Wall-clock time, seconds.
     pub seconds: f64,
-    /// Time of all processors together, seconds, where the system reports it.
+    /// Processor time summed over all processors, seconds; `None` if the system does not report it.
     pub processor_seconds: Option<f64>,
-    /// Largest resident memory of the process up to the end of this stage, bytes, where the system reports it.
+    /// Largest resident memory of the process from its start to the end of this stage, bytes; `None` if the system does
+    /// not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Stage or step that was omitted.
+/// Stage or step that a run omitted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
     /// Name of the omitted work.
     pub what: String,
-    /// Reason.
+    /// Reason for omitting the work.
     pub why: String,
-    /// Cost that was saved, where it is known.
+    /// Time, reads or bytes that were saved, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub saved: Option<Saved>,
 }
@@ -49,22 +51,22 @@ pub struct LeftOut {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Saved {
-    /// Cost of a stage: approximate time on all threads, and maximum full reads of the frames.
+    /// Estimated cost of a whole stage.
     Stage {
-        /// Time, seconds.
+        /// Wall-clock time when all threads are busy, seconds.
         seconds: f64,
-        /// Number of full reads.
+        /// Maximum amount read, in full reads (every frame of the input once).
         reads: f64,
     },
-    /// Values that did not change and were not read again.
+    /// Statistics that had not changed and were therefore not read again.
     Values {
-        /// Bytes of these values.
+        /// Number of bytes of these statistics.
         bytes: u64,
     },
 }
 
 impl Saved {
-    /// Formats the saved cost for display.
+    /// Formats the saved cost for display, such as "about 12.0 s, 1.00 full reads".
     pub fn text(self) -> String {
         match self {
             Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
@@ -83,7 +85,7 @@ impl LeftOut {
     }
 }
 
-/// Deserializes pairs of an integer (size or SH degree) and a number; null becomes NaN.
+/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. The number null becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
@@ -94,25 +96,25 @@ pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<
     Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
-/// Effect of half precision of the deformation field on renders of the result.
+/// Effect on renders of writing the deformation field of the result in half precision (2 bytes per value).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FieldSummary {
     /// Whether the field is written in half precision.
     pub half: bool,
-    /// Number of compared views.
+    /// Number of views on which renders were compared.
     pub pictures: usize,
-    /// Mean PSNR of renders with the half-precision field against those with the exact field, dB.
+    /// Mean PSNR of renders with the half-precision field compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of renders with the exact field against the original, dB; `None` if the decision did not need it.
+    /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if the choice did not need it.
     pub result: Option<f64>,
-    /// Minimum of `rounding` for which half precision is accepted, dB.
+    /// Value that `rounding` must reach for half precision to be used, dB.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
 
 impl FieldSummary {
-    /// Returns the reason for the precision of the field as text.
+    /// Returns, as text, the measured values that explain why the field is or is not written in half precision.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
@@ -126,81 +128,81 @@ impl FieldSummary {
     }
 }
 
-/// Quality gained by refinement.
+/// PSNR before and after refinement, on validation views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RefinedSummary {
-    /// Number of validation views, which are not used for fitting.
+    /// Number of validation views, which are used to choose the best state but not to fit.
     pub pictures: usize,
-    /// Mean PSNR against the original before refinement, dB.
+    /// Mean PSNR against renders of the original before refinement, dB.
     #[serde(deserialize_with = "number")]
     pub before: f64,
-    /// Mean PSNR against the original after refinement, dB.
+    /// Mean PSNR against renders of the original after refinement, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
 }
 
-/// Split that the views of a quality figure belong to.
+/// Kind of the views on which the quality of a result was measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ViewKind {
-    /// Test views: nothing was fitted to them or chosen by them.
+    /// Test views: used neither to fit nor to choose anything.
     Test,
-    /// Validation views: the best state of refinement was chosen by them.
+    /// Validation views: the best state of refinement was chosen on them.
     Validation,
-    /// Training views: Gaussians were ranked by them.
+    /// Training views: Gaussians were ranked by their contribution to these views, so the quality may look too high.
     Training,
-    /// Views of a virtual rig, because the scene has no cameras.
+    /// Views of a virtual rig (cameras placed by the program), because the scene has no cameras.
     Virtual,
 }
 
-/// Time of rendering one view on one thread, without the evaluation of the deformation field: the median of several, in
-/// milliseconds.
+/// Median time of rendering one view on one thread, milliseconds, without the evaluation of the deformation field.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RenderTime {
-    /// The original.
+    /// Render time of the original, milliseconds.
     pub before: f64,
-    /// The result.
+    /// Render time of the result, milliseconds.
     pub after: f64,
 }
 
-/// Quality of the result against the original.
+/// Quality of renders of the result compared with renders of the original.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct QualitySummary {
-    /// Split of the views.
+    /// Kind of the views.
     pub kind: ViewKind,
     /// Number of views.
     pub views: usize,
-    /// Mean PSNR against the original's renders, dB.
+    /// Mean PSNR, dB.
     #[serde(deserialize_with = "number")]
     pub psnr: f64,
-    /// Mean SSIM; `None` where only the PSNR of validation views is known.
+    /// Mean SSIM; `None` where only the PSNR on validation views is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
-    /// Render time before and after.
+    /// Render times of the original and the result, if measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub render_ms: Option<RenderTime>,
 }
 
-/// Effect of lower SH degrees on renders of the result.
+/// Effect on renders of dropping SH degrees of the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BandsSummary {
     /// SH degree of the output.
     pub sh_degree: usize,
-    /// Number of compared views.
+    /// Number of views on which renders were compared.
     pub pictures: usize,
-    /// Tried lower SH degrees, each with the mean PSNR of its renders against those with all degrees, dB.
+    /// Lower SH degrees that were tried, each with the mean PSNR of its renders compared with renders with all degrees,
+    /// dB.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
-    /// Mean PSNR of renders with all SH degrees against the original, dB.
+    /// Mean PSNR of renders with all SH degrees compared with renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
-    /// Minimum PSNR that a lower degree needed to be chosen, dB.
+    /// Value that the PSNR of a lower degree in `tried` had to reach for this degree to be used, dB.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
 
 impl BandsSummary {
-    /// Returns the reason for the SH degree as text.
+    /// Returns, as text, the measured values that explain the SH degree of the output.
     pub(crate) fn why(&self) -> String {
         let BandsSummary { pictures, tried, result, least, .. } = self;
         let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
@@ -214,7 +216,7 @@ impl BandsSummary {
     }
 }
 
-/// Range of an estimated value.
+/// Estimated value with its lower and upper bound.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Range {
     /// Lower bound; smaller values are unlikely.
@@ -225,60 +227,62 @@ pub struct Range {
     pub most: f64,
 }
 
-/// Expected processor time of a stage.
+/// Expected processor time of one stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageForecast {
     /// Name of the stage.
     pub name: String,
-    /// Expected time of all processors together, seconds.
+    /// Expected processor time summed over all processors, seconds.
     pub core_seconds: f64,
 }
 
-/// Expected time and memory of a run.
+/// Expected time and memory of a run, estimated before it begins.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
-    /// Wall-clock time, seconds.
+    /// Expected wall-clock time, seconds.
     pub seconds: Range,
-    /// Time of all processors together, seconds.
+    /// Expected processor time summed over all processors, seconds.
     pub core_seconds: Range,
-    /// Number of threads.
+    /// Number of threads that the run uses.
     pub threads: u64,
-    /// Whether the forecast is based on a calibration on this machine.
+    /// Whether the speed of this machine was measured on the scene for this forecast.
     pub measured: bool,
-    /// Maximum memory, bytes.
+    /// Maximum memory of the process, bytes.
     pub memory_bytes: u64,
-    /// Forecasts of all stages in order.
+    /// Expected times of all stages in order.
     pub stages: Vec<StageForecast>,
 }
 
-/// Percentiles of a term of the score.
+/// Percentiles, over all Gaussians, of one term of the score by which Gaussians are ranked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// Name of the term, see [`Quantity::name`](crate::statistics::score::Graded::name).
+    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::Quantity::name).
     pub name: String,
-    /// 1st percentile.
+    /// Value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p1: f64,
-    /// 99th percentile.
+    /// Value that 99% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
-    /// Whether the percentiles differ. If they are equal, the term only splits Gaussians into two groups.
+    /// Whether the two percentiles differ. If they are equal, the term only tells Gaussians above them from the others.
     pub active: bool,
 }
 
-/// Counts of unusual Gaussians.
+/// Numbers of Gaussians with unusual values.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct FlagSummary {
-    /// Gaussians with NaN or infinity in some frame.
+    /// Number of Gaussians with NaN or infinity in some frame.
     pub non_finite: usize,
-    /// Gaussians with a zero quaternion in some frame.
+    /// Number of Gaussians with a zero quaternion as rotation in some frame.
     pub zero_rotation: usize,
-    /// Gaussians whose motion D was set to 0 as rounding noise.
+    /// Number of Gaussians whose motion D (root mean square step) was set to 0, because it was within rounding noise of
+    /// the positions.
     pub snapped_d: usize,
-    /// Gaussians whose curvature κ was set to 0 as rounding noise.
+    /// Number of Gaussians whose curvature of motion κ was set to 0, because it was within rounding noise of the
+    /// positions.
     pub snapped_kappa: usize,
-    /// Gaussians that are never alive.
+    /// Number of Gaussians that are never alive (opacity below `alpha_min` in every frame).
     pub never_alive: usize,
-    /// Gaussians that are in no scored view.
+    /// Number of Gaussians that lie in no view by which Gaussians are scored.
     pub never_in_view: usize,
 }

@@ -1,19 +1,20 @@
-//! Memory and time that a stage needs.
+//! Estimate of the memory and time that one stage of a run needs.
 
 use super::workload::{MemoryPart, Workload};
 
-/// Memory and time that a stage needs.
+/// Memory and time that one stage of a run needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResourceEstimate {
     /// Name of the stage.
     pub stage: &'static str,
-    /// Maximum number of full reads of the frames.
+    /// Maximum number of times that the stage reads all frames of the input.
     pub reads: f64,
-    /// Estimated time in seconds of one processor, computed from measured costs of single operations.
+    /// Estimated time of the stage on one processor core, in seconds. Computed from measured times of single
+    /// operations.
     pub seconds: f64,
-    /// Memory in bytes per Gaussian.
+    /// Named parts of the stage's memory that grow with the number of Gaussians, in bytes per Gaussian of the input.
     pub per_gaussian: Vec<MemoryPart>,
-    /// Memory in bytes that does not depend on the number of Gaussians.
+    /// Named parts of the stage's memory that do not depend on the number of Gaussians, in bytes.
     pub fixed: Vec<MemoryPart>,
 }
 
@@ -22,19 +23,20 @@ impl ResourceEstimate {
         self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
     }
 
-    /// Returns the memory in bytes that the stage takes for such an input.
+    /// Returns the bytes of memory that the stage takes for the input that `work` describes, the open input included.
     pub(crate) fn bytes(&self, work: &Workload) -> u64 {
         let fixed: u64 = self.fixed.iter().map(|&(_, bytes)| bytes).sum();
         work.gaussians.saturating_mul(work.input.per_gaussian + self.bytes_per_gaussian()).saturating_add(fixed)
     }
 }
 
-/// Returns `bytes` per survivor as bytes per Gaussian of the input, if the fraction `left` of the Gaussians survives.
+/// Converts `bytes` per survivor (Gaussian that has not been removed) to bytes per Gaussian of the input, of which the
+/// fraction `left` survives.
 pub fn bytes_of_survivors(left: f64, bytes: u64) -> u64 {
     (left * bytes as f64).ceil() as u64
 }
 
-/// Returns the names of the stages and their estimated times in seconds on all threads.
+/// Returns for each stage its name and its estimated time in seconds if all threads share the work.
 pub fn seconds(work: &Workload, estimates: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
     estimates.iter().map(|estimate| (estimate.stage, estimate.seconds / work.threads as f64)).collect()
 }

@@ -1,4 +1,4 @@
-//! Limits that keep all stages of a run within its memory budget.
+//! Choice of limits that keep all stages of a run within its memory budget.
 
 use std::fmt::Write as _;
 
@@ -11,12 +11,13 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, duration};
 
-/// Divisor of the budget for decoded tiles: all tiles of a container are held if they take at most 1/16 of the budget.
-/// The file system caches the stored bytes anyway, and a larger part would leave less memory to other processes and
-/// save no more than decoding time.
+/// Divisor of the memory budget: all decoded tiles of a container (values of consecutive Gaussians × frames) stay in
+/// memory if they take at most 1/16 of the budget. The file system caches the stored bytes anyway. A larger part would
+/// leave less memory to other processes and save no more than decoding time.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Ways to halve one limit, beginning with the limits that cost most time.
+/// Functions that each halve one limit. Halving a limit slows a run; the functions that slow it most come first. If
+/// several free equally much memory, the last of them is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -25,22 +26,23 @@ const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { frames_held: limits.frames_held.div_ceil(2), ..*limits },
 ];
 
-/// Limits by which a run stays within its budget, and the estimates they follow from.
+/// Limits by which a run stays within its memory budget, and the estimates of its stages under these limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     work: Workload,
     budget: u64,
-    /// Amounts that stages keep in memory at a time.
+    /// How much stages keep in memory at a time.
     pub limits: Limits,
     estimates: Vec<ResourceEstimate>,
 }
 
 impl Plan {
-    /// Finds the fastest limits with which all stages of `estimates` fit into `budget`. Sends the plan to `events` if
-    /// the budget asks for it, even if the stages do not fit.
+    /// Finds the fastest limits with which all stages fit into `budget`. `estimates` returns the estimates of all
+    /// stages for given limits. Sends the plan as text to `events` if the budget asks for it, even if the stages do not
+    /// fit.
     ///
     /// # Errors
-    /// A budget that no limits fit; the error states the smallest budget that works.
+    /// If no limits make the stages fit; the error states the smallest sufficient budget.
     pub fn fit(
         work: Workload,
         budget: Budget,
@@ -55,7 +57,7 @@ impl Plan {
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
-    /// Returns whether there are limits with which all stages of `estimates` fit into `budget`.
+    /// Returns whether there are limits with which all stages that `estimates` describes fit into `budget`.
     pub fn fits(
         work: Workload,
         budget: Budget,
@@ -64,7 +66,8 @@ impl Plan {
         Self::closest(work, budget.limit(), estimates).excess_bytes() == 0
     }
 
-    /// Returns the fastest plan that fits into `budget`, or the plan of least memory if none fits.
+    /// Returns the plan of the fastest limits with which all stages fit into `budget` (bytes). If there are none,
+    /// returns the plan that takes the least memory.
     pub(crate) fn closest(
         work: Workload,
         budget: u64,
@@ -79,7 +82,7 @@ impl Plan {
             rows_aside: false,
             tiles_held: false,
         };
-        // A model is read entirely before anything else.
+        // The input is read entirely before anything else, if its model format requires this.
         let opening = vec![("file", work.input.opening)];
         let opening_read =
             ResourceEstimate { stage: "read", reads: 0.0, seconds: 0.0, per_gaussian: opening, fixed: Vec::new() };
@@ -87,7 +90,7 @@ impl Plan {
             let first = Some(opening_read.clone()).filter(|_| work.input.opening > 0);
             first.into_iter().chain(estimates(&work, limits)).collect::<Vec<ResourceEstimate>>()
         };
-        // Spilling rows of statistics costs almost no time, so it is decided first.
+        // Moving statistics to a scratch file costs almost no time, so this is decided first.
         let [excess_bytes, less] = [false, true].map(|rows_aside| {
             let limits = Limits { rows_aside, ..limits };
             Plan { work, budget, limits, estimates: all(&limits) }.excess_bytes()
@@ -103,7 +106,7 @@ impl Plan {
                 let smaller = std::iter::successors(Some(limits), |limits| Some(halve(limits)));
                 smaller.take(usize::BITS as usize).find(|other| saved_bytes(other) > 0)
             });
-            // The last of equal savings: the limit that is cheapest to reduce.
+            // Of several halvings that free equally much memory, the last one is taken: it slows the run least.
             match halved.max_by_key(saved_bytes) {
                 Some(other) => limits = other,
                 None => return plan.with_held_tiles(),
@@ -111,8 +114,8 @@ impl Plan {
         }
     }
 
-    /// Enables holding all decoded tiles of the container if that takes a small part of the budget. Nothing is then
-    /// read twice.
+    /// Allows all decoded tiles of the container to stay in memory if they take a small part of the budget. No tile is
+    /// then read twice.
     fn with_held_tiles(mut self) -> Plan {
         let decoded = self.work.input.decoded;
         let fits = self.excess_bytes() == 0 && self.peak().saturating_add(decoded) <= self.budget;
@@ -120,38 +123,39 @@ impl Plan {
         self
     }
 
-    /// Returns the maximum number of full reads of the input in all stages together.
+    /// Returns how many times all stages together read the input in full, at most.
     pub fn reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
         if self.limits.tiles_held { sum.min(1.0) } else { sum }
     }
 
-    /// Returns the peak memory in bytes.
+    /// Returns the peak memory of the run in bytes: that of the stage that takes most.
     pub fn peak(&self) -> u64 {
         self.base() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
     }
 
-    /// Returns the bytes that are resident in every stage.
+    /// Returns the bytes of memory that are taken in every stage: program, threads, index, time stamps, cameras,
+    /// decoded tiles.
     fn base(&self) -> u64 {
         let held = if self.limits.tiles_held { self.work.input.decoded } else { 0 };
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
-    /// Returns the number of bytes by which the stages exceed the budget, summed over all stages.
+    /// Returns the number of bytes by which each stage exceeds the memory budget, summed over all stages.
     fn excess_bytes(&self) -> u64 {
         let available = self.budget.saturating_sub(self.base());
         let beyond = self.estimates.iter().map(|estimate| estimate.bytes(&self.work).saturating_sub(available));
         beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
     }
 
-    /// Returns the error for a budget that is too small.
+    /// Returns the error for a memory budget that is too small; it states the smallest sufficient one.
     fn too_small_error(&self, budget: Budget) -> Error {
         let largest = self
             .estimates
             .iter()
             .max_by_key(|estimate| estimate.bytes(&self.work))
             .map_or("", |estimate| estimate.stage);
-        // Rounded up to whole MiB, as a user would write it.
+        // Rounded up to whole MiB, since the user will write it so.
         let least = self.peak().div_ceil(1 << 20);
         let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::MemoryLimit(format!(
@@ -163,7 +167,8 @@ impl Plan {
         ))
     }
 
-    /// Returns the plan as text: stages with their parts, limits, and full reads.
+    /// Returns the plan as text: the memory of each stage by its named parts, the limits, and the full reads of the
+    /// input.
     pub fn text(&self) -> String {
         let Plan { work, limits, .. } = self;
         let mut out = String::new();
@@ -218,7 +223,7 @@ impl Plan {
         out
     }
 
-    /// Sends the estimated time to `events` if `tell` asks for the plan.
+    /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan.
     pub fn tell_time(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
             let stages = seconds(&self.work, &self.estimates);

@@ -1,4 +1,4 @@
-//! Properties of an input from which memory and time are estimated, and the cost of common operations.
+//! Properties of an input from which memory and time are estimated, and the measured time of common operations.
 
 use crate::files::frame_stream::StreamHeader;
 use crate::limits::Limits;
@@ -9,51 +9,53 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::{BLOCK, VIEWS_PER_THREAD};
 use crate::render;
 
-/// Resident bytes per tile of an open container: whether the tile has been verified.
+/// Bytes of memory per tile of an open container: a flag that tells whether the tile's checksum has been verified.
 const PER_TILE: u64 = 1;
-/// Resident bytes per column and block of Gaussians while a container is open or written: its last constant tile.
+/// Bytes of memory per column and block of Gaussians of a container that is open or being written: the index entry of
+/// the last tile whose values are constant in time.
 const PER_SLOT: u64 = 80;
-/// Resident bytes per frame of a container that is written: its time stamp, in a list that grows by being copied to
-/// twice its length.
+/// Bytes of memory per frame of a container that is being written: its time stamp, in a list that grows by being copied
+/// to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
-/// Resident bytes per frame of an open input: its time stamp in the container's index and in the sequence, and the
-/// number of Gaussians alive in it.
+/// Bytes of memory per frame of an open input: its time stamp, once in the container's index and once in the sequence,
+/// and the number of Gaussians alive in it.
 const PER_FRAME: u64 = 8 + 8 + 8;
-/// Resident bytes per view in a list of views.
+/// Bytes of memory per view in a list of views.
 const PER_PICTURE: u64 = 24;
 
-/// Bytes per Gaussian of a view that is rendered on all threads: the data of each thread, and the same data joined.
+/// Bytes of memory per Gaussian while all threads render one view together: the data of each thread, and the same data
+/// joined.
 pub const SHARED_VIEW_BYTES_PER_GAUSSIAN: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
-/// Named part of a stage's memory, in bytes.
+/// Named part of a stage's memory, with its size in bytes.
 pub type MemoryPart = (&'static str, u64);
 
-/// Properties of an input and its cameras from which memory and time are estimated.
+/// Properties of an input and its cameras, from which the memory and time of a run are estimated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Workload {
     /// Number of Gaussians, N.
     pub gaussians: u64,
     /// Number of frames, T; 0 for a stream, whose length is unknown.
     pub frames: u64,
-    /// SH degree.
+    /// SH degree of the Gaussians' colors.
     pub sh_degree: usize,
-    /// Columns that vary in time.
+    /// Attributes that vary in time.
     pub varying: Attributes,
-    /// Memory that the input takes while it is open.
+    /// Memory that the input and its readers take, and how it is divided into tiles.
     pub input: MemoryProfile,
-    /// Number of different view numbers of the cameras.
+    /// Number of different view numbers that the cameras use.
     pub viewpoints: u64,
-    /// Number of pixels of the largest view.
+    /// Number of pixels of the camera with the largest images.
     pub pixels: u64,
-    /// Maximum number of views of one frame.
+    /// Number of views of the frame that has most.
     pub views: u64,
-    /// Number of views of all frames.
+    /// Number of views of all frames together.
     pub pictures: u64,
-    /// Bytes of the cameras and of the list of their shots, see [`Rig::bytes`].
+    /// Bytes of memory that the cameras and the list of their shots take, see [`Rig::bytes`].
     pub rig: u64,
-    /// Number of threads.
+    /// Number of threads that share the work.
     pub threads: u64,
-    /// Measured speed of these threads.
+    /// Measured speed of these threads for the scene.
     pub pace: Throughput,
 }
 
@@ -76,13 +78,13 @@ impl Workload {
         }
     }
 
-    /// Creates the workload of zero Gaussians.
+    /// Creates the workload of an input without Gaussians, frames and cameras.
     pub fn nothing() -> Workload {
         let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
         Workload::new(&info, MemoryProfile::for_tiles(0))
     }
 
-    /// Adds the views of the cameras of `rig` in `schedule`.
+    /// Adds the views of the cameras of `rig`; `schedule` lists the views at each frame.
     pub fn seen(self, rig: &Rig, schedule: &ViewSchedule) -> Workload {
         self.seen_by(rig, schedule.max_views_per_frame() as u64, schedule.pairs() as u64)
     }
@@ -102,8 +104,9 @@ impl Workload {
         }
     }
 
-    /// Creates the workload of a stream whose header has arrived, with the cameras of `rig`. The stream will be packed
-    /// into tiles of `frame_block` frames. `frames` is the assumed number of frames; 0: unknown.
+    /// Creates the workload of a stream of which only the header has arrived, with the cameras of `rig`. The stream
+    /// will be packed into a container with `frame_block` frames per tile. `frames` is the assumed number of frames; 0:
+    /// unknown.
     pub fn from_stream_header(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
         let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
@@ -117,23 +120,25 @@ impl Workload {
         work.seen_by(rig, views, pairs)
     }
 
-    /// Returns the number of Gaussians in a block of `block`; the input may have fewer.
+    /// Returns the number of Gaussians in the largest of blocks of `block`: fewer if the input has fewer Gaussians.
     pub fn at_most(&self, block: u64) -> u64 {
         block.min(self.gaussians)
     }
 
-    /// Returns the number of frames in a block of `block`; the input may have fewer, if their number is known.
+    /// Returns the number of frames in the largest of blocks of `block`: fewer if the input is known to have fewer
+    /// frames.
     fn frames_at_most(&self, block: u64) -> u64 {
         if self.frames == 0 { block } else { block.min(self.frames) }
     }
 
-    /// Returns the bytes of one Gaussian's columns `columns`.
+    /// Returns the bytes that the attributes `columns` of one Gaussian take at one frame.
     pub fn state(&self, columns: Attributes) -> u64 {
         state_bytes(self.sh_degree, columns)
     }
 
-    /// Returns the bytes per Gaussian of the frames that a reader of the columns `columns` keeps. A reader keeps no
-    /// frames if the limit is one frame, and two frames more than the limit otherwise.
+    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. If the
+    /// smaller of `frames_held` and the frame block of the input is at most 1, it keeps none; otherwise it keeps two
+    /// more than this number.
     pub fn held(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.frames_held as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -142,14 +147,15 @@ impl Workload {
         frames * self.state(columns & self.varying)
     }
 
-    /// Returns the memory of the blocks that readers of all threads are reading, and of decoding them.
+    /// Returns the memory of the blocks of Gaussians that the readers of all threads are filling, and of decoding these
+    /// blocks.
     pub fn arriving(&self) -> MemoryPart {
         let block = self.at_most(BLOCK as u64) * (self.state(Attributes::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
-    /// Returns the bytes of the buffers in which all threads decode or encode tiles: stored, shuffled and decoded bytes
-    /// of the largest tile.
+    /// Returns the bytes of the buffers in which all threads decode or encode tiles. Each thread has three: for the
+    /// stored, the shuffled and the decoded bytes of the largest tile.
     fn decoding(&self) -> u64 {
         let MemoryProfile { frame_block, gaussian_block, .. } = self.input;
         let gaussian_block = self.at_most(gaussian_block);
@@ -159,8 +165,9 @@ impl Workload {
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
-    /// Returns the memory of a pass over views, per Gaussian and fixed: states of the columns `columns` that are ready,
-    /// states being read, and views being rendered with `sums` bytes of accumulators per Gaussian.
+    /// Returns the memory parts of a pass over views: those in bytes per Gaussian, and those of fixed size in bytes.
+    /// They cover the attributes `columns` of frames that are ready, frames being read, and views being rendered, each
+    /// with `sums` bytes per Gaussian for results.
     pub fn looking(&self, limits: &Limits, columns: Attributes, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
         let pictures = self.threads.min(limits.pictures_together as u64);
         let ready = VIEWS_PER_THREAD as u64 * self.threads;
@@ -174,17 +181,17 @@ impl Workload {
         (per_gaussian, vec![self.arriving(), ("views", buffers)])
     }
 
-    /// Returns the memory of a list of `pictures` views.
+    /// Returns the memory that a list of `pictures` views takes.
     pub fn listed(pictures: f64) -> MemoryPart {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
-    /// Returns the memory of the buffers for writing a container, or one file per frame.
+    /// Returns the memory of the buffers for writing the result, as a container or as one file per frame.
     pub fn writing(&self) -> Vec<MemoryPart> {
         self.writing_together(FRAME_BLOCK)
     }
 
-    /// Returns the memory of the buffers for writing a container with `frames` frames per tile.
+    /// Returns the memory of the buffers for writing a container whose tiles hold `frames` frames.
     pub fn writing_together(&self, frames: usize) -> Vec<MemoryPart> {
         let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
         let block =
@@ -192,14 +199,14 @@ impl Workload {
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 
-    /// Returns the memory that zstd takes at `level` for tiles of `frames` frames.
+    /// Returns the memory that the zstd compressors of all threads take at level `level` for tiles of `frames` frames.
     pub fn compressing(&self, level: i32, frames: usize) -> MemoryPart {
         let widest = Attributes::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns the maximum number of full reads of the input caused by reading `frames` evenly spread frames. Tiles are
-    /// read as a whole, and repeatedly if readers may keep only some of their frames.
+    /// Returns how often the whole input is read, at most, if `frames` evenly spread frames are read. Tiles are read as
+    /// a whole, and again if readers may keep only some of the frames of a tile.
     pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -211,15 +218,15 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns [`Workload::reads`] for Gaussians at arbitrary ids that are read in blocks. A tile at the border of two
-    /// blocks is read for each of them.
+    /// Returns [`Workload::reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians of
+    /// two blocks is read for each of the two.
     pub fn scattered_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.reads(frames, limits)
     }
 
-    /// Returns the time in seconds of one processor for rendering `pictures` views of `gaussians` Gaussians at the
-    /// given cost.
+    /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians, given
+    /// the time of one view per Gaussian and per pixel.
     pub fn render_seconds(
         &self,
         pictures: f64,
@@ -229,17 +236,17 @@ impl Workload {
         pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
-    /// Returns the time in seconds of one processor for reading the states of `gaussians` Gaussians at `frames` frames.
+    /// Returns the time in seconds on one processor core for reading `gaussians` Gaussians at `frames` frames.
     pub fn reading(&self, gaussians: f64, frames: f64) -> f64 {
         self.pace.states * gaussians * frames * self.input.seconds_per_state
     }
 
-    /// Returns N as a floating-point number; later stages are timed by fractions of it.
+    /// Returns the number of Gaussians N as a floating-point number, since later stages process a fraction of them.
     pub fn count(&self) -> f64 {
         self.gaussians as f64
     }
 
-    /// Returns the bytes of the input's index, time stamps and cameras, without its Gaussians.
+    /// Returns the bytes of memory of what is known of the input besides its Gaussians: index, time stamps and cameras.
     pub(super) fn known_bytes(&self) -> u64 {
         let index = match self.input.frame_block {
             0 => 0,
@@ -251,55 +258,57 @@ impl Workload {
         index + self.input.fixed + PER_FRAME * self.frames + self.rig
     }
 
-    /// Returns the bytes of the index of a container that is being written.
+    /// Returns the bytes of memory that the index of a container takes while the container is written.
     fn written_index(&self) -> u64 {
         let slots = Attributes::all().iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
         PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
     }
 }
 
-/// Speed of this machine for a scene: measured times as multiples of the costs in this module; 1 if nothing was
-/// measured.
+/// Speed of this machine for a scene: measured times divided by the times that this module assumes. 1 if nothing was
+/// measured; a larger value is slower.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Throughput {
-    /// Time of reading states and processing each of them.
+    /// Time for reading Gaussians at a frame and processing them, as a multiple of the assumed time.
     pub states: f64,
-    /// Time of finding the contributions in a view, see [`LOOK`].
+    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that [`LOOK`] assumes.
     pub look: f64,
-    /// Time of finding removal errors in a view, see [`REMOVE`].
+    /// Time for finding removal errors in a view, as a multiple of the time that [`REMOVE`] assumes.
     pub remove: f64,
-    /// Time of rendering and comparing a view, see [`RENDER`].
+    /// Time for rendering and comparing a view, as a multiple of the time that [`RENDER`] assumes.
     pub render: f64,
-    /// Mean number of processors available to this process during the measurement; `None` if nothing was measured.
+    /// Mean number of processor cores that were available to this process during the measurement; `None` if nothing was
+    /// measured.
     pub processors: Option<f64>,
 }
 
 impl Throughput {
-    /// Speed of a machine and a scene without a measurement.
+    /// Speed that is assumed without a measurement.
     pub const UNKNOWN: Throughput = Throughput { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
 }
 
-/// Cost of rendering one view for a certain purpose.
+/// Time that one view takes if it is rendered for a certain purpose: a part per Gaussian plus a part per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderCost {
-    /// Seconds of one processor per Gaussian.
+    /// Seconds on one processor core per Gaussian.
     gaussian: f64,
-    /// Seconds of one processor per pixel.
+    /// Seconds on one processor core per pixel.
     pixel: f64,
     pace: fn(&Throughput) -> f64,
 }
 
-/// Cost of finding the contribution of every Gaussian in a view, fitted to runs on three trained models.
-/// `scripts/estimate.py` compares such estimates with the time of a run.
+/// Time for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. This and the next two are
+/// fitted to runs on three trained models; `scripts/estimate.py` compares estimated with measured times.
 pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
-/// Cost of finding the removal error of every Gaussian in a view.
+/// Time for finding the removal error of every Gaussian in a view: the squared error that removing it alone would
+/// cause.
 pub const REMOVE: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
-/// Cost of rendering a view and comparing it.
+/// Time for rendering a view and comparing it with another render.
 pub const RENDER: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
 
-/// Returns the bytes of the match-finding tables of zstd at a level for `bytes` bytes of input: at most the maximum of
-/// the level's group, and at most 4 bytes for each entry of two tables with no more than twice as many entries as there
-/// are bytes.
+/// Returns the bytes that zstd's tables for finding matches take at level `level`, for `bytes` bytes of input. They do
+/// not exceed the maximum of the level's group. They are two tables of 4-byte entries, each with at most twice as many
+/// entries as the input has bytes.
 fn zstd_tables(level: i32, bytes: u64) -> u64 {
     let most_mebibytes = match level {
         ..=3 => 1,

@@ -1,22 +1,25 @@
-//! Tests 1 and 2 of merging: whether two Gaussians look alike at the reference frame.
+//! Tests 1 (place and size) and 2 (color) of merging: whether two Gaussians look alike at the reference frame, the
+//! frame in which most Gaussians are alive.
 //!
-//! Input: two rows of Gaussians. Output: pass or fail. No memory is allocated. A NaN fails every test.
+//! Input: the attributes of two Gaussians. Output: pass or fail. No memory is allocated. A NaN fails every test.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::model::{Gaussians, SH_C0};
 use crate::recipe;
 
-/// ε in the denominator of the cosines of base colors and of motion steps, as in the paper (section 3.5.1).
+/// Term added to the denominator of the cosines of base colors and of velocities, against division by 0; value of the
+/// paper (section 3.5.1).
 pub(super) const COSINE_EPSILON: f64 = 1e-8;
-/// Fraction of the trace added to the diagonal of the averaged covariance, so that coplanar flat Gaussians have a
+/// Fraction of the trace of the mean covariance that is added to its diagonal, so that coplanar flat Gaussians have a
 /// finite Mahalanobis distance.
 const REGULARIZATION: f64 = 1e-6;
-/// Smallest scale as a fraction of the middle scale below which a Gaussian counts as flat. Thickness below this
-/// fraction is training noise that no render shows.
+/// Ratio of the smallest to the middle scale below which a Gaussian counts as flat. A smaller thickness is training
+/// noise that no render shows.
 const MIN_THICKNESS: f64 = 0.1;
 
-/// Thresholds of tests 1 and 2 of one merge pass.
+/// Thresholds of tests 1 (place and size) and 2 (color) of one merging pass. The recipe may have several passes with
+/// different thresholds.
 #[derive(Debug, Clone, Copy)]
 pub struct Gates {
     d0: f64,
@@ -26,7 +29,7 @@ pub struct Gates {
 }
 
 impl Gates {
-    /// Creates the tests from the thresholds of `pass` and `merge`.
+    /// Creates the tests from the thresholds of the pass `pass` and from those of `merge`, which all passes share.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         Gates {
             d0: pass.d0,
@@ -36,7 +39,8 @@ impl Gates {
         }
     }
 
-    /// Returns whether `a` and `b` pass both tests; symmetric in `a` and `b`. The cheap tests run first.
+    /// Returns whether `a` and `b` pass both tests. The order of `a` and `b` does not matter. The cheap comparisons run
+    /// first.
     pub fn pass(&self, a: &Appearance, b: &Appearance) -> bool {
         (a.color - b.color).length() <= self.max_color_difference
             && cosine(a.dc, b.dc) > self.rho
@@ -45,13 +49,13 @@ impl Gates {
     }
 }
 
-/// Values of one Gaussian that tests 1 and 2 read.
+/// Values of one Gaussian that tests 1 (place and size) and 2 (color) compare.
 #[derive(Debug, Clone, Copy)]
 pub struct Appearance {
     position: DVec3,
     rotation: DQuat,
-    /// Log scales, descending; the smallest is raised to at least [`MIN_THICKNESS`] times the middle scale for the
-    /// comparison of sizes.
+    /// Natural logarithms of the scales, descending. For the comparison of sizes the smallest scale is raised to at
+    /// least [`MIN_THICKNESS`] times the middle one.
     log_scale: [f64; 3],
     scales: DVec3,
     dc: DVec3,
@@ -59,12 +63,12 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// Reads row `i` of `states`.
+    /// Reads the values of Gaussian `i` from `states`.
     pub fn new(states: &Gaussians, i: usize) -> Self {
         let log_scale = states.log_scale.row::<3>(i).map(f64::from);
         let mut sorted = log_scale;
         sorted.sort_by(|a, b| b.total_cmp(a));
-        // Only a finite scale is raised: minus infinity is not a thickness and must fail.
+        // Only a finite scale is raised: minus infinity is not a thickness and must fail the test of sizes.
         if sorted[2].is_finite() {
             sorted[2] = sorted[2].max(sorted[1] + MIN_THICKNESS.ln());
         }
@@ -85,29 +89,30 @@ impl Appearance {
     }
 }
 
-/// Returns the unit quaternion of a stored wxyz row; the identity if the row has length zero or is not finite.
+/// Returns the unit quaternion of the stored quaternion (w, x, y, z), or the identity if it has length zero or is not
+/// finite.
 pub(super) fn unit_rotation([w, x, y, z]: [f32; 4]) -> DQuat {
     let rotation = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
     let length = rotation.length();
     if length > 0.0 && length.is_finite() { rotation / length } else { DQuat::IDENTITY }
 }
 
-/// Returns whether corresponding scales (largest and largest, middle and middle, smallest and smallest) differ by at
-/// most a factor exp(`max_log_ratio`). A very large Gaussian next to fine detail fails whatever its shape. Equal
-/// infinities differ by NaN and fail.
+/// Returns whether the largest, the middle and the smallest scales of two Gaussians each differ by at most the factor
+/// exp(`max_log_ratio`). `a` and `b` are log scales, descending. The test keeps a very large Gaussian from swallowing
+/// fine detail near it. If both have the same infinite scale, the difference is NaN and the test fails.
 fn are_sizes_alike(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
     (0..3).all(|c| (a[c] - b[c]).abs() <= max_log_ratio)
 }
 
-/// Returns (a·b)/(‖a‖‖b‖ + ε), in [−1, 1]. Equal vectors of any length give 1, so that duplicates of exactly medium
-/// gray, whose coefficients are zero, count as alike.
+/// Returns the cosine (a·b)/(‖a‖‖b‖ + [`COSINE_EPSILON`]), in [−1, 1]. Equal vectors of any length give 1, so that
+/// copies of a medium gray Gaussian, whose color coefficients are all zero, count as alike.
 fn cosine(a: DVec3, b: DVec3) -> f64 {
     if a == b { 1.0 } else { a.dot(b) / (a.length() * b.length() + COSINE_EPSILON) }
 }
 
-/// Returns √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) for a positive semidefinite Σ. Uses a Cholesky factorization in f64 of Σ divided
-/// by its trace, so that the squares of scales between 1e-12 and 1e6 stay in range. Σ = 0 gives 0 for Δ = 0, else
-/// infinity.
+/// Returns the Mahalanobis distance √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) of the offset Δ = `delta` under the positive semidefinite
+/// covariance Σ = `sigma`. Divides Σ by its trace before the Cholesky factorization in f64, so that the squares of
+/// scales between 1e-12 and 1e6 stay in range. For Σ = 0 the distance is 0 if Δ = 0, else infinite.
 fn mahalanobis(delta: DVec3, sigma: &DMat3) -> f64 {
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     if trace == 0.0 {
@@ -115,7 +120,7 @@ fn mahalanobis(delta: DVec3, sigma: &DMat3) -> f64 {
     }
     let unit = *sigma * trace.recip();
     let [a, b, c] = [unit.x_axis.x, unit.y_axis.y, unit.z_axis.z].map(|diagonal| diagonal + REGULARIZATION);
-    // Lower factor L, then L y = Δ: the distance is ‖y‖.
+    // Computes the lower Cholesky factor L and solves L y = Δ; the distance is ‖y‖.
     let l00 = a.sqrt();
     let (l10, l20) = (unit.x_axis.y / l00, unit.x_axis.z / l00);
     let l11 = (b - l10 * l10).sqrt();
@@ -222,8 +227,8 @@ mod tests {
             let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
             let regular = sigma + DMat3::from_diagonal(DVec3::splat(REGULARIZATION * trace));
             let delta = DVec3::from(delta);
-            // Inversion by cofactors loses about cond(Σ) ≤ 1e6 ulp. Σ is divided by its trace first because its
-            // determinant may overflow.
+            // Inversion by cofactors has a relative error of about cond(Σ) ≤ 1e6 ulp. Σ is divided by its trace first
+            // because its determinant may overflow.
             let expected = (delta.dot((regular * trace.recip()).inverse() * delta) / trace).sqrt();
             let got = mahalanobis(delta, &sigma);
             prop_assert!((got / expected - 1.0).abs() < 1e-8, "got {got:e}, expected {expected:e}");

@@ -1,37 +1,39 @@
-//! Assignment of Gaussians to leaders: the sequential greedy rule, computed in parallel.
+//! Assignment of Gaussians to leaders (Gaussians that take others into their cluster): the sequential greedy rule,
+//! computed in parallel.
 //!
-//! The rule: visit the nodes in order of rank. A node without a leader becomes a leader and takes every node without a
-//! leader that passes all tests with it. A pair is tested against the leader only, so the leaders are the
-//! lexicographically first independent set, and every other node joins its earliest leader. This set can be computed
-//! locally (Blelloch, Fineman and Shun, "Greedy sequential maximal independent set and matching are parallel on
-//! average", 2012): in synchronous rounds a node reads only the decisions of earlier rounds, so the thread count cannot
-//! change the result.
+//! The rule: visit the nodes (single Gaussians, or groups merged in earlier passes) in order of rank. A node that no
+//! leader has taken becomes a leader, and takes every node that passes all tests with it and that no leader has taken.
+//! Members are tested against their leader only. The leaders are therefore the lexicographically first independent set,
+//! and every other node joins the earliest leader that it passes with. This set can be computed locally (Blelloch,
+//! Fineman and Shun, "Greedy sequential maximal independent set and matching are parallel on average", 2012): in
+//! synchronous rounds a node reads only the decisions of earlier rounds, so the thread count cannot change the result.
 //!
-//! Input: ranks and directed pairs. Output: a leader for every node. Memory: 24 bytes per node beside the input; the
-//! pairs are sorted in place.
+//! Input: the rank of every node, and the pairs (leader, member) that passed the tests. Output: a leader for every
+//! node. Memory: 24 bytes per node in addition to the input. The pairs are sorted in place.
 
 use rayon::prelude::*;
 
-/// Number of parallel rounds before the remaining nodes are decided sequentially. Scenes need 5 to 8; a chain sorted
-/// along a line would need one round for every second node.
+/// Number of parallel rounds after which the remaining nodes are decided sequentially. Scenes need 5 to 8 rounds; a
+/// chain of Gaussians sorted along a line would need one round for every second one.
 const MAX_ROUNDS: usize = 32;
-/// Number of undecided nodes below which another round costs more than deciding them sequentially.
+/// Number of undecided nodes below which deciding them sequentially is faster than another parallel round.
 const FEW: usize = 64;
 
-/// Leader of every node, and counts of the work.
+/// Leader of every node, and statistics of how the leaders were found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
-    /// Leader of every node; a node that joined no other is its own leader.
+    /// Index of the leader of every node. A node that joined no other is its own leader.
     pub leader_of: Vec<u32>,
-    /// Number of nodes that joined another.
+    /// Number of nodes that joined another node, which is their leader.
     pub joins: usize,
-    /// Number of parallel rounds.
+    /// Number of parallel rounds that were run.
     pub rounds: usize,
-    /// Whether nodes were left undecided after the last round and were decided sequentially.
+    /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
     pub sequential: bool,
 }
 
-/// Returns the rank of every node: by descending size, then ascending hash, then index; a permutation of 0..N.
+/// Returns the rank of every node, a permutation of 0..N. Nodes are ranked by descending `size`; ties by ascending
+/// `hash`, then by index.
 ///
 /// A size that is NaN counts as the smallest; −0 equals 0.
 pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
@@ -48,14 +50,15 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
     rank
 }
 
-/// Marker of a node without a decision in `leader_of`. A decided member holds the index of its leader.
+/// Value in `leader_of` of a node without a decision. A decided node has the index of its leader there.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Clusters the nodes with these `rank`s (a permutation of 0..N) along `pairs` (leader, member), rank(leader) <
-/// rank(member), in any order. The result is that of the sequential rule.
+/// Assigns every node to a leader. `rank`: rank of every node, a permutation of 0..N. `pairs`: pairs (leader, member)
+/// that passed all tests, in any order, in which the leader has the lower rank. The result is that of the sequential
+/// rule.
 ///
-/// With `limit`, merging stops after exactly that many joins in sequential order: by the leader's rank, then by the
-/// member's. Members beyond the limit stay single.
+/// With `limit`, exactly the first `limit` joins of the sequential order are made: by the leader's rank, then by the
+/// member's. The members of later joins stay single.
 pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Clustering {
     let predecessors = Predecessors::new(rank, pairs);
     let mut leader_of = vec![UNDECIDED; rank.len()];
@@ -75,17 +78,17 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     let sequential = undecided.len() > FEW;
     undecided.sort_unstable_by_key(|&node| rank[node as usize]);
     for node in undecided {
-        // Every predecessor is decided by now, so `decide` always returns a leader.
+        // Every predecessor (node that could take this one) is decided by now, so `decide` always returns a leader.
         leader_of[node as usize] = predecessors.decide(node, &leader_of).unwrap_or(node);
     }
     let joins = truncate(rank, &mut leader_of, limit);
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// For every node the leaders that could take it, by rank.
+/// For every node, the nodes of lower rank that could become its leader.
 struct Predecessors {
     start: Vec<usize>,
-    /// Pairs (leader, member), sorted by member, then by the leader's rank.
+    /// Pairs (possible leader, node), sorted by node, then by the rank of the possible leader.
     pairs: Vec<(u32, u32)>,
 }
 
@@ -102,8 +105,8 @@ impl Predecessors {
         Predecessors { start, pairs }
     }
 
-    /// Returns the leader of `node` (itself if it leads) as far as `leader_of` determines it; `None` while an earlier
-    /// predecessor that might take it is undecided.
+    /// Returns the leader of `node` (itself if it becomes a leader), or `None` if it still depends on a predecessor
+    /// that is undecided in `leader_of`. Predecessors are the nodes of lower rank that could take `node`.
     fn decide(&self, node: u32, leader_of: &[u32]) -> Option<u32> {
         let candidates = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
         for &(predecessor, _) in candidates {
@@ -117,7 +120,7 @@ impl Predecessors {
     }
 }
 
-/// Undoes all joins but the first `limit` in sequential order; returns how many remain.
+/// Undoes all joins except the first `limit` in sequential order. Returns the number of joins that remain.
 fn truncate(rank: &[u32], leader_of: &mut [u32], limit: Option<usize>) -> usize {
     let joined = |(node, &leader): (usize, &u32)| (node as u32 != leader).then_some(node as u32);
     let all = leader_of.iter().enumerate().filter_map(joined).count();
@@ -136,7 +139,8 @@ mod tests {
 
     use super::*;
 
-    /// Applies the rule literally: visits nodes in order, and each free node takes every free node that it can.
+    /// Slow reference that applies the rule literally: visits the nodes in order of rank, and each free node takes
+    /// every free node that it may take. Returns the leader of every node and the number of joins.
     fn sequential_oracle(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> (Vec<u32>, usize) {
         let n = rank.len();
         let mut order: Vec<u32> = (0..n as u32).collect();
@@ -151,7 +155,8 @@ mod tests {
             for &member in &order {
                 let free = leader_of[member as usize].is_none();
                 if free && pairs.contains(&(leader, member)) {
-                    // A join beyond the limit is not made, but no other leader may take the member either.
+                    // A join beyond the limit is not made; the member stays single, because no other leader may take it
+                    // either.
                     leader_of[member as usize] =
                         Some(if limit.is_none_or(|limit| joins < limit) { leader } else { member });
                     joins += usize::from(leader_of[member as usize] == Some(leader));
@@ -223,7 +228,8 @@ mod tests {
 
     #[test]
     fn members_never_lead_and_the_earliest_leader_wins() {
-        // 0 takes 1; 1 could take 2 but was taken; 3 passes with 2 only, so 2 leads it.
+        // Node 0 takes 1. Node 1 could take 2 but was taken itself. So 2 is free when it is visited, leads, and takes
+        // 3.
         let got = cluster(&[0, 1, 2, 3], vec![(0, 1), (1, 2), (2, 3)], None);
         assert_eq!(got.leader_of, [0, 0, 2, 2]);
         let got = cluster(&[1, 0, 2], vec![(0, 2), (1, 2)], None);

@@ -1,6 +1,7 @@
-//! A partition of the survivors into groups, each with a leader.
+//! Groups of Gaussians that merging has joined, each with a leader: the Gaussian that took the others.
 
-/// Groups of rows, ordered by their leaders' rows. Memory: at most 12 bytes per row.
+/// Partition of the survivors (Gaussians left by pruning) into groups. A Gaussian is identified by its row in the table
+/// of survivors. Groups are ordered by the row of their leader. Memory: at most 12 bytes per row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MergeGroups {
     leaders: Vec<u32>,
@@ -9,13 +10,13 @@ pub struct MergeGroups {
 }
 
 impl MergeGroups {
-    /// Returns one group for each of `rows` (increasing).
+    /// Creates one group for each of the increasing `rows`: no Gaussian is merged.
     pub fn alone(rows: &[u32]) -> Self {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
-    /// Returns the groups after group g joined group `leader_of[g]` (a group that is its own leader stays). A merged
-    /// group has the leader of the group that was joined.
+    /// Returns the groups after group g has joined group `leader_of[g]`. A group with `leader_of[g]` = g stays as it is
+    /// or is joined by others. The joined group keeps its own leader.
     pub fn joined(&self, leader_of: &[u32]) -> Self {
         let mut new_index = vec![0; leader_of.len()];
         let mut leaders = Vec::new();
@@ -56,17 +57,17 @@ impl MergeGroups {
         self.leaders.is_empty()
     }
 
-    /// Returns the leader's row of every group, increasing.
+    /// Returns the row of every group's leader, increasing.
     pub fn leaders(&self) -> &[u32] {
         &self.leaders
     }
 
-    /// Returns the rows of group `group` including its leader, increasing.
+    /// Returns the rows of all Gaussians of group `group`, its leader included, increasing.
     pub fn members(&self, group: usize) -> &[u32] {
         &self.members[self.start[group] as usize..self.start[group + 1] as usize]
     }
 
-    /// Returns the groups of more than one member.
+    /// Returns the indices of the groups that have more than one Gaussian.
     pub fn clusters(&self) -> impl Iterator<Item = u32> {
         (0..self.len() as u32).filter(|&group| self.members(group as usize).len() > 1)
     }
@@ -78,7 +79,7 @@ mod tests {
 
     #[test]
     fn joining_twice_flattens_to_original_rows() {
-        // Rows 2 and 4 join 5; then the group of 5 joins that of 1.
+        // Rows 2 and 4 join row 5. Then the group of row 5 joins that of row 1.
         let once = MergeGroups::alone(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
         assert_eq!(once.leaders(), [1, 3, 5]);
         assert_eq!((once.members(0), once.members(1), once.members(2)), (&[1][..], &[3][..], &[2, 4, 5][..]));

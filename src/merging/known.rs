@@ -1,20 +1,22 @@
-//! Cache of the motion similarities of pairs. A pair is measured once, however often passes and trials request it.
+//! Cache of the motion similarities of pairs of Gaussians. A pair is measured only once, although several merging
+//! passes and trial sizes may request it.
 //!
 //! Memory: [`KNOWN_BYTES`] per pair.
 
-/// Memory of one pair with known similarity, in bytes.
+/// Bytes of memory for one pair of Gaussians whose similarity is known.
 pub const KNOWN_BYTES: usize = size_of::<PairSimilarity>();
 
-/// Two rows, the smaller first, and their motion similarity ([`super::motion::MotionGate::likeness`]).
+/// Pair of Gaussians, as two row indices with the smaller first, and its motion similarity
+/// ([`super::motion::MotionGate::likeness`]).
 pub type PairSimilarity = (u32, u32, f64);
 
-/// Motion similarities of pairs of rows, sorted by pair.
+/// Motion similarities of pairs of Gaussians, sorted by the row indices of the pair.
 #[derive(Debug, Default)]
 pub struct KnownPairs(Vec<PairSimilarity>);
 
 impl KnownPairs {
-    /// Returns the pairs of `pairs` whose similarity is not known yet: the smaller row first, increasing, without
-    /// duplicates.
+    /// Returns those of `pairs` whose similarity is not known yet, without duplicates. Each has its smaller row first;
+    /// the pairs are sorted.
     pub fn missing(&self, pairs: impl ExactSizeIterator<Item = (u32, u32)>) -> Vec<(u32, u32)> {
         let mut missing = Vec::with_capacity(pairs.len());
         missing.extend(pairs.map(|(a, b)| (a.min(b), a.max(b))).filter(|&pair| self.position(pair).is_err()));
@@ -23,13 +25,14 @@ impl KnownPairs {
         missing
     }
 
-    /// Creates the cache from measured pairs, in any order, without duplicates.
+    /// Creates the cache from the measured pairs `found`: in any order, but without duplicates.
     pub fn new(mut found: Vec<PairSimilarity>) -> Self {
         found.sort_unstable_by_key(|&(a, b, _)| (a, b));
         KnownPairs(found)
     }
 
-    /// Adds measured pairs that were missing, unless the cache would then hold more than `max_pairs` pairs.
+    /// Adds the measured pairs `found`, which must not be in the cache yet. Adds nothing if the cache would then hold
+    /// more than `max_pairs` pairs.
     pub fn add(&mut self, mut found: KnownPairs, max_pairs: usize) {
         if self.0.is_empty() {
             *self = found;
@@ -40,7 +43,7 @@ impl KnownPairs {
         }
     }
 
-    /// Returns the motion similarity of a pair, given in either order, if it is known.
+    /// Returns the motion similarity of the pair (`a`, `b`), in either order; `None` if it is not known.
     pub fn likeness(&self, (a, b): (u32, u32)) -> Option<f64> {
         self.position((a.min(b), a.max(b))).ok().map(|position| self.0[position].2)
     }

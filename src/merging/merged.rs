@@ -1,9 +1,11 @@
-//! A sequence with explicit frames whose clusters are merged frame by frame while it is read.
+//! A sequence with explicit frames in which clusters are replaced by proxies (one Gaussian per cluster) while frames
+//! are read.
 //!
-//! At every frame a proxy is the moment match of its members at that frame, with the weights of the reference frame;
-//! its trajectory is Σ w_i x_i(t). Nothing is stored; the memory is that of the members being read. The members of a
-//! proxy may lie anywhere in the source. A caller that reads many Gaussians reads them together
-//! ([`MergedSequence::together`]), so that blocks decoded for one Gaussian serve all of them.
+//! The state of a proxy at a frame has the weighted mean and covariance of its members (the Gaussians of its cluster)
+//! at that frame. The weights are those of the reference frame for all frames, so the trajectory is Σ w_i x_i(t). No
+//! proxy is stored; only the members being read are in memory. The members of a proxy may be anywhere in the source.
+//! Many Gaussians are best read by [`MergedSequence::together`], because a block of the source that is decoded for one
+//! of them then serves all.
 
 use std::ops::Range;
 
@@ -16,28 +18,30 @@ use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, Placement};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Attributes that depend on each other in a proxy: moments mix position, rotation and scale, and opacity depends on
-/// areas.
+/// Attributes of a proxy that cannot be computed separately: moments mix position, rotation and scale, and opacity
+/// depends on areas.
 const MIXED: Attributes = Attributes::all().difference(Attributes::SH);
 
-/// Number of proxies computed in one batch.
+/// Number of proxies that are computed before their values are written to the output.
 const BATCH: usize = 4096;
 
-/// Survivors of a source, with clusters replaced by proxies.
+/// Sequence of the survivors (Gaussians left by pruning) of a source, in which a proxy replaces each merged cluster.
 pub struct MergedSequence<'a> {
     source: &'a dyn FrameSource,
     info: SequenceInfo,
-    /// Ids in the source, one per Gaussian of this sequence; a proxy has its leader's id.
+    /// Id in the source of each Gaussian of this sequence. A proxy has the id of its leader, the Gaussian that took the
+    /// others.
     survivors: &'a [u32],
-    /// Members (id, weight) of each Gaussian that is a proxy; empty for other Gaussians.
+    /// For each Gaussian of this sequence that is a proxy: the ids and weights of the Gaussians it replaces; otherwise
+    /// empty.
     members: Vec<&'a [(u32, f64)]>,
     merge: MergeParams,
 }
 
 impl<'a> MergedSequence<'a> {
-    /// Creates the sequence of the Gaussians `survivors` of `source`, with the Gaussians at `clusters` (index into
-    /// `survivors`, members by id) replaced by proxies. Proxies are placed at the mean of their members: with a known
-    /// trajectory they need not follow their leader.
+    /// Creates the sequence of the Gaussians `survivors` of `source`, in which proxies replace some of them. `clusters`
+    /// yields for each proxy its index in `survivors`, and the ids and weights of its members. A proxy is placed at the
+    /// mean of its members; because its trajectory is explicit, it need not be at its leader's position.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -64,17 +68,17 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians `places` at the frames `wanted` that reads all their members together, on all
-    /// threads.
+    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all their
+    /// proxies together, on all threads.
     ///
-    /// Memory per Gaussian to be read, members included: its reader, its state at one frame, and 24 bytes.
+    /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
         let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), wanted)?;
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
-    /// Returns the number of source Gaussians from which the Gaussian at `place` is made; 1 if it is not a proxy.
+    /// Returns how many Gaussians of the source Gaussian `place` of this sequence replaces; 1 if it is not a proxy.
     pub fn members(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -100,19 +104,19 @@ impl FrameSource for MergedSequence<'_> {
     }
 }
 
-/// Source Gaussians needed for a selection of Gaussians of the sequence.
+/// Gaussians of the source that must be read for a selection of Gaussians of this sequence.
 struct MergedMembers {
-    /// Ids in the source of all Gaussians to be read, increasing.
+    /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// Row in `ids` of the own id of every selected Gaussian.
+    /// For every selected Gaussian, the row in `ids` of its own id.
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// Row in `ids` and weight of the members of all proxies.
+    /// For every member of every proxy, its row in `ids` and its weight; one proxy after the other.
     members: Vec<(u32, f64)>,
 }
 
 struct Proxy {
-    /// Index of the proxy among the selected Gaussians.
+    /// Index of this proxy (Gaussian that replaces a cluster) among the selected Gaussians.
     row: usize,
     members: Range<usize>,
 }
@@ -135,12 +139,13 @@ impl MergedMembers {
         MergedMembers { ids, rows, proxies, members }
     }
 
-    /// Returns the attributes of the members that must be read to compute the attributes `want`.
+    /// Returns the attributes of the source Gaussians that are needed to compute the attributes `want` of the sequence.
     fn needed(&self, want: Attributes) -> Attributes {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
-    /// Writes the attributes `want` of the selected Gaussians, computed from the source states `state`, to `out`.
+    /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state` and writes them to
+    /// `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));
@@ -169,7 +174,7 @@ struct MergedSequenceReader<'a> {
     sequence: &'a MergedSequence<'a>,
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
-    /// Attributes in `state` that do not vary and were already read.
+    /// Attributes in `state` that do not vary with time and were already read.
     constant_read: Attributes,
     inputs: MergedMembers,
 }

@@ -1,18 +1,19 @@
-//! Motion-consistent merging by moment matching (method.md, section 5).
+//! Merging: replaces clusters of Gaussians that look alike and move alike by one Gaussian, the proxy, with their mean
+//! and covariance (method.md, section 5).
 //!
 //! ```text
 //! states at the reference frame ─▶ neighbors ─▶ gates ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy
-//!                                                          frames ──▲
+//! frames ──▲
 //! ```
 //!
-//! Input: the states of the survivors at the reference frame, and a callback that measures the motion of pairs. Output:
-//! groups of survivors, and the state of one proxy per group of more than one member.
+//! Input: the states of the survivors (Gaussians left by pruning) at the reference frame, and a callback that measures
+//! the motion of pairs. Output: groups of survivors, and the state of one proxy for each group of more than one.
 //!
-//! Peak memory: per survivor its state, held by the caller; the proxy states before and after a pass (each at most half
-//! as many as survivors); and [`BYTES_PER_SURVIVOR`]. In addition [`BYTES_PER_PAIR`] per candidate pair measured
-//! together and [`BYTES_PER_PASSING`] per pair that passed all tests. There are at most `max_neighbors` pairs per
-//! survivor; 3.5 were measured for evenly distributed Gaussians. The callback that measures motion needs memory of its
-//! own.
+//! Peak memory per survivor: its state, held by the caller; the proxy states before and after a pass (each at most half
+//! as many as survivors); and [`BYTES_PER_SURVIVOR`]. To this add [`BYTES_PER_PAIR`] for each candidate pair that is
+//! measured in one call, and [`BYTES_PER_PASSING`] for each pair that passed all tests. There are at most
+//! `max_neighbors` pairs per survivor; 3.5 were measured for evenly distributed Gaussians. The memory of the callback
+//! is not included.
 
 pub mod gates;
 pub mod greedy;
@@ -41,96 +42,103 @@ use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
 use tree::TreePoint;
 
-/// Memory per survivor beside its state during a pass, in bytes: groups 12 before and 12 after, state row 4, rank 4,
-/// and the largest of neighbor index (46), coincident nodes (24) and clustering (24).
+/// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. Groups take 12
+/// before the pass and 12 after it, the row of the state 4, the rank 4. The last term is the largest of three that are
+/// not needed at once: neighbor index (46), coincident nodes (24), and clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
-/// Memory per candidate pair of one call of `measure`, beside the memory of the measurement itself, in bytes: the pair,
-/// the same pair in the list to be measured, its known similarity and that of one pair of earlier passes
+/// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
+/// its copy in the list to be measured, the known similarities of this pair and of one pair of earlier passes
 /// ([`known::KnownPairs`]), and its motion similarity.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES + size_of::<f64>();
 
-/// Memory per pair that passed all tests of a pass, in bytes: the pair, and 4 bytes of spare list capacity.
+/// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
+/// list.
 pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
-/// Number of nodes whose neighbors one task looks up.
+/// Number of nodes (single Gaussians or merged groups) whose neighbors one parallel task looks up.
 const CHUNK: usize = 1024;
 
-/// The Gaussians to merge: selected rows of a table of states.
+/// Survivors (Gaussians left by pruning), which are to be merged: selected rows of a table of states.
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
-    /// States at the reference frame. Only the SH coefficients of degree 0 are read; proxies get all degrees of the
-    /// table.
+    /// Attributes of all Gaussians at the reference frame. Comparisons read only the SH coefficients of degree 0;
+    /// proxies get all degrees that this table has.
     pub states: &'a Gaussians,
-    /// The M rows that survive, increasing.
+    /// Rows of the survivors in `states`, increasing.
     pub rows: &'a [u32],
-    /// Ids of all rows, whose hashes break ties of size; contribution C by id, the size that ranks leaders; visibility
-    /// by id.
+    /// Ids of all rows, whose hashes break ties. By id: the contribution C, by which leaders are ranked, and the
+    /// visibility.
     pub importance: Importance<'a>,
-    /// Merge class of every row: a Gaussian may merge only with others of its class; `None`: with no other. A Gaussian
-    /// with a state that is not finite never merges.
+    /// Merge class of every row of `states`. A Gaussian merges only with others of its class; with `None` it never
+    /// merges. A Gaussian with a value that is not finite never merges either.
     pub classes: &'a [Option<u8>],
-    /// Scene extent in scene units, the unit of [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
+    /// Extent of the scene in scene units: the unit of recipe lengths given in
+    /// [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
     pub extent: f64,
 }
 
-/// Pairs of a pass whose motion is to be measured.
+/// Pairs of nodes (single Gaussians or merged groups) of one merging pass whose motion is to be measured.
 #[derive(Debug, Clone, Copy)]
 pub struct RequestedPairs<'a> {
     pairs: &'a [(u32, u32)],
     row: &'a [u32],
-    /// ε of the pass in scene units: the two nodes of a pair are at most this far apart at the reference frame.
+    /// Maximum distance ε of the two nodes of a pair at the reference frame, in scene units.
     pub reach: f64,
-    /// Whether this pass has further pairs, requested before or after these.
+    /// Whether further pairs of the same pass are requested in other calls.
     pub is_part: bool,
 }
 
 impl<'a> RequestedPairs<'a> {
-    /// Returns the pairs as rows of the states.
+    /// Returns each pair as two rows of [`Survivors::states`], those of the leaders if the nodes are groups.
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
     }
 }
 
-/// Result of merging: groups and proxies.
+/// Result of merging: groups of Gaussians, and a proxy for each group that has more than one.
 #[derive(Debug, Clone)]
 pub struct Merged {
-    /// Groups of survivors; every survivor is in exactly one.
+    /// Groups of the survivors (Gaussians left by pruning). Every survivor is in exactly one group.
     pub groups: MergeGroups,
-    /// State at the reference frame of every group of more than one member, in the order of the groups.
+    /// Proxies: one merged Gaussian for each group of more than one, in the order of the groups, as it is at the
+    /// reference frame.
     pub proxies: Gaussians,
-    /// Counts of each pass. Passes after the join limit was reached are not run and have no entry.
+    /// Statistics of each merging pass that was run. After the limit of joins is reached, no further pass is run.
     pub passes: Vec<PassCounts>,
 }
 
-/// Counts of one merge pass.
+/// Statistics of one merging pass. Its nodes are single Gaussians and the groups that earlier passes merged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Number of nodes with more neighbors within ε than were examined.
+    /// Number of nodes of which only the nearest neighbors were examined, because more than the maximum lie within the
+    /// radius ε.
     pub truncated: usize,
-    /// Number of pairs that passed tests 1 and 2.
+    /// Number of candidate pairs: pairs that passed tests 1 (place and size) and 2 (color).
     pub candidates: usize,
-    /// Number of candidate pairs that also passed test 3.
+    /// Number of candidate pairs that also passed test 3 (motion).
     pub passing: usize,
-    /// Number of nodes that joined a leader.
+    /// Number of nodes that joined another node.
     pub joins: usize,
-    /// Number of rounds of the parallel greedy rule.
+    /// Number of parallel rounds in which the leaders were decided.
     pub rounds: usize,
-    /// Whether the remaining nodes were decided sequentially after the last round.
+    /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
     pub sequential: bool,
 }
 
-/// Runs all passes of `recipe` over `survivors`. Every pass first merges nodes that coincide, then neighbors.
+/// Runs all merging passes of `recipe` over `survivors`. Every pass first merges nodes (Gaussians or merged groups)
+/// that coincide, then neighbors.
 ///
-/// `measure` answers test 3: it returns the motion similarity of every requested pair, in order; a pair passes if its
-/// similarity exceeds the pass's τ_m. It is called once per pass, and once before that if nodes coincide, and not at
-/// all without candidate pairs. With more than `most_pairs` pairs it is called several times, for at most `most_pairs`
-/// pairs each, in the voxel order of the leaders. The similarity depends on the pair alone, so the caller may cache it.
-/// In later passes the nodes are groups: state = proxy over all original members, size = ΣC, trajectory, life span and
-/// hash = the leader's.
+/// `measure` provides the values for test 3 (motion): it returns the motion similarity of every requested pair, in
+/// order. A pair passes if its similarity exceeds the minimum τ_m of the pass. `measure` is called once per pass, once
+/// more before that if nodes coincide, and never without candidate pairs. If there are more than `most_pairs` pairs, it
+/// is called several times with at most `most_pairs` pairs each, in the voxel order of their leaders. The similarity
+/// depends on the pair alone, so the caller may cache it. In later passes the nodes are groups: a group has the state
+/// of the proxy of all its original Gaussians, the sum of their contributions C as its size, and the trajectory, life
+/// span and hash of its leader.
 ///
-/// With `limit`, merging stops after exactly that many joins over all passes, or fewer if fewer are possible; the joins
-/// kept are the first ones in sequential order.
+/// With `limit`, merging stops after exactly that many joins over all passes, or earlier if no more are possible. The
+/// joins made are the first ones in sequential order.
 ///
 /// # Errors
 /// Returns the first error of `measure`; nothing else fails.
@@ -190,7 +198,8 @@ pub fn run<E>(
     Ok(Merged { groups, proxies, passes })
 }
 
-/// Returns the rank of every group: by descending ΣC, ties by the hash of the leader's id.
+/// Returns the rank of every group: by the descending sum of the contributions C of its Gaussians, ties by the hash of
+/// the leader's id.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -199,12 +208,12 @@ fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     greedy::ranks(&sizes, &hashes)
 }
 
-/// The nodes of a pass: single Gaussians and proxies.
+/// Nodes of one merging pass: single Gaussians, and the proxies of groups merged in earlier passes.
 struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
     groups: &'a MergeGroups,
     proxies: &'a Gaussians,
-    /// Row of each node in the survivors' states (a single Gaussian) or in the proxies.
+    /// Row of each node: in the survivors' states for a single Gaussian, in `proxies` for a merged group.
     place: Vec<u32>,
 }
 
@@ -221,7 +230,7 @@ impl<'a> MergeNodes<'a> {
         self.place.len()
     }
 
-    /// Returns the table that holds the state of `node`, and the row in it.
+    /// Returns the table with the state of `node`, and its row in this table.
     fn state(&self, node: usize) -> (&Gaussians, usize) {
         let alone = self.groups.members(node).len() == 1;
         (if alone { self.survivors.states } else { self.proxies }, self.place[node] as usize)
@@ -246,7 +255,7 @@ impl<'a> MergeNodes<'a> {
         Appearance::new(states, row)
     }
 
-    /// Returns the bits of all values that determine an [`Appearance`], with −0 stored as 0.
+    /// Returns the bits of all values of `node` that tests 1 and 2 compare ([`Appearance`]), with −0 stored as 0.
     fn appearance_bits(&self, node: usize) -> [u32; 13] {
         let (states, row) = self.state(node);
         let [x, y, z] = states.position.row(row);
@@ -257,9 +266,10 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Calls `take` with the pairs (leader, member) of coincident nodes: nodes that are equal in every attribute that
-/// `gates` compare, and that pass them. The leader of a set of coincident nodes is its first node in rank; all others
-/// are its members, however many. Pairs are ordered by leader and passed `max_batch` (at least 1) at a time.
+/// Finds sets of coincident nodes: nodes that are equal in every attribute that `gates` compare, and that pass these
+/// tests. Calls `take` with the pairs (leader, member) of each set. The leader is the first node of the set in rank;
+/// all others are its members, however many. Pairs are ordered by leader, and each call gets at most `max_batch` (at
+/// least 1).
 ///
 /// This step is needed because the neighbor search returns a fixed number of nearest Gaussians. If more Gaussians than
 /// that coincide, all neighbors of each are in the same set, so the set would neither merge into one nor reach the
@@ -294,13 +304,13 @@ fn each_coincident<E>(
     pairs.chunks(max_batch).try_for_each(|some| take(some, is_part))
 }
 
-/// Calls `take` with the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`: the member is among the
-/// leader's nearest neighbors and ranks after it. `unit` is the length of one unit of the recipe, in scene units. Pairs
-/// are ordered by leader in voxel order, then by distance, and passed `max_batch` (at least 1) at a time, with a flag
-/// that says whether there are several batches. Returns the number of nodes with more neighbors within ε than were
-/// examined.
+/// Finds the pairs of nodes (leader, member) that pass tests 1 (place and size) and 2 (color) of `pass`, and calls
+/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit`: length of one unit
+/// of the recipe, in scene units. Pairs are ordered by leader in voxel order, then by distance. Each call of `take`
+/// gets at most `max_batch` pairs (at least 1), and a flag that says whether there are several calls. Returns the
+/// number of nodes with more neighbors within the radius ε than were examined.
 ///
-/// A node that is not mergeable or not finite never leads or joins, and does not count among the nearest neighbors of
+/// A node that may not merge, or is not finite, never leads or joins, and is not counted among the nearest neighbors of
 /// others.
 ///
 /// # Errors
@@ -331,7 +341,8 @@ fn each_candidate<E>(
         (pairs, truncated)
     };
     let (mut pairs, mut truncated, mut is_part) = (Vec::new(), 0, false);
-    // Processing one batch of chunks at a time bounds the number of pairs that wait for the next call of `take`.
+    // Only one batch of chunks is processed at a time, which bounds the number of pairs that wait for the next call of
+    // `take`.
     for batch in index.points().chunks(2 * CHUNK * rayon::current_num_threads()) {
         let chunks: Vec<(Vec<(u32, u32)>, usize)> =
             batch.par_chunks(CHUNK).map_init(|| index.search(), find_pairs).collect();
@@ -351,7 +362,7 @@ fn each_candidate<E>(
     Ok(truncated)
 }
 
-/// Returns whether every value of a row is finite.
+/// Returns whether all attribute values of the Gaussian in row `row` are finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
     let columns = Attributes::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))

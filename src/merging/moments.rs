@@ -1,16 +1,17 @@
-//! Moment matching: computes the single Gaussian that has the weighted mean and covariance of several.
+//! Moment matching: computes the single Gaussian that has the weighted mean and covariance of several Gaussians.
 //!
-//! Input: weighted ellipsoids. Output: one ellipsoid. Memory: 96 bytes per part. The covariance Σ = Σ_i w_i (R_i S_i
-//! S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ) is never formed, because squaring halves the number of correct digits and the
-//! smallest scale of a needle would lose its digits first. Its factor F (3 × 4n, Σ = F Fᵀ) has the columns √w_i R_i S_i
-//! and √w_i (μ_i − μ). A one-sided Jacobi SVD rotates the three rows of F until they are orthogonal (Demmel and
-//! Veselić, "Jacobi's method is more accurate than QR", 1992). Every rotation is exact to rounding column by column, so
-//! a column a billion times shorter than another keeps its digits.
+//! Input: weighted ellipsoids. Output: one ellipsoid. Memory: 96 bytes per input ellipsoid. The covariance Σ = Σ_i w_i
+//! (R_i S_i S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ), where w is a weight, R a rotation, S a diagonal matrix of scales and μ a
+//! center, is never formed: squaring halves the number of correct digits, and the smallest scale of a needle would lose
+//! its digits first. Its factor F (3 × 4n, Σ = F Fᵀ) is formed instead; it has the columns √w_i R_i S_i and √w_i (μ_i −
+//! μ). A one-sided Jacobi SVD rotates the three rows of F until they are orthogonal (Demmel and Veselić, "Jacobi's
+//! method is more accurate than QR", 1992). Every rotation is exact to rounding in each column, so a column a billion
+//! times shorter than another keeps its digits.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Maximum number of sweeps over the three pairs of rows. Quadratic convergence needs about six; rounding noise in
-/// nearly equal singular values needs a few more.
+/// Maximum number of sweeps over the three pairs of rows of the factor F. Quadratic convergence needs about six sweeps;
+/// rounding noise in nearly equal singular values needs a few more.
 const MAX_SWEEPS: usize = 40;
 
 /// One Gaussian of a mixture, with its weight.
@@ -18,32 +19,32 @@ const MAX_SWEEPS: usize = 40;
 pub struct WeightedGaussian {
     /// Weight in the mixture, ≥ 0; the weights sum to 1.
     pub weight: f64,
-    /// μ, in any unit of length.
+    /// Center μ, in any unit of length.
     pub position: DVec3,
-    /// R, a unit quaternion.
+    /// Rotation R, a unit quaternion.
     pub rotation: DQuat,
-    /// Diagonal of S: standard deviations along the columns of R, in the unit of `position`.
+    /// Scales, the diagonal of S: standard deviations along the axes of `rotation`, in the unit of `position`.
     pub scales: DVec3,
 }
 
-/// Mean and covariance R S Sᵀ Rᵀ of a Gaussian.
+/// A Gaussian without color and opacity: mean, and covariance R S Sᵀ Rᵀ given by the rotation R and the scales S.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ellipsoid {
-    /// Center, in the unit of the parts.
+    /// Center, in the unit of length of the input Gaussians.
     pub mean: DVec3,
-    /// Unit quaternion with w ≥ 0.
+    /// Rotation, a unit quaternion with w ≥ 0.
     pub rotation: DQuat,
-    /// Standard deviations along the columns of the rotation.
+    /// Scales: standard deviations along the axes of `rotation`.
     pub scales: DVec3,
 }
 
-/// Returns the Gaussian whose mean is Σ w_i μ_i and whose covariance is the mixture's about that mean. With `about`,
-/// the mean is that point instead and the second moments are taken about it.
+/// Returns the Gaussian with the mean Σ w_i μ_i and the covariance of the mixture `parts`. If `about` is given, the
+/// mean is that point instead, and the second moments are taken about it.
 ///
-/// Canonical form: scales descend; the first two axes have their largest component positive and the third completes a
-/// right-handed frame, so that a reflection is resolved by flipping the smallest axis. Accuracy: every scale has a
-/// relative error of about 1e-14 if the columns of the parts do, at any anisotropy. Edge cases: without parts all
-/// scales are zero, at `about` or the origin; scales need only be finite, their squares may overflow.
+/// Canonical form: scales descend. The first two axes have a positive largest component, and the third makes the frame
+/// right-handed, so a reflection is resolved by flipping the smallest axis. Accuracy: every scale has a relative error
+/// of about 1e-14 if the scaled axes of `parts` have, at any anisotropy. Edge cases: without parts all scales are zero,
+/// and the mean is `about` or the origin. Scales need only be finite; their squares may overflow.
 pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     let mean = about.unwrap_or_else(|| parts.iter().map(|part| part.weight * part.position).sum());
     let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| Vec::with_capacity(4 * parts.len()));
@@ -60,7 +61,8 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
             row.extend(columns.iter().map(|column| column[r]));
         }
     }
-    // Dot products square the entries, so scale the largest entry to about 1 first. A power of two changes no digit.
+    // Dot products square the entries, so the largest entry is first scaled to about 1. A power of two changes no
+    // digit.
     let largest = rows.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
     let unit = if largest.is_normal() { 2f64.powi(largest.log2().floor() as i32) } else { 1.0 };
     rows.iter_mut().flatten().for_each(|x| *x /= unit);
@@ -74,11 +76,11 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     Ellipsoid { mean, rotation: unit_from_axes(&frame), scales: DVec3::from(order.map(|r| lengths[r])) }
 }
 
-/// Rotates pairs of rows until all three are orthogonal. Returns one axis per row such that the original rows are Σ_r
-/// axis_r ⊗ row_r.
+/// Rotates pairs of rows until all three are orthogonal. Returns one axis for each resulting row r, such that the
+/// original rows are Σ_r axis_r ⊗ row_r.
 fn orthogonalize_rows(rows: &mut [Vec<f64>; 3]) -> [DVec3; 3] {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
-    // A dot product of n terms has a rounding error of about this fraction of the product of the lengths.
+    // Relative to the product of the lengths, a dot product of n terms has about this rounding error.
     let tolerance = f64::EPSILON * (rows[0].len() as f64).sqrt().max(1.0);
     for _ in 0..MAX_SWEEPS {
         let mut rotated = false;
@@ -114,17 +116,18 @@ fn with_largest_positive(axis: DVec3) -> DVec3 {
     if axis[largest] < 0.0 { -axis } else { axis }
 }
 
-/// Returns the rotation whose matrix has these columns, with w ≥ 0.
+/// Returns the unit quaternion with w ≥ 0 of the rotation matrix `frame`.
 fn unit_from_axes(frame: &DMat3) -> DQuat {
     let rotation = DQuat::from_mat3(frame).normalize();
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
-/// Returns the ellipsoid with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of the
-/// 24 proper signed permutations the one with the largest |⟨q, reference⟩| is taken, the first one on a tie; q gets the
-/// sign nearest to `reference`.
+/// Returns the same ellipsoid with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of
+/// the 24 rotations that map axes to axes, the one with the largest |⟨q, reference⟩| is taken, the first one on a tie.
+/// The quaternion q gets the sign nearest to `reference`.
 ///
-/// A deformation field adds its deltas per axis, so a proxy must number its axes as its leader does.
+/// A deformation field adds its deltas axis by axis, so the axes of a proxy must be in the same order as those of its
+/// leader.
 pub fn align_axes(ellipsoid: &Ellipsoid, reference: DQuat) -> Ellipsoid {
     let axes = DMat3::from_quat(ellipsoid.rotation);
     let (mut closest, mut rotation, mut scales) = (f64::NEG_INFINITY, ellipsoid.rotation, ellipsoid.scales);
@@ -179,7 +182,7 @@ mod tests {
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
     }
 
-    /// Computes mean and covariance by the textbook formula, forming Σ.
+    /// Slow reference: computes mean and covariance by the textbook formula, forming Σ.
     fn oracle(parts: &[WeightedGaussian], about: Option<DVec3>) -> (DVec3, DMat3) {
         let mean = about.unwrap_or_else(|| parts.iter().fold(DVec3::ZERO, |sum, p| sum + p.position * p.weight));
         let sigma = parts

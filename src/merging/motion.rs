@@ -1,9 +1,11 @@
-//! Test 3 of merging: whether two Gaussians move alike while both are alive, measured frame by frame.
+//! Test 3 of merging: whether two Gaussians move alike while both are alive (visible by opacity), measured frame by
+//! frame.
 //!
-//! Input: pairs, then position and liveness of every node at each frame. Output: a [`PairMeasure`] for each pair,
-//! independent of any threshold, which a [`MotionGate`] turns into the one number that passes compare with their τ_m.
-//! Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`] per node; nothing grows with the number of frames. Each pair is
-//! summed by one thread in frame order, so the thread count does not change the sums.
+//! Input: pairs of nodes (Gaussians or merged groups), then at each frame the position of every node and whether it is
+//! alive. Output: one [`PairMeasure`] per pair, which depends on no threshold. A [`MotionGate`] turns it into the
+//! similarity that merging passes compare with their minimum τ_m. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`]
+//! per node, whatever the number of frames. Each pair is summed by one thread in frame order, so the thread count does
+//! not change the sums.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -11,55 +13,55 @@ use rayon::prelude::*;
 use super::gates::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, Trajectory};
 
-/// Memory of one pair during the measurement, in bytes.
+/// Bytes of memory for one pair during the measurement.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
-/// Memory of one node during the measurement, in bytes.
+/// Bytes of memory for one node (Gaussian or merged group) during the measurement.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
-/// Motion of two Gaussians relative to each other. Velocities are steps x(t) − x(t−1) between consecutive frames,
-/// whatever the time between them, because the noise level they are compared with is one per step.
+/// Measured motion of two Gaussians relative to each other. Velocities are steps a = x(t) − x(t−1) between consecutive
+/// frames, whatever the time between them, because the noise level they are compared with is also one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean cosine of the velocities, a·b/(‖a‖‖b‖ + 1e-8); a step with a velocity of zero counts as 0. The mean is over
-    /// all frames in which both are alive (`MotionParams::Literal`), or over the steps whose two frames are both such
-    /// frames (`MotionParams::Runs`).
+    /// Mean cosine a·b/(‖a‖‖b‖ + 1e-8) of the velocities a and b; a step in which one of them is zero counts as 0. The
+    /// mean is over all frames in which both are alive (`MotionParams::Literal`), or only over the steps that also
+    /// begin in such a frame (`MotionParams::Runs`).
     pub cosine: f64,
-    /// Σ a·b over the steps, in squared scene units.
+    /// Σ a·b of the velocities a and b over the steps, in squared scene units.
     pub dot: f64,
-    /// Σ ‖a‖² + ‖b‖² over the steps, in squared scene units.
+    /// Σ ‖a‖² + ‖b‖² of the velocities a and b over the steps, in squared scene units.
     pub squares: f64,
-    /// Number of steps n.
+    /// Number n of steps in the sums.
     pub steps: u32,
-    /// Number of frames in which both are alive, |life ∩ life'|.
+    /// Number of frames in which both Gaussians are alive.
     pub common: u32,
-    /// Number of frames in which at least one is alive, |life ∪ life'|.
+    /// Number of frames in which at least one of the Gaussians is alive.
     pub union: u32,
-    /// Maximum of ‖(x_i − x_j)(t) − (x_i − x_j)(t₀)‖ over the frames in which both are alive, in scene units. t₀ is the
-    /// reference frame; a proxy is built from the offset at that frame.
+    /// Maximum change of the offset x_i − x_j from its value at the reference frame, in scene units, over the frames in
+    /// which both are alive. Proxies are built from the offset at the reference frame.
     pub drift: f64,
 }
 
 impl PairMeasure {
-    /// Returns A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]: 1 for two static Gaussians, the cosine for
-    /// equally fast ones, and a small value for velocities v and 10 v. Without any step, or without motion at σ = 0, A
-    /// is 1.
+    /// Returns the alignment of the velocities a and b, A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1
+    /// for two static Gaussians, the cosine for equally fast ones, and small if one is ten times as fast as the other.
+    /// Without any of the n steps, or without motion at σ = 0, A is 1.
     ///
-    /// `noise` is σ in scene units per step.
+    /// `noise`: noise level σ of a step, in scene units.
     pub fn alignment(&self, noise: f64) -> f64 {
         let floor = 2.0 * f64::from(self.steps) * noise * noise;
         let denominator = self.squares + floor;
         if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
     }
 
-    /// Returns the fraction of the frames with at least one alive in which only one is alive; 1 if neither is ever
+    /// Returns in which fraction of the frames with at least one Gaussian alive only one is alive; 1 if neither is ever
     /// alive.
     pub fn dead_time(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
 }
 
-/// Thresholds of test 3 that hold for every pass, lengths in scene units. The required motion similarity is the pass's
-/// τ_m.
+/// Thresholds of test 3 (motion) that all merging passes share. Lengths are in scene units. The minimum similarity τ_m
+/// differs between passes and is not stored here.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionGate {
     trajectory: Trajectory,
@@ -69,7 +71,7 @@ pub struct MotionGate {
 }
 
 impl MotionGate {
-    /// Creates the test from the thresholds of `merge`; `unit` is the length of one unit of the recipe, in scene units.
+    /// Creates the test from the thresholds of `merge`. `unit`: length of one unit of the recipe, in scene units.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
@@ -81,9 +83,9 @@ impl MotionGate {
         }
     }
 
-    /// Returns the motion similarity of a pair, in [−1, 1]; the pair passes test 3 if it exceeds τ_m. Returns NaN,
-    /// which exceeds no τ_m, if the two are never alive together, if the fraction of frames with only one alive is too
-    /// large, or if the pair drifts apart.
+    /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
+    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two are never alive together, if the
+    /// fraction of frames with only one alive is too large, or if the two drift too far apart.
     pub fn likeness(&self, pair: &PairMeasure) -> f64 {
         let together = pair.common > 0 && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time;
         match self.trajectory {
@@ -94,7 +96,8 @@ impl MotionGate {
     }
 }
 
-/// Position and liveness of a node at two consecutive frames, and its position at the reference frame.
+/// Position of a node (Gaussian or merged group) at the present, the previous and the reference frame, and whether it
+/// is alive at the first two.
 #[derive(Debug, Clone, Copy)]
 struct NodeTrack {
     reference: [f32; 3],
@@ -116,7 +119,7 @@ struct NodePair {
     drift_squared: f64,
 }
 
-/// Measurement of pairs of nodes over frames that arrive in order.
+/// Measures the motion of pairs of nodes (Gaussians or merged groups) over frames that arrive in order.
 #[derive(Debug)]
 pub struct PairMotion {
     motion: MotionParams,
@@ -126,9 +129,9 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts measuring `pairs` of nodes; `reference` gives the position of each of the N nodes at the reference frame.
-    /// `motion` says which steps count: with `Literal` all steps that end in a frame in which both are alive, with
-    /// `Runs` only those that also begin in one.
+    /// Starts to measure `pairs` of the N nodes. `reference`: position of each node at the reference frame. `motion`:
+    /// with `Literal` all steps count that end in a frame in which both nodes are alive, with `Runs` only those that
+    /// also begin in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -154,7 +157,7 @@ impl PairMotion {
         }
     }
 
-    /// Adds the next frame; `state` returns position and liveness of each of the N nodes.
+    /// Adds the next frame. `state` returns for the index of a node its position and whether it is alive.
     pub fn frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);
@@ -177,7 +180,7 @@ impl PairMotion {
         self.frames += 1;
     }
 
-    /// Returns the measure of each pair over the frames so far, in the order given.
+    /// Returns the measure of each pair over all frames added, in the order in which the pairs were given.
     pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
         let measure = move |pair: NodePair| {
@@ -235,7 +238,7 @@ mod tests {
 
     type Path = Vec<(f32, bool)>;
 
-    /// Measures the pair (0, 1) of nodes that move along x; reference frame 0.
+    /// Measures a pair of nodes that move along x on the paths `a` and `b`; the reference frame is frame 0.
     fn measure(a: &Path, b: &Path, motion: MotionParams) -> PairMeasure {
         let state = |t: usize, node: usize| {
             let (x, alive) = [a, b][node][t];
@@ -253,7 +256,8 @@ mod tests {
         (0..20).map(|t| (x(t), true)).collect()
     }
 
-    /// Returns whether the pair passes with the default recipe in a scene of extent `extent`.
+    /// Returns whether two Gaussians on the paths `a` and `b` pass test 3 with the default recipe in a scene of extent
+    /// `extent`.
     fn merges(a: &Path, b: &Path, extent: f64) -> bool {
         let merge = Recipe::preset("default").unwrap().merge;
         MotionGate::new(&merge, extent).likeness(&measure(a, b, MotionParams::Runs)) > merge.passes[0].tau_m
@@ -293,7 +297,7 @@ mod tests {
         let slow = path(|t| 1e-5 * t as f32);
         assert!(merges_in_paper(&path(|t| 1e-3 * t as f32), &path(|t| 1e-3 * t as f32)));
         let cosine = measure(&slow, &slow, MotionParams::Runs).cosine;
-        // 1e-10 / (1e-10 + 1e-8), from f32 coordinates.
+        // Expected cosine for steps of 1e-5: 1e-10 / (1e-10 + 1e-8); coordinates are f32.
         assert!((cosine - 1.0 / 101.0).abs() < 1e-6, "{cosine}");
         assert!(!merges_in_paper(&slow, &slow));
     }
@@ -319,7 +323,7 @@ mod tests {
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.max_dead_time = f64::INFINITY;
         merge.max_drift = f64::INFINITY;
-        // No threshold lets them pass, not even one that every alignment exceeds.
+        // The pair passes at no threshold, not even at one that every alignment exceeds.
         let exceeds = |a: &Path, b: &Path, tau: f64| {
             MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Runs)) > tau
         };

@@ -1,11 +1,11 @@
-//! Measures the motion similarity of pairs of Gaussians over all frames.
+//! Measurement of the motion similarity of pairs of Gaussians over all frames.
 //!
-//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`crate::merging::run`] splits
-//! them into partitions of a fixed number of consecutive pairs in voxel order, and the trajectories of all survivors
-//! are first gathered into a scratch file in that order. A partition reads the Gaussians that lead its pairs and their
-//! ghosts, that is, partners within ε that other partitions also read. Partitions are cut by counting pairs, so a voxel
-//! that holds more pairs than fit is split. The sums of a pair are computed entirely in one partition, so partitioning
-//! does not change a bit.
+//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`crate::merging::run`] divides
+//! them into partitions of a fixed number of consecutive pairs in voxel order, so that the Gaussians of a partition are
+//! close in space. The trajectories of all survivors (Gaussians left by pruning) are then first gathered in a scratch
+//! file in that order. For a partition, the Gaussians that lead its pairs are read, and their partners; these may also
+//! be read for other partitions. Partitions are cut by counting pairs, so even a voxel with more pairs than fit in
+//! memory is split. The sums of a pair are computed entirely in one partition, so partitioning does not change a bit.
 
 use std::path::PathBuf;
 
@@ -23,61 +23,65 @@ use crate::progress::Events;
 use crate::recipe;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Memory of one pair while it is measured, in bytes: its sums, its two Gaussians in the list of members, its result.
+/// Bytes of memory for one pair while it is measured: its sums, its two Gaussians in the list of Gaussians, and its
+/// result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
 
-/// Returns the memory of one Gaussian of the pairs that are measured together (at most two per pair), in bytes, beside
-/// the memory of the source's own reader: index and id, track, state at one frame, and the frames that a reader holds.
+/// Returns the bytes of memory for each Gaussian of the pairs that are measured together (at most two per pair): index
+/// and id, track, state at one frame, and the `frames_held` frames that a reader holds. The memory of the source's own
+/// reader is not included.
 pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
 
-/// Measurement of the motion similarity of pairs of Gaussians of a source.
+/// Measures the motion similarity of pairs of Gaussians of a source.
 pub struct PairMeter<'a> {
-    /// Source of the trajectories.
+    /// Source from which the trajectories are read.
     pub source: &'a dyn FrameSource,
-    /// Scan parameters: `alpha_min`, which defines when a Gaussian is alive, and `motion`, which defines the steps that
-    /// count.
+    /// Scan parameters. Used are `alpha_min`, the opacity from which a Gaussian is alive, and `motion`, which defines
+    /// the steps that count.
     pub scan: &'a recipe::ScanParams,
-    /// Thresholds of test 3.
+    /// Thresholds of test 3 (motion).
     pub gate: MotionGate,
-    /// Number of frames that a reader holds and that are gathered together.
+    /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
+    /// time.
     pub frames_held: usize,
-    /// Folder of the scratch file for trajectories.
+    /// Folder in which the scratch file for trajectories is created.
     pub scratch: PathBuf,
     /// Receiver of progress events.
     pub events: Events,
-    /// Trajectories gathered so far; `None` at first.
+    /// Trajectories in the scratch file; `None` until they are first needed.
     pub gathered: Option<GatheredTrajectories>,
 }
 
-/// Trajectories in a scratch file, in voxel order.
+/// Trajectories of Gaussians in a scratch file, in voxel order: Gaussians close in space are close in the file.
 pub struct GatheredTrajectories {
     trajectories: Trajectories,
-    /// Row of the Gaussian at every place of the file.
+    /// For every place in the file, the row of its Gaussian.
     order: Vec<u32>,
-    /// Place in the file of every row.
+    /// For every row, the place of its Gaussian in the file.
     place: Vec<u32>,
 }
 
 impl PairMeter<'_> {
-    /// Returns a meter with the same settings and no gathered trajectories.
+    /// Returns a copy of this meter with the same settings but without gathered trajectories.
     pub fn fresh(&self) -> Self {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
-    /// Measures the motion similarity of each of `pairs` (rows of `ids`, which increase) and returns it in some order.
-    /// `reference` `[3, M]` holds the positions of `ids` at the reference frame; the two Gaussians of a pair are at
-    /// most about `reach` apart there. `ids` and `reference` must be the same at every call. `is_part` says that other
-    /// pairs were or will be requested, so that gathering trajectories pays.
+    /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order. The pairs are rows
+    /// of `ids`, which increase. `reference` `[3, M]` holds the positions of `ids` at the reference frame, where the
+    /// two Gaussians of a pair are at most about `reach` apart. `ids` and `reference` must be the same in every call.
+    /// `is_part`: whether pairs are also requested in other calls, so that gathering the trajectories pays.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
-    /// With gathered trajectories also 8 bytes for each of `ids` and, while gathering, 12 more and their samples at the
-    /// frames held. Nothing grows with the number of frames. A sequence in which neither positions nor opacities vary
-    /// is measured by its first frame alone.
+    /// With gathered trajectories also 8 bytes for each of `ids`; while gathering, 12 more and the values of the frames
+    /// held. Nothing grows with the number of frames. If neither positions nor opacities vary, only the first frame is
+    /// measured.
     ///
     /// # Errors
-    /// Fails if reading the source or writing or reading the scratch file fails. The scratch file is gone then.
+    /// Fails if the source cannot be read, or the scratch file cannot be read or written. The scratch file is then
+    /// deleted.
     pub fn measure(
         &mut self,
         ids: &[u32],
@@ -119,7 +123,7 @@ impl PairMeter<'_> {
         Ok(pairs.iter().zip(measured).map(by_row).collect())
     }
 
-    /// Gathers the trajectories of all of `ids` in the order of voxels of side `reach`.
+    /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in the order of voxels of side `reach`.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
@@ -133,7 +137,8 @@ impl PairMeter<'_> {
         Ok(GatheredTrajectories { trajectories, order, place })
     }
 
-    /// Passes every frame of the Gaussians `ids` to `motion`; only the first frame if nothing varies.
+    /// Passes every frame of the Gaussians `ids` of the source to `motion`; only the first frame if nothing varies with
+    /// time.
     fn play_source(&self, ids: &[u32], motion: &mut PairMotion) -> Result<()> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
@@ -153,7 +158,7 @@ impl PairMeter<'_> {
     }
 }
 
-/// Returns the Gaussians that occur in a pair, increasing.
+/// Returns all Gaussians that occur in `pairs`, increasing and without duplicates.
 fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     let mut members = Vec::with_capacity(2 * pairs.len());
     members.extend(pairs.iter().flat_map(|&(a, b)| [a, b]));
@@ -163,7 +168,7 @@ fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     members
 }
 
-/// Returns the pairs as indices into `members`.
+/// Returns each pair as two indices into the sorted list `members`.
 fn local_indices<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
     let place = |member: u32| members.binary_search(&member).unwrap_or_default() as u32;
     pairs.iter().map(move |&(a, b)| (place(a), place(b)))
@@ -182,7 +187,7 @@ mod tests {
     /// Reference frame of all tests.
     const REFERENCE: usize = 3;
 
-    /// Every third Gaussian of a demo scene, and all pairs of them that are at most `reach` apart.
+    /// Test case: every third Gaussian of a demo scene, and all pairs of these that are at most `reach` apart.
     struct Case {
         scene: Scene,
         recipe: Recipe,
@@ -215,7 +220,7 @@ mod tests {
                 gathered: None,
             };
             let is_part = self.pairs.len() > pairs_together;
-            // An empty list of pairs is still one part.
+            // Without pairs there is still one (empty) part.
             let starts = (0..self.pairs.len().max(1)).step_by(pairs_together);
             let parts =
                 starts.map(|start| &self.pairs[start..self.pairs.len().min(start.saturating_add(pairs_together))]);
@@ -230,7 +235,7 @@ mod tests {
             Ok(found)
         }
 
-        /// Measures all pairs from whole frames, without partitions.
+        /// Measures the motion similarity of all pairs from whole frames, without partitions.
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
             let gate = MotionGate::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
@@ -262,7 +267,7 @@ mod tests {
     #[test]
     fn overfull_voxels_are_split() {
         let case = Case::new(0.3);
-        // Voxels wider than the scene: one voxel leads all pairs.
+        // The voxels are wider than the scene, so all pairs are in one voxel.
         let got = case.measure(&case.scene, case.pairs.len() / 5, 1e6).unwrap();
         assert!(got == case.measure_whole());
     }
@@ -284,7 +289,7 @@ mod tests {
         }
     }
 
-    /// A scene whose frames cannot be read from `from` on.
+    /// Scene whose frames from number `from` on cannot be read.
     struct Failing<'a> {
         scene: &'a Scene,
         from: usize,

@@ -1,15 +1,15 @@
-//! Nearest neighbors of every Gaussian, by a hash of voxels with sides as long as the maximum distance ε.
+//! Search for the nearest neighbors of every Gaussian, by a hash table of voxels whose side is the maximum distance ε.
 //!
-//! Input: positions. Output: for a Gaussian the at most K nearest others within ε, nearest first, ties by index. The
-//! result is defined by (distance, index) alone, so it does not depend on voxels, hashes, threads or any partition of
-//! space.
+//! Input: positions. Output: for each Gaussian its nearest neighbors, at most K within ε, nearest first, ties by index.
+//! The result is defined by distance and index alone, so it does not depend on voxels, hashes, threads or any partition
+//! of space.
 //!
-//! Points are sorted by voxel, and a hash table holds the start of each voxel. All points within ε of a point lie in
-//! its own voxel or in one of the 26 around it. These are looked up once for all points of a voxel, and skipped if they
-//! are farther away than the worst neighbor kept. A voxel with very many points has a [`Tree`] over them, so that many
-//! points in one voxel, or an ε that spans the scene, cost no more than a tree.
-//! Memory: 16 bytes per point, and 13 bytes for each slot of the table, which has at most 16 slots for 7 voxels: at
-//! most 46 bytes per point, 40 while points are sorted.
+//! Points are sorted by voxel, and the hash table holds the start of each voxel. All points within ε of a point lie in
+//! its own voxel or in one of the 26 around it. These voxels are looked up once for all points of a voxel, and skipped
+//! if they are farther away than the worst neighbor found so far. A voxel with very many points has a [`Tree`], so that
+//! many points in one voxel, or an ε that spans the scene, cost no more than a tree search.
+//! Memory: 16 bytes per point, and 13 bytes for each entry of the hash table, which has at most 16 entries for 7
+//! voxels. This is at most 46 bytes per point, and 40 while points are sorted.
 //!
 //! Source: spatial hashing after M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
 //! objects", 2003.
@@ -23,31 +23,32 @@ use super::tree::{Nearest, Tree, TreePoint};
 use super::voxels::{Voxels, along, voxel_of};
 use crate::model::hash_id;
 
-/// Maximum number of points in a voxel without a tree. Trees in voxels of 8 to 64 points cost up to a third more for
-/// evenly distributed points and save 7% for clusters.
+/// Maximum number of points in a voxel without a tree. Trees in voxels of 8 to 64 points would cost up to a third more
+/// time for evenly distributed points, and save 7% for clusters.
 const MAX_WITHOUT_TREE: usize = 64;
-/// Error bound of a position within the grid, as a fraction of a voxel's side: coordinates are up to 2²¹ sides, rounded
-/// to 53 bits a few times.
+/// Bound on the rounding error of a position in the grid, as a fraction of a voxel's side. Coordinates are up to 2²¹
+/// sides and are rounded to 53 bits a few times.
 const ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 
-/// Index of finite points that answers queries for the neighbors of each point within ε.
+/// Index of points that finds the neighbors of each point within the distance ε. Holds only points with finite
+/// coordinates.
 #[derive(Debug)]
 pub struct PointIndex {
     epsilon: f64,
     voxels: Voxels,
     /// Points sorted by voxel.
     points: Vec<TreePoint>,
-    /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in voxel order.
+    /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in the order of the voxels.
     trees: Vec<Tree>,
     table: HashTable<Occupied>,
 }
 
-/// A voxel that holds points.
+/// A voxel that contains at least one point.
 #[derive(Debug, Clone, Copy)]
 struct Occupied {
     start: u32,
     len: u32,
-    /// Index of its tree; an index beyond all trees if it has none.
+    /// Index of the voxel's tree in `trees`; an index beyond the last one if the voxel has no tree.
     tree: u32,
 }
 
@@ -58,12 +59,14 @@ impl Occupied {
 }
 
 impl PointIndex {
-    /// Indexes the finite ones of `points`, at most 2³² − 2 points with different indices.
+    /// Builds an index of those of `points` that have finite coordinates, for queries within the distance `epsilon`.
+    /// There may be at most 2³² − 2 points, all with different indices.
     ///
     /// Edge cases: ε = 0 finds exact duplicates; an infinite ε reaches all points.
     pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
         points.retain(|point| point.at.iter().all(|x| x.is_finite()));
-        // Sides are slightly longer than ε, so that rounding cannot put a point exactly ε away two voxels away.
+        // Sides are slightly longer than ε, so that rounding never puts a point at the exact distance ε two voxels
+        // away.
         let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
         let rows: Vec<u32> = (0..points.len() as u32).collect();
         let order = voxels.order(&rows, |row| points[row as usize].at);
@@ -85,12 +88,12 @@ impl PointIndex {
         PointIndex { epsilon, voxels, points, trees, table }
     }
 
-    /// Returns all points, sorted by voxel: the fastest order for neighbor queries.
+    /// Returns all indexed points, sorted by voxel. Neighbor queries are fastest in this order.
     pub fn points(&self) -> &[TreePoint] {
         &self.points
     }
 
-    /// Returns a reusable query state; each thread needs its own.
+    /// Creates a reusable query object; each thread needs its own.
     pub fn search(&self) -> NeighborSearch<'_> {
         NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: Nearest::default() }
     }
@@ -101,34 +104,34 @@ impl PointIndex {
     }
 }
 
-/// Returns the hash of a voxel's number. The eight voxels of a 2×2×2 cube follow one another in the table, so that the
-/// 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the highest bits first, so
-/// these differ within a cube too.
+/// Returns the hash of the voxel with Morton code `number`. The eight voxels of a 2×2×2 cube follow one another in the
+/// table, so that the 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the
+/// highest bits first, so these differ within a cube too.
 fn hash(number: u64) -> u64 {
     let corner = number & 7;
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Query state that remembers the neighborhood of the voxel queried last.
+/// Query object, which remembers the neighborhood of the voxel queried last.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
     last_voxel: Option<[u32; 3]>,
-    /// Occupied voxels among the last queried voxel and its 26 neighbors, with the step to each along the axes as in
-    /// [`STEPS`].
+    /// Voxels with points among the last queried voxel and the 26 around it, each with its step along the three axes,
+    /// encoded as in [`STEPS`].
     around: Vec<([u8; 3], Occupied)>,
     nearest: Nearest,
 }
 
 impl NeighborSearch<'_> {
-    /// Returns the at most `k` nearest indexed points other than `query` whose distance to `at` is at most ε, nearest
-    /// first, equal distances by index; and whether there were more than `k`.
+    /// Returns the indices of the nearest points to `at` other than `query`: at most `k` within the distance ε, nearest
+    /// first, equal distances by index. Also returns whether there were more than `k`.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edge case: a point that is not finite has no
     /// neighbors.
     pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
         let index = self.index;
-        // One neighbor more than k shows whether the list was cut.
+        // One neighbor more than `k` is sought, to know whether there are more.
         self.nearest.start(query, at, k + 1, index.epsilon);
         if at.iter().all(|x| x.is_finite()) {
             let position = index.voxels.place(at);
@@ -136,7 +139,8 @@ impl NeighborSearch<'_> {
             if self.last_voxel != Some(voxel) {
                 self.look_up(voxel);
             }
-            // Smallest squared distance to the neighboring voxels, by step and axis; it adds up over the axes.
+            // Returns the smallest squared distance to a neighboring voxel along one axis. These distances add up over
+            // the axes.
             let gap = |part: f64| ((part - ROUNDING).max(0.0) * index.voxels.side()).powi(2);
             let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
                 let inside = position[c] - f64::from(voxel[c]);
@@ -156,10 +160,10 @@ impl NeighborSearch<'_> {
         (found[..found.len().min(k)].iter().map(|&(_, index)| index), found.len() > k)
     }
 
-    /// Looks up the occupied voxels at and around `voxel`.
+    /// Looks up `voxel` and the 26 voxels around it, and remembers those that contain points.
     fn look_up(&mut self, voxel: [u32; 3]) {
         self.last_voxel = Some(voxel);
-        // The number below 0 wraps to a number beyond the last voxel.
+        // One below 0 wraps to a number beyond the last voxel, for which there is no voxel.
         let numbers: [[Option<u64>; 3]; 3] =
             std::array::from_fn(|c| [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| along(c, number)));
         let index = self.index;
@@ -171,8 +175,9 @@ impl NeighborSearch<'_> {
     }
 }
 
-/// Steps to a voxel itself and the 26 around it, by axis: 0 stays, 1 goes down, 2 goes up. The voxel itself comes
-/// first, then those that share a side, an edge and a corner: near voxels first let more of the far ones be skipped.
+/// Steps from a voxel to itself and to the 26 around it, one per axis: 0 stays, 1 goes down, 2 goes up. The voxel
+/// itself comes first, then those that share a side, an edge and a corner. Near voxels come first so that more of the
+/// far ones can be skipped.
 const STEPS: [[u8; 3]; 27] = {
     let mut steps = [[0; 3]; 27];
     let (mut filled, mut moved) = (0, 0);
@@ -242,7 +247,7 @@ mod tests {
             prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // A coarse grid: many points coincide, most distances tie.
+        // On a coarse grid, many points coincide and most distances tie.
         #[test]
         fn duplicates_and_ties_equal_brute_force(
             cells in prop::collection::vec(prop::array::uniform3(0u8..3), 0..150),
@@ -257,7 +262,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
-        // Clusters far narrower and far wider than ε: voxels with and without trees, and borders between them.
+        // Clusters far narrower and far wider than ε give voxels with and without trees, side by side.
         #[test]
         fn distant_clusters_equal_brute_force(
             centers in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
@@ -273,7 +278,7 @@ mod tests {
             prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // One point at the end of the range of f32 makes voxels wider than all other distances.
+        // A point at each end of the range of f32 makes voxels wider than all other distances.
         #[test]
         fn extreme_coordinates_equal_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),
@@ -285,7 +290,7 @@ mod tests {
         }
     }
 
-    // Neighbors exactly ε away, on the borders of voxels, for several grid origins and values of ε.
+    // Neighbors are exactly ε away, on the borders of voxels, for several grid origins and values of ε.
     #[test]
     fn points_exactly_epsilon_away_are_found() {
         for unit in [1.0f32, 0.1, 3e-7, 7e9] {
@@ -332,7 +337,8 @@ mod tests {
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
     }
 
-    /// Returns the seconds taken by the queries for all neighbors of `points`, and how many lists were cut.
+    /// Returns the seconds that the neighbor queries for all `points` take, and the number of points with more than `k`
+    /// neighbors.
     fn time_queries(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let start = Instant::now();
         let index = PointIndex::new(numbered(points), epsilon);
@@ -347,7 +353,7 @@ mod tests {
     fn coincident_points_take_bounded_time() {
         let (seconds, cut) = time_queries(&vec![[1.0, 2.0, 3.0]; 200_000], 32, 0.1);
         assert_eq!(cut, 200_000);
-        // All pairs would be 4e10 distances; 60 s leaves time for a slow shared machine.
+        // Comparing all pairs would take 4e10 distances; 60 s leaves time for a slow shared machine.
         assert!(seconds < 60.0, "{seconds} s for 200,000 coincident points");
     }
 

@@ -1,8 +1,9 @@
-//! The proxy: the single Gaussian that replaces a cluster.
+//! Computation of the proxy: the single Gaussian that replaces a cluster of merged Gaussians, its members.
 //!
-//! Input: states of all members at the reference frame, and their weights. Output: a state in the stored encoding, one
-//! row per cluster. Memory: 1 KiB per cluster for at most 4096 of them at a time, beside the output; for a large set of
-//! coincident Gaussians 220 bytes per member, less than the pairs that led to it may take.
+//! Input: attributes of all members at the reference frame, and their weights. Output: one Gaussian per cluster, in the
+//! stored encoding (log scales, opacity logits). Memory: 1 KiB per cluster for at most 4096 clusters at a time, beside
+//! the output. A large set of coincident Gaussians needs 220 bytes per member, less than the pairs that led to it may
+//! take.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -13,32 +14,33 @@ use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
-/// Number of clusters merged between two writes to the output planes.
+/// Number of proxies that are computed before their values are written to the output.
 const BATCH: usize = 4096;
-/// Distance of a proxy's opacity from 0 and 1: opacities stay within [this, 1 − this], where the logit is finite in
-/// f32.
+/// Minimum distance of a proxy's opacity from 0 and from 1, so that its logit is finite in f32.
 const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
-/// Exponent of Thomsen's formula for the surface of an ellipsoid (Knud Thomsen, 2004; see Michon, "Surface area of an
-/// ellipsoid").
+/// Exponent p of Thomsen's approximation of the surface of an ellipsoid (Knud Thomsen, 2004; see Michon, "Surface area
+/// of an ellipsoid").
 const THOMSEN: f64 = 1.6075;
 
-/// State of a proxy at the reference frame, in the encoding of [`Gaussians`] but in f64.
+/// Attributes of a proxy (Gaussian that replaces a cluster) at the reference frame, encoded as in [`Gaussians`] but in
+/// f64.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProxyState {
     /// Center, in scene units.
     pub position: DVec3,
-    /// Unit quaternion, wxyz; axes in the leader's order, sign nearest to the leader's quaternion.
+    /// Unit quaternion (w, x, y, z). Its axes are in the order of the leader's axes, and its sign is the one nearest to
+    /// the leader's quaternion.
     pub rotation: [f64; 4],
-    /// Natural logarithms of the scales in scene units, finite.
+    /// Natural logarithms of the scales (scene units); always finite.
     pub log_scale: [f64; 3],
-    /// Logit of the opacity, finite.
+    /// Logit of the opacity; always finite.
     pub opacity_logit: f64,
-    /// SH coefficients, laid out as a row of [`Gaussians::sh`].
+    /// SH coefficients, in the order of a row of [`Gaussians::sh`].
     pub sh: Vec<f64>,
 }
 
 impl ProxyState {
-    /// Writes the attributes `want` to row `row` of `out`, rounded to f32.
+    /// Rounds the attributes `want` to f32 and writes them to row `row` of `out`.
     pub fn write(&self, want: Attributes, row: usize, out: &mut Gaussians) {
         for column in want.iter() {
             match column {
@@ -56,31 +58,32 @@ impl ProxyState {
     }
 }
 
-/// Values that determine the weights of members, by id.
+/// Importance of Gaussians, which determines the weights of the members of a cluster.
 #[derive(Debug, Clone, Copy)]
 pub struct Importance<'a> {
-    /// Id of every row of the states.
+    /// Id of each row of the table of Gaussians.
     pub ids: &'a [u32],
-    /// Contribution C by id.
+    /// Contribution C (mean share in the renders, pixels) of each id.
     pub coverage: &'a [f64],
-    /// Visibility Vis by id.
+    /// Visibility Vis (share of the views in which the Gaussian is on screen) of each id.
     pub visibility: &'a [f64],
 }
 
 impl Importance<'_> {
-    /// Returns C of a row.
+    /// Returns the contribution C of the Gaussian in row `row`.
     pub(super) fn coverage(&self, row: u32) -> f64 {
         self.coverage[self.ids[row as usize] as usize]
     }
 
-    /// Returns C·Vis of a row.
+    /// Returns contribution times visibility, C·Vis, of the Gaussian in row `row`.
     fn weighted_contribution(&self, row: u32) -> f64 {
         self.coverage(row) * self.visibility[self.ids[row as usize] as usize]
     }
 }
 
-/// Returns the weights of the rows `members`, w ∝ C·Vis, summing to 1. If that sum is not positive and finite, w ∝
-/// opacity × area; if that fails too, all weights are equal.
+/// Returns the weights of the members of a cluster, given as rows of `states`. Weights are proportional to contribution
+/// × visibility (C·Vis) and sum to 1. If this sum is not positive and finite, they are proportional to opacity × area;
+/// if that fails too, all are equal.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
     let weighted_contribution = |&i: &u32| importance.weighted_contribution(i);
     let opaque_area = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
@@ -94,13 +97,14 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
         .unwrap_or_else(|| vec![1.0 / members.len() as f64; members.len()])
 }
 
-/// Computes the proxy of `members`: rows of `states` with weights that sum to 1, `leader` among them.
+/// Computes the proxy that replaces the cluster `members`: rows of `states` and their weights, which sum to 1. The row
+/// `leader` is one of them.
 ///
-/// Mean and covariance are the mixture's; with [`Placement::Leader`] the proxy has the leader's position and the second
-/// moments about it. The base color is the weighted average; higher SH degrees are the weighted average or the heaviest
-/// member's (ties to the first). Opacity follows [`ProxyOpacity`]; areas are the mean projected area of the ellipsoid
-/// over all directions. Exact duplicates give the leader's own position, axes, scales and color. A zero quaternion
-/// counts as the identity.
+/// Mean and covariance are those of the weighted mixture. With [`Placement::Leader`] the proxy has the leader's
+/// position, and the second moments are taken about it. The base color is the weighted mean; coefficients of higher SH
+/// degrees are the weighted mean or those of the member with the largest weight (the first on a tie). Opacity follows
+/// [`ProxyOpacity`], with the area of an ellipsoid projected in all directions and averaged. Exact duplicates give the
+/// leader's own position, axes, scales and color. A zero quaternion counts as the identity.
 ///
 /// Colors are computed only if `want` contains them: they are slow to read, and in most sequences they are the same at
 /// every frame.
@@ -111,8 +115,8 @@ pub fn merge_state(
     merge: &recipe::MergeParams,
     want: Attributes,
 ) -> ProxyState {
-    // All values are relative to the leader's frame: coordinates far from the origin cancel once, and the Jacobi
-    // iteration starts from the leader's axes, so it rotates them only as far as the other members require.
+    // All values are relative to the leader. Thus coordinates far from the origin cancel once, and the Jacobi iteration
+    // starts from the leader's axes and rotates them only as far as the other members require.
     let origin = position(states, leader);
     let frame = unit_rotation(states.rotation.row(leader as usize));
     let part = |&(i, weight): &(u32, f64)| {
@@ -134,7 +138,7 @@ pub fn merge_state(
     ProxyState {
         position: origin + frame * local.mean,
         rotation: nearest_sign(frame * local.rotation, frame),
-        // An underflowed scale is replaced by the smallest positive one, whose logarithm is finite.
+        // A scale that has underflowed to 0 is replaced by the smallest positive number, whose logarithm is finite.
         log_scale: local.scales.to_array().map(|scale| scale.max(f64::MIN_POSITIVE).ln()),
         opacity_logit: logit(merged_opacity(members, states, &local, merge.opacity)),
         sh: match want.contains(Attributes::SH) {
@@ -144,7 +148,8 @@ pub fn merge_state(
     }
 }
 
-/// Computes the proxy of every group of more than one member: one row per group, in their order.
+/// Computes the proxy of every group of more than one Gaussian. The result has one row for each such group, in the
+/// order of the groups.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,
@@ -188,16 +193,17 @@ fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Returns the wxyz of a unit quaternion, in the sign nearest to `reference`.
+/// Returns the unit quaternion `rotation` as (w, x, y, z), with the sign nearest to `reference`.
 fn nearest_sign(rotation: DQuat, reference: DQuat) -> [f64; 4] {
     let rotation = rotation.normalize();
     let q = if rotation.dot(reference) < 0.0 { -rotation } else { rotation };
     [q.w, q.x, q.y, q.z]
 }
 
-/// Returns the mean projected area, over all directions, of an ellipsoid with these half axes. The area is a quarter of
-/// the surface (Cauchy), by Thomsen's formula, within 1.1%. The plain mean of the three cross sections would
-/// overestimate the growth of a flat Gaussian that thickens to 0.3 of its width: 60% instead of 18%.
+/// Returns the projected area, averaged over all directions, of an ellipsoid with the half axes `scales`. It is a
+/// quarter of the surface (Cauchy), computed by Thomsen's formula, with an error of at most 1.1%. The plain mean of the
+/// three cross sections would overestimate the growth of a flat Gaussian that thickens to 0.3 of its width: 60% instead
+/// of 18%.
 fn mean_area(scales: DVec3) -> f64 {
     let largest = scales.max_element();
     if largest <= 0.0 {
@@ -208,7 +214,7 @@ fn mean_area(scales: DVec3) -> f64 {
     std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
 }
 
-/// Returns the opacity of the proxy by `rule`, clamped so that its logit is finite.
+/// Returns the opacity of the proxy of `members` by the rule `rule`, clamped so that its logit is finite.
 fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
     let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
     let opacity = match rule {
@@ -218,7 +224,7 @@ fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid,
             let opaque_area: f64 =
                 members.iter().map(|&(i, _)| opacity(states, i) * mean_area(scales(states, i))).sum();
             let area = mean_area(proxy.scales);
-            // Underflowed scales have no area to conserve.
+            // A proxy whose scales have underflowed has no area, so the sum of opacities is used.
             if area.is_normal() { opaque_area / area } else { sum() }
         }
     };
@@ -231,7 +237,7 @@ fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHi
         .fold((leader, f64::NEG_INFINITY), |best, &(i, weight)| if weight > best.1 { (i, weight) } else { best })
         .0;
     let average = |plane: &[f32]| {
-        // Averaging differences from the leader keeps equal colors equal to the last bit.
+        // Averaging the differences from the leader keeps equal colors equal to the last bit.
         let base = f64::from(plane[leader as usize]);
         base + members.iter().map(|&(i, weight)| weight * (f64::from(plane[i as usize]) - base)).sum::<f64>()
     };
@@ -253,7 +259,7 @@ mod tests {
         MergeParams { placement, opacity, ..Recipe::preset("default").unwrap().merge }
     }
 
-    /// Returns `n` copies of a Gaussian of SH degree 1.
+    /// Returns `n` copies of one Gaussian of SH degree 1.
     fn copies(n: usize, log_scale: [f32; 3], rotation: [f32; 4]) -> Gaussians {
         let mut states = Gaussians::zeros(n, 1);
         for i in 0..n {

@@ -1,4 +1,4 @@
-//! Tests of whole merge passes.
+//! Tests of merging from beginning to end.
 
 use std::convert::Infallible;
 
@@ -10,12 +10,12 @@ use super::*;
 use crate::model::AttributeValues;
 use crate::recipe::{MergeParams, MotionParams, Recipe};
 
-/// Returns a number in [0, 1) for Gaussian `i`, different for every `salt`.
+/// Returns a pseudorandom number in [0, 1) for Gaussian `i`; different for every `salt`.
 fn uniform(i: usize, salt: u64) -> f64 {
     (xxh3_64_with_seed(&(i as u64).to_le_bytes(), salt) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Survivors with all the data that [`Survivors`] borrows.
+/// Test scene of survivors (Gaussians to be merged), which owns the data that [`Survivors`] borrows.
 struct TestScene {
     states: Gaussians,
     ids: Vec<u32>,
@@ -26,7 +26,7 @@ struct TestScene {
 }
 
 impl TestScene {
-    /// Creates `n` similar Gaussians, evenly distributed in the unit cube.
+    /// Creates a scene of `n` similar Gaussians, evenly distributed in the unit cube.
     fn uniform_cube(n: usize) -> Self {
         let mut states = Gaussians::zeros(n, 1);
         let size = 0.7 * (n.max(1) as f64).powf(-1.0 / 3.0);
@@ -48,7 +48,7 @@ impl TestScene {
         }
     }
 
-    /// Returns the default recipe with an ε of about two Gaussians of this scene.
+    /// Returns the default recipe with a merging radius ε of about twice the distance between Gaussians of this scene.
     fn recipe(&self) -> MergeParams {
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.passes[0].epsilon = 1.2 * (self.states.len() as f64).powf(-1.0 / 3.0);
@@ -60,13 +60,14 @@ impl TestScene {
         self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
-    /// Merges with all Gaussians alive at `frames`, the first of which is the reference frame.
+    /// Merges all Gaussians of this scene. `frames`: positions at each frame, the first of which is the reference
+    /// frame. All Gaussians are alive at all frames.
     fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[AttributeValues]) -> Merged {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
-    /// Merges selected rows like [`TestScene::merge_moving`].
+    /// Merges only the Gaussians in `rows`, with frames as in [`TestScene::merge_moving`].
     fn merge_rows(
         &self,
         rows: &[u32],
@@ -77,8 +78,8 @@ impl TestScene {
         self.merge_in_batches(rows, recipe, limit, frames, usize::MAX).0
     }
 
-    /// Merges like [`TestScene::merge_rows`] with `max_pairs` pairs measured at a time; also returns the number of
-    /// pairs in each call.
+    /// Merges like [`TestScene::merge_rows`] and measures the motion of at most `max_pairs` pairs in one call. Also
+    /// returns the number of pairs in each of these calls.
     fn merge_in_batches(
         &self,
         rows: &[u32],
@@ -108,7 +109,7 @@ impl TestScene {
         Importance { ids: &self.ids, coverage: &self.coverage, visibility: &self.visibility }
     }
 
-    /// Returns the scene with every position and Gaussian rotated, scaled and shifted.
+    /// Returns this scene rotated, scaled and shifted as a whole.
     fn transformed(mut self, rotation: DQuat, scale: f64, shift: DVec3) -> Self {
         for i in 0..self.states.len() {
             let position = DVec3::from(self.states.position.row::<3>(i).map(f64::from));
@@ -127,7 +128,7 @@ fn joins(merged: &Merged) -> usize {
     merged.passes.iter().map(|pass| pass.joins).sum()
 }
 
-/// Returns the group of `row`.
+/// Returns the index of the group that contains the Gaussian `row`.
 fn group_of(groups: &MergeGroups, row: u32) -> usize {
     (0..groups.len()).find(|&group| groups.members(group).contains(&row)).unwrap()
 }
@@ -158,7 +159,7 @@ fn static_neighbors_merge_diverging_ones_do_not() {
     assert!(joins(&still) > 300, "{:?}", still.passes);
     assert_eq!(still.groups.len(), 2000 - joins(&still));
     assert_eq!(still.proxies.len(), still.groups.clusters().count());
-    // Every other Gaussian moves up, the rest down.
+    // Every second Gaussian moves up, the others down.
     let mut later = scene.states.position.clone();
     for (i, y) in later.plane_mut(1).iter_mut().enumerate() {
         *y += if i % 2 == 0 { 0.5 } else { -0.5 };

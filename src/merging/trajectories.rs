@@ -1,17 +1,17 @@
-//! Positions and opacities of selected Gaussians in a scratch file. The order of the Gaussians in the file is chosen so
-//! that those read together are stored together.
+//! Positions and opacities of selected Gaussians at all frames, in a scratch file. The order of the Gaussians in the
+//! file is chosen so that those read together are stored together.
 //!
-//! The source is read once, in blocks of Gaussians in the order of ids and a few frames at a time. A tiled source
-//! decodes each tile once if the tile spans no more frames than that, and files are opened once per block. The scratch
-//! file is read by the calling thread with plain reads: it has no index and leaves no mapped pages, either of which
-//! would grow with the number of frames.
+//! The source is read once, in blocks of Gaussians in the order of ids, and a few frames at a time. A source that
+//! stores tiles (consecutive Gaussians × frames) decodes each tile once if the tile spans no more frames than are read
+//! at a time. Files are opened once per block. The scratch file is read by the calling thread with plain reads: it has
+//! no index and leaves no mapped pages, either of which would grow with the number of frames.
 //!
 //! Layout of the file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block
-//! of F frames (the last may be shorter) the values that vary, `[N, F, W]` with W = 4, 3 or 1, or nothing. All values
-//! are f32 in the byte order of this machine.
+//! of F frames (the last may be shorter) the values that vary with time, `[N, F, W]` with W = 4, 3 or 1, or nothing.
+//! All values are f32 in the byte order of this machine.
 //!
-//! Memory while gathering, per Gaussian: 8 bytes, and the varying ones of 16 bytes for each of F frames; for every
-//! thread two blocks of as many frames.
+//! Memory while gathering: per Gaussian 8 bytes, and for each of F frames those of its 16 bytes that vary; per thread
+//! two blocks of as many frames.
 
 use std::ops::Range;
 use std::path::Path;
@@ -26,34 +26,34 @@ use crate::passes::BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids, ReadPlan};
 
-/// Values that test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
+/// Values of one Gaussian at one frame that test 3 of merging (motion) needs: x, y, z, opacity logit.
 pub(crate) type TrajectorySample = [f32; 4];
 
-/// Attributes of a [`TrajectorySample`].
+/// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum distance in the file between two requested Gaussians that are read together with the ones between them.
+/// Maximum distance in the file between two requested Gaussians that are read in one go, with those between them.
 const GAP: u32 = 32;
-/// Maximum number of Gaussians in one read.
+/// Maximum number of Gaussians that are read in one go.
 const RUN: u32 = 2048;
 
-/// Trajectories in an unnamed file that is deleted when this value is dropped.
+/// Trajectories of Gaussians in an unnamed scratch file, which is deleted when this value is dropped.
 pub(crate) struct Trajectories {
     file: Spill,
     count: usize,
     frames: usize,
-    /// Number of frames in a block.
+    /// Number of consecutive frames that the file stores together.
     block: usize,
-    /// Range of the values of a sample that vary.
+    /// Range of the values in a [`TrajectorySample`] that vary with time.
     varying: Range<usize>,
 }
 
 impl Trajectories {
-    /// Gathers the Gaussians `ids` of `source` (all different) in this order in a file in `folder`. Reads at most
-    /// `frames_together` frames at a time.
+    /// Reads the Gaussians `ids` of `source` (all different) at all frames and stores them in this order in a scratch
+    /// file in `folder`. Reads at most `frames_together` frames at a time.
     ///
     /// # Errors
-    /// Fails if reading `source` or writing the file fails. The file is gone then.
+    /// Fails if `source` cannot be read or the scratch file cannot be written. The file is then deleted.
     pub(crate) fn gather(
         source: &dyn FrameSource,
         ids: &[u32],
@@ -83,13 +83,13 @@ impl Trajectories {
         Ok(Trajectories { file, count: ids.len(), frames, block, varying })
     }
 
-    /// Passes the samples of the Gaussians at `places` (increasing) to `show`, frame after frame; only once if nothing
-    /// varies.
+    /// Calls `show` once per frame with the samples of the Gaussians at `places` (increasing indices into the file);
+    /// only once if no value varies with time.
     ///
-    /// Memory: for every Gaussian its sample, its varying values for the frames of a block, and a bounded buffer.
+    /// Memory: for every Gaussian its sample and its varying values for the frames of a block; also a bounded buffer.
     ///
     /// # Errors
-    /// Fails if reading the file fails.
+    /// Fails if the scratch file cannot be read.
     pub(crate) fn play(&self, places: &[u32], mut show: impl FnMut(&[TrajectorySample])) -> Result<()> {
         if self.frames == 0 {
             return Ok(());
@@ -116,7 +116,8 @@ impl Trajectories {
         Ok(())
     }
 
-    /// Reads rows of `width` numbers at `places` of a table that starts at number `first` of the file.
+    /// Reads the rows `places` of a table into `out`. The table begins `first` numbers after the start of the file and
+    /// has `width` numbers per row.
     fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
         for run in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
@@ -134,13 +135,14 @@ impl Trajectories {
     }
 }
 
-/// Returns the range of the values in a [`TrajectorySample`] that belong to `columns`.
+/// Returns which values of a [`TrajectorySample`] belong to the attributes `columns`.
 fn value_range(columns: Attributes) -> Range<usize> {
     let start = if columns.contains(Attributes::POSITION) { 0 } else { 3 };
     start..if columns.contains(Attributes::OPACITY) { 4 } else { 3 }
 }
 
-/// Reads `frames` of `columns` of the Gaussians (id, place), sorted by id, into `values`: `[N, frames, W]` by place.
+/// Reads the attributes `columns` of Gaussians at `frames` into `values`, with layout `[N, frames, W]` in the order of
+/// place. `places`: pairs (id, place), sorted by id.
 fn read_frames(
     source: &dyn FrameSource,
     places: &[(u32, u32)],
@@ -162,7 +164,8 @@ fn read_frames(
         };
         frames.clone().map(at).collect()
     };
-    // Processing one batch of blocks at a time bounds the memory of states that are not yet copied to `values`.
+    // Only one batch of blocks is processed at a time, which bounds the memory of states that are not yet copied to
+    // `values`.
     for batch in places.chunks(2 * rayon::current_num_threads() * BLOCK) {
         let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
         for (block, states) in batch.chunks(BLOCK).zip(&blocks) {
@@ -186,7 +189,7 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::BlockReader;
 
-    /// A scene that declares fewer attributes as varying and keeps the others as they are at frame 0.
+    /// Scene that declares fewer attributes as varying with time and keeps all others as they are at frame 0.
     struct PartlyStatic(Scene, SequenceInfo);
 
     impl PartlyStatic {
@@ -233,7 +236,7 @@ mod tests {
     fn trajectories_equal_the_source_for_any_block_size() {
         let folder = tempfile::tempdir().unwrap();
         let ids: Vec<u32> = (0..2500).map(|k| (k * 1171 + 5) % 3000).collect();
-        // Neighbors, narrow and wide gaps, both ends.
+        // Places with neighbors, narrow and wide gaps, and both ends of the file.
         let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
         let ids_at_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
         for varying in [NEEDED, Attributes::POSITION, Attributes::OPACITY, Attributes::empty()] {

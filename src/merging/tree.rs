@@ -1,16 +1,16 @@
 //! A k-d tree that stays fast if points coincide, and the list of the nearest points found so far.
 //!
-//! Input: points. Output: the nearest of them, by (distance, index) alone. Memory: 28 bytes per node, two nodes for
-//! every 4 to 8 points, that is 7 to 14 bytes per point.
+//! Input: points. Output: those nearest to a position, ordered by distance, then index. Memory: 28 bytes per node, with
+//! two nodes for every 4 to 8 points, that is 7 to 14 bytes per point.
 //!
-//! Every node stores the smallest index below it, and a subtree is skipped unless it can hold a pair (distance, index)
-//! below the worst one kept. With ten million points at one position all distances are equal, the K smallest indices
-//! are found at once and all other points are skipped; a tree that prunes by distance alone would visit every point for
-//! every query.
+//! Every node stores the smallest index below it. A subtree is skipped unless it can hold a pair (distance, index) that
+//! is smaller than the worst one found so far. With ten million points at one position all distances are equal, so the
+//! K smallest indices are found at once and all other points are skipped; a tree that prunes by distance alone would
+//! visit every point for every query.
 
 /// Maximum number of points in a leaf.
 const MAX_LEAF_POINTS: usize = 8;
-/// Number of points below which a subtree is built by one thread.
+/// Number of points below which one thread builds a subtree alone.
 const MIN_PARALLEL_POINTS: usize = 1 << 14;
 
 /// A point and its index.
@@ -18,14 +18,14 @@ const MIN_PARALLEL_POINTS: usize = 1 << 14;
 pub struct TreePoint {
     /// Position of the point.
     pub at: [f32; 3],
-    /// Index of the point; decides between equal distances.
+    /// Index of the point. Of two points at equal distance, the one with the smaller index counts as nearer.
     pub index: u32,
 }
 
-/// A candidate: squared distance (≥ 0) as bits, which have the same order as the values, then the index.
+/// Candidate for a neighbor: bits of its squared distance (≥ 0, so bits have the order of the values), then its index.
 type NeighborCandidate = (u64, u32);
 
-/// The nearest points found so far around a position, up to the number requested.
+/// List of the nearest points to a position found so far, up to the requested number.
 ///
 /// The list holds up to twice as many unsorted candidates before the farther half is dropped. A heap would move about
 /// log K candidates for each one found.
@@ -39,7 +39,8 @@ pub struct Nearest {
 }
 
 impl Nearest {
-    /// Starts a query for the `wanted` nearest points other than `query` whose distance to `at` is at most `epsilon`.
+    /// Starts a new query: for the `wanted` nearest points to `at`, other than the point with index `query`, within the
+    /// distance `epsilon`.
     ///
     /// Squared distances are summed in f64 and compared with ε².
     pub fn start(&mut self, query: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
@@ -48,7 +49,7 @@ impl Nearest {
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 
-    /// Compares every one of `points` with the candidates kept.
+    /// Adds those of `points` that are nearer than the worst candidate found so far.
     pub fn scan(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
@@ -61,12 +62,12 @@ impl Nearest {
         }
     }
 
-    /// Returns whether a point whose squared distance is at least `bound` can still be among the nearest.
+    /// Returns whether a point could still be among the nearest if its squared distance is `bound` or more.
     pub fn reaches(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
 
-    /// Returns the points found, nearest first, equal distances by index.
+    /// Returns the points found as (bits of the squared distance, index), nearest first, equal distances by index.
     pub fn sorted(&mut self) -> &[(u64, u32)] {
         if self.found.len() > self.wanted {
             self.drop_far();
@@ -88,7 +89,7 @@ struct Node {
     smallest: u32,
 }
 
-/// A perfect binary tree over points: nodes in preorder, all leaves at one depth.
+/// Perfect binary tree over points. Its nodes are in preorder, and all leaves have the same depth.
 #[derive(Debug)]
 pub struct Tree {
     nodes: Vec<Node>,
@@ -96,7 +97,7 @@ pub struct Tree {
 }
 
 impl Tree {
-    /// Builds a tree over `points`, which are reordered.
+    /// Builds a tree over `points` and reorders them in the order of its leaves.
     pub fn new(points: &mut [TreePoint]) -> Self {
         let depth = points.len().div_ceil(MAX_LEAF_POINTS).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
@@ -105,7 +106,8 @@ impl Tree {
         Tree { nodes, depth }
     }
 
-    /// Scans those of `points`, in the order of the tree, that can be among the `nearest`.
+    /// Adds to `nearest` those of `points` that belong there, skipping subtrees that are too far away. `points` must be
+    /// in the order that [`Tree::new`] gave them.
     pub fn search(&self, points: &[TreePoint], nearest: &mut Nearest) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }
@@ -133,8 +135,8 @@ impl Tree {
 }
 
 impl Node {
-    /// Returns a lower bound of (distance, index) below this node. Each step of the sum is monotone in f64, so rounding
-    /// cannot raise the bound above the distance of a point in the box.
+    /// Returns a lower bound of (squared distance to `at`, index) for all points below this node. Each step of the sum
+    /// is monotone in f64, so rounding cannot raise the bound above the distance of a point in the node's box.
     fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)
@@ -145,8 +147,8 @@ fn squared(d: [f64; 3]) -> u64 {
     (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).to_bits()
 }
 
-/// Fills `nodes`, the preorder of a perfect subtree over `points`. Splits at the median of the widest side; equal
-/// coordinates are split by index, so that low indices are found first.
+/// Builds a perfect subtree over `points` into `nodes`, in preorder. Splits the points at the median of the widest side
+/// of their box. Equal coordinates are split by index, so that low indices are found first.
 fn build(points: &mut [TreePoint], nodes: &mut [Node]) {
     let Some((node, below)) = nodes.split_first_mut() else { return };
     for point in points.iter() {

@@ -1,17 +1,17 @@
-//! A grid of voxels: cubes of equal size, in Morton order (G. M. Morton, "A computer oriented geodetic data base",
-//! 1966).
+//! A grid of voxels: cubes of equal size, sorted in Morton order, which keeps neighbors together (G. M. Morton, "A
+//! computer oriented geodetic data base", 1966).
 //!
-//! In that order Gaussians that are close in space are mostly close in the list. A consecutive part of the list and its
-//! ghosts, the Gaussians within one voxel side of it, contain all pairs led from that part. The order affects only the
-//! speed of reading, never a result.
-//! Memory of sorting: 20 bytes per Gaussian beside the output.
+//! Gaussians in this order that are close in space are mostly close in the list. A consecutive part of the list,
+//! together with all Gaussians within one voxel side of it (its ghosts), contains all pairs led from that part. The
+//! order affects only the speed of reading, never a result.
+//! Memory while sorting: 20 bytes per Gaussian beside the output.
 
 use rayon::prelude::*;
 
-/// Maximum number of voxels along an axis: three 21-bit numbers form a 63-bit code.
+/// Maximum number of voxels along an axis. Three voxel numbers of 21 bits form a 63-bit Morton code.
 const MAX_PER_AXIS: u32 = 1 << 21;
 
-/// Grid of voxels around a set of points.
+/// Grid of voxels that covers a set of points.
 #[derive(Debug, Clone, Copy)]
 pub struct Voxels {
     low: [f64; 3],
@@ -20,9 +20,9 @@ pub struct Voxels {
 }
 
 impl Voxels {
-    /// Creates voxels of side `side` that start at the lowest coordinates of `points`, or wider ones if there would be
-    /// more than 2²¹ along an axis. Edge cases: if all points are at one position and the side is zero, there is one
-    /// voxel. Coordinates that are not finite are ignored.
+    /// Creates a grid that starts at the lowest coordinates of `points`, with voxels of side `side`. The voxels are
+    /// wider if there would be more than 2²¹ along an axis. Edge cases: if all points are at one position and the side
+    /// is zero, there is one voxel. Coordinates that are not finite are ignored.
     pub fn around(points: impl Iterator<Item = [f32; 3]>, side: f64) -> Self {
         let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for point in points {
@@ -36,24 +36,24 @@ impl Voxels {
         Voxels { low, side, per_unit: side.recip() }
     }
 
-    /// Returns the side of a voxel in scene units.
+    /// Returns the side length of a voxel, in scene units.
     pub fn side(&self) -> f64 {
         self.side
     }
 
-    /// Returns the position of `at` in units of voxels from the corner where the grid starts.
+    /// Returns the position of `at` relative to the lowest corner of the grid, in voxel sides.
     pub fn place(&self, at: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|c| (f64::from(at[c]) - self.low[c]) * self.per_unit)
     }
 
-    /// Returns the Morton code of the voxel that holds `at`.
+    /// Returns the Morton code of the voxel that contains the position `at`.
     pub fn number(&self, at: [f32; 3]) -> u64 {
         let voxel = voxel_of(self.place(at));
         (0..3).filter_map(|c| along(c, voxel[c])).sum()
     }
 
-    /// Returns `rows` sorted by the Morton code of their voxel; `at` returns the position of a row in scene units; ties
-    /// by row.
+    /// Returns `rows` sorted by the Morton code of their voxel, ties by row. `at` returns the position of a row, in
+    /// scene units.
     pub fn order(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
         let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.number(at(row)), row)).collect();
         keyed.par_sort_unstable();
@@ -61,25 +61,25 @@ impl Voxels {
     }
 }
 
-/// Returns `rows` in the [`Voxels::order`] of voxels of side `side` around themselves.
+/// Returns `rows` sorted as by [`Voxels::order`], in a grid of voxels of side `side` that covers their positions.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
     Voxels::around(rows.iter().map(|&row| at(row)), side).order(rows, at)
 }
 
-/// Returns the voxel at a [place](Voxels::place), by its number along each axis; outside of the grid, the nearest one.
-/// NaN gives the first voxel.
+/// Returns the number along each axis of the voxel at `place`, a result of [`Voxels::place`]. Outside of the grid it is
+/// the nearest voxel; NaN gives the first voxel.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
-    // A saturating cast maps values beyond the range to its ends, and NaN (from 0·∞) to 0.
+    // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
     place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))
 }
 
-/// Returns the part of a voxel's Morton code that belongs to coordinate `number` along `axis`; `None` if there is no
+/// Returns the bits of a Morton code that a voxel gets from its number `number` along `axis`; `None` if the grid has no
 /// such voxel.
 pub fn along(axis: usize, number: u32) -> Option<u64> {
     (number < MAX_PER_AXIS).then(|| spread_bits(number.into()) << axis)
 }
 
-/// Moves bit k of the lowest 21 bits to bit 3k.
+/// Spreads the lowest 21 bits of `x`: bit k moves to bit 3k.
 fn spread_bits(x: u64) -> u64 {
     let x = (x | x << 32) & 0x001f_0000_0000_ffff;
     let x = (x | x << 16) & 0x001f_0000_ff00_00ff;

@@ -1,4 +1,4 @@
-//! Containers (`.gseq`) as a model format.
+//! Containers of frames (`.gseq`) as a model format.
 
 use gseq::{Encoding, Reader, TileId};
 
@@ -9,7 +9,7 @@ use crate::files::container::Container;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::source::FrameSource;
 
-/// Container of frame states (`.gseq`).
+/// Container that stores the state of every Gaussian at every frame (`.gseq`).
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
@@ -50,7 +50,7 @@ impl InputModel for Container {
 
     fn residence(&self) -> MemoryProfile {
         let layout = self.reader().layout();
-        // The tiles of the file determine which Gaussians are decoded together.
+        // The tiles of the file (blocks of Gaussians × frames) determine which Gaussians are decoded together.
         MemoryProfile {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
@@ -79,7 +79,7 @@ impl InputModel for Container {
     }
 }
 
-/// Collects the statistics of every column from the tile index.
+/// Returns size and value range of every column of the container, collected from its tile index.
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
     let layout = reader.layout();
     let mut out = Vec::new();

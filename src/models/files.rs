@@ -1,4 +1,4 @@
-//! Copies of files that an output takes over unchanged.
+//! Copies input files that are part of the output unchanged.
 
 use std::fs::File;
 use std::io;
@@ -7,7 +7,8 @@ use std::path::Path;
 use crate::error::{Error, Result};
 use crate::files::open::open_file;
 
-/// Copies the bytes of a file but not its permissions, so that the output of a read-only model can be replaced.
+/// Copies the content of the file `from` to `to`, but not its permissions, so that the output of a read-only model can
+/// be replaced.
 pub(super) fn copy(from: &Path, to: &Path) -> Result<()> {
     let mut source = open_file(from)?;
     let mut target = File::create(to).map_err(Error::io("create", to))?;

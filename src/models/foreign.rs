@@ -1,6 +1,6 @@
-//! Models that are recognized but not read. Their error says which model it is and how to convert it.
+//! Models that are recognized but cannot be read. Their error names the model and says how to convert it.
 //!
-//! Any renderer can export frames as PLY files or a frame stream, so every message suggests that.
+//! Any renderer can export frames as PLY files or as a frame stream, so every message suggests that.
 
 use std::path::Path;
 
@@ -9,11 +9,11 @@ use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
 use crate::models::input_model::ModelFormat;
 
-/// Advice that works for every renderer.
+/// Advice in every message, since it works for models of any renderer.
 const ADVICE: &str = "export its frames with its own renderer, either as PLY files (one per frame, with the same \
                       Gaussians in the same order) or as a frame stream, and give those";
 
-/// Checkpoint of an unsupported trainer, or a folder of one.
+/// Checkpoint of an unsupported trainer, or a folder that contains one.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => describe_folder(found.path).is_some(),
@@ -32,7 +32,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 const UNKNOWN: &str = "an unsupported checkpoint, such as those of Ex4DGS, Gaussian-Flow, MEGA or OMG4";
 const ROTOR: &str = "a 4D-Rotor model of nerfstudio";
 
-/// Returns the description of an unsupported model folder, recognized by file names that no other format uses.
+/// Returns the description of an unsupported model folder, which is recognized by file names that no other format uses;
+/// `None` for other folders.
 fn describe_folder(folder: &Path) -> Option<&'static str> {
     let has = |name: &str| folder.join(name).exists();
     if has("nerfstudio_models") {
@@ -44,7 +45,7 @@ fn describe_folder(folder: &Path) -> Option<&'static str> {
     None
 }
 
-/// Returns the description of an unsupported checkpoint, recognized by the names in its tree.
+/// Returns the description of the model in an unsupported checkpoint, which is recognized by the names of its tensors.
 ///
 /// # Errors
 /// Fails if the file is not a checkpoint.
@@ -61,7 +62,8 @@ fn describe_checkpoint(path: &Path, memory: ReadLimit) -> crate::error::Result<&
     })
 }
 
-/// Iterates over the tensor names of dictionaries in the root and in its values.
+/// Iterates over the names of tensors in the root of the checkpoint, if it is a dictionary, and in dictionaries
+/// directly below it.
 fn tensor_names(pickle: &Pickle) -> impl Iterator<Item = &str> {
     let root = pickle.root();
     let inner = pickle.items(root).into_iter().flatten().map(|(_, id)| id);

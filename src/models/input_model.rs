@@ -1,4 +1,4 @@
-//! The interface of every model format.
+//! The interface that every model format implements.
 
 use std::path::{Path, PathBuf};
 
@@ -20,30 +20,31 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Open input of some model format.
+/// Opened input in some model format.
 ///
-/// The default methods suit explicit trajectories, whose frame states are stored for every frame. Formats that derive
-/// frames from raw parameters override them.
+/// The default methods suit explicit trajectories, where the state of every Gaussian is stored for every frame. Formats
+/// that compute frames from stored parameters override them.
 pub trait InputModel: Send + Sync {
     /// Returns the name of the model format, shown to users.
     fn kind(&self) -> &'static str;
 
-    /// Returns the source of frame states.
+    /// Returns the source from which the attributes of the Gaussians at each frame are read.
     fn source(&self) -> &dyn FrameSource;
 
-    /// Returns a hash of the bytes read.
+    /// Returns a hash of all bytes of the input that were read.
     ///
     /// # Errors
     /// Fails if a file cannot be read.
     fn digest(&self) -> Result<String>;
 
-    /// Returns the bytes of all files that a renderer opens; for a stream, the bytes received.
+    /// Returns the size in bytes of all files that a renderer opens; for a stream, the number of bytes received.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
     fn bytes(&self) -> Result<u64>;
 
-    /// Returns [`InputModel::bytes`] divided by part.
+    /// Returns the size of the input like [`InputModel::bytes`], divided into Gaussians, deformation field, frames and
+    /// rest.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
@@ -51,8 +52,8 @@ pub trait InputModel: Send + Sync {
         Ok(Size::from_frames(self.bytes()?))
     }
 
-    /// Returns the bytes, by part, that [`InputModel::write`] wrote to `path` as `kind`. No other files may have been
-    /// added yet.
+    /// Returns the size of the output that [`InputModel::write`] wrote to `path` as `kind`, divided into Gaussians,
+    /// deformation field, frames and rest. No other files may have been added to the output yet.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
@@ -61,7 +62,7 @@ pub trait InputModel: Send + Sync {
         Ok(Size::from_frames(bytes_below(path)?))
     }
 
-    /// Returns the bytes of the files that frames are read from.
+    /// Returns the size in bytes of the files that frames are read from.
     ///
     /// # Errors
     /// Fails if a file no longer exists.
@@ -69,29 +70,30 @@ pub trait InputModel: Send + Sync {
         self.bytes()
     }
 
-    /// Returns the memory that the input takes and the costs of reading it.
+    /// Returns the memory that the open input takes and the time and memory that reading it takes.
     fn residence(&self) -> MemoryProfile;
 
-    /// Allows decoded values to stay in memory if [`MemoryProfile::decoded`] is not 0.
+    /// Allows the input to keep decoded values in memory if [`MemoryProfile::decoded`] is not 0.
     fn hold_decoded(&self) {}
 
-    /// Returns how frames get their times.
+    /// Returns where the time stamps of frames come from.
     fn timing(&self) -> Timing;
 
-    /// Returns the unit of camera times if cameras give the times of frames.
+    /// Returns the unit of the camera times, for models whose frame times come from cameras.
     fn clock(&self) -> Clock {
         Clock::Normalized
     }
 
-    /// Returns the duration of the model in its own time unit. Used if no times are given.
+    /// Returns the duration of the model in its own time unit. It is used if no frame times are given.
     fn span(&self) -> f64 {
         1.0
     }
 
-    /// Returns the input with frames at `times`. Inputs with [`Timing::Stamped`] refuse.
+    /// Returns the input with frames at `times`. Inputs whose files store frame times ([`Timing::Stamped`]) refuse.
     ///
     /// # Errors
-    /// Fails if times are not finite or do not increase, or if their number differs from a fixed number of frames.
+    /// Fails if times are not finite or do not increase, or if the input has a fixed number of frames and `times` has
+    /// another.
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
 
     /// Returns notes for the user, such as repairs or guesses made while opening.
@@ -99,12 +101,12 @@ pub trait InputModel: Send + Sync {
         Vec::new()
     }
 
-    /// Returns the folder of the training data if the input names it. The cameras may be found there.
+    /// Returns the folder of the training data, where the cameras may be found, if the input names it.
     fn data_folder(&self) -> Option<&str> {
         None
     }
 
-    /// Returns the number of training frames if the input gives it. The last of them is one step before the end of the
+    /// Returns the number of training frames if the input gives it. The last frame is one step before the end of the
     /// time span.
     fn data_frames(&self) -> Option<usize> {
         None
@@ -115,26 +117,26 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the merge class of a Gaussian. Gaussians of different classes never merge.
+    /// Returns the merge class of Gaussian `id`. Gaussians of different classes are never merged.
     fn class(&self, id: u32) -> u8 {
         let _ = id;
         0
     }
 
-    /// Returns the raw parameters that all frames are computed from, if the format has any.
+    /// Returns the stored parameters of the Gaussians, before any motion, if all frames are computed from them.
     fn canonical(&self) -> Option<&Gaussians> {
         None
     }
 
-    /// Returns a description of each column of a container; empty for other inputs.
+    /// Returns statistics of each column if the input is a container; else an empty list.
     ///
     /// # Errors
-    /// Fails if the index cannot be read.
+    /// Fails if the index of the container cannot be read.
     fn columns(&self) -> Result<Vec<ColumnInfo>> {
         Ok(Vec::new())
     }
 
-    /// Returns the kind of output to write if neither the user nor the output path specifies one.
+    /// Returns the kind of output that is written if neither the user nor the output path specifies one.
     fn own_output(&self) -> OutputKind {
         DEFAULT_OUTPUT
     }
@@ -142,7 +144,7 @@ pub trait InputModel: Send + Sync {
     /// Checks that this input can be written as `kind` to `path`.
     ///
     /// # Errors
-    /// Fails if it cannot; the message lists kinds that work.
+    /// Fails if it cannot be written; the message lists kinds of output that work.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
             OutputKind::Archive if self.archives_as_frames() => Ok(()),
@@ -150,8 +152,9 @@ pub trait InputModel: Send + Sync {
         }
     }
 
-    /// Computes the raw parameters of the proxies of `clusters`, compared at `reference`. The default returns no
-    /// proxies: without raw parameters, a proxy follows from its members in each frame.
+    /// Computes the stored parameters of one proxy (Gaussian that replaces merged ones) per cluster. `reference` is the
+    /// frame at which proxies are compared with their members (the merged Gaussians). By default no parameters are
+    /// computed, and each proxy is computed from its members frame by frame.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -168,12 +171,12 @@ pub trait InputModel: Send + Sync {
         Ok(false)
     }
 
-    /// Returns the reason why SH coefficients of every degree must be kept; `None` if the degree may be lowered.
+    /// Returns the reason why SH coefficients of every degree must be kept; `None` if the SH degree may be lowered.
     fn needs_all_bands(&self) -> Option<&'static str> {
         None
     }
 
-    /// Returns the content of an archive of the compressed model `reduction`.
+    /// Returns everything that an archive (`.gsz`) of the compressed model `reduction` stores.
     ///
     /// # Errors
     /// Fails if the input cannot be archived or its files cannot be read.
@@ -182,8 +185,8 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns the frames that `content` decodes to, at the times of this input. `content` is an archive of this input
-    /// or of a compressed model of it.
+    /// Returns the frames of the model decoded from `content`, at the times of this input. `content` is what an archive
+    /// of this input, or of a compressed model of it, stores.
     ///
     /// # Errors
     /// Fails if `content` belongs to another kind of input.
@@ -192,23 +195,25 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns whether the input already identifies Gaussians across frames and can still be linked anew.
+    /// Returns whether the frames may be linked again, although the input already identifies each Gaussian across
+    /// frames.
     fn may_be_linked(&self) -> bool {
         false
     }
 
-    /// Returns whether the state of every Gaussian is stored for every frame, so that refinement may add a delta that
+    /// Returns whether the state of every Gaussian is stored for every frame. Refinement may then add a delta that
     /// varies in time ([`CompressedModel::course`]).
     fn has_explicit_frames(&self) -> bool {
         false
     }
 
-    /// Returns whether an archive of this input is a lossy container of its frames (`.gseq` within error bounds).
+    /// Returns whether an archive of this input is a lossy container of its frames (`.gseq` with bounded errors), not a
+    /// `.gsz`.
     fn archives_as_frames(&self) -> bool {
         self.has_explicit_frames()
     }
 
-    /// Returns the frames of the compressed model `reduction`, as they will be after writing.
+    /// Returns the frames of the compressed model `reduction` as they will be read from the output.
     ///
     /// # Errors
     /// Fails if the deformation field cannot be evaluated.
@@ -217,7 +222,7 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Writes the compressed model `reduction` to `path`, a new file or an empty folder, and returns notes for the
-    /// user. Write buffers stay within `limits`. Progress is reported to `events`.
+    /// user. Write buffers stay within the memory of `limits`. Progress is reported to `events`.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
@@ -233,50 +238,50 @@ pub trait InputModel: Send + Sync {
     }
 }
 
-/// Source of frame times.
+/// Where the time stamps of frames come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timing {
-    /// Continuous in time: a frame can be at any time.
+    /// The model is continuous in time: a frame can be at any time.
     Continuous,
-    /// Fixed number of frames; their times may come from cameras.
+    /// The number of frames is fixed; their times may come from cameras.
     Numbered,
-    /// Frame times stored in the input.
+    /// The times of the frames are stored in the input.
     Stamped,
 }
 
-/// Memory of an open input and costs of reading it.
+/// Memory that an open input takes, and the time and memory that reading it takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MemoryProfile {
-    /// Bytes per Gaussian that are resident while the input is open.
+    /// Bytes of memory per Gaussian while the input is open.
     pub per_gaussian: u64,
-    /// Additional bytes per Gaussian while the input is being opened.
+    /// Additional bytes of memory per Gaussian while the input is being opened.
     pub opening: u64,
-    /// Bytes per Gaussian of an open reader, in addition to the frames it holds.
+    /// Bytes of memory per Gaussian of an open reader, besides the frames that it keeps in memory.
     pub reader: u64,
-    /// Bytes per Gaussian of a compressed copy from which frames are read.
+    /// Bytes of memory per Gaussian of a copy of the compressed model, from which its frames are read.
     pub reduced: u64,
-    /// Bytes per Gaussian of the Jacobian of frame states with respect to stored parameters; 0 if changes are simply
-    /// added.
+    /// Bytes of memory per Gaussian of the derivative (Jacobian) of frame states with respect to stored parameters; 0
+    /// if states change by as much as stored parameters do.
     pub jacobian: u64,
-    /// Bytes per Gaussian of a memory-mapped file that is read whole.
+    /// Bytes per Gaussian of a memory-mapped file that is read as a whole.
     pub file: u64,
-    /// Bytes that do not depend on the number of Gaussians.
+    /// Bytes of memory that do not depend on the number of Gaussians.
     pub fixed: u64,
-    /// Number of frames that are decoded together, so that a reader may hold several; 0 if each frame is read by
-    /// itself.
+    /// Number of frames that are decoded together, which a reader may keep in memory; 0 if each frame is read alone.
     pub frame_block: u64,
-    /// Number of Gaussians that are decoded together.
+    /// Number of Gaussians that are decoded together, in one block.
     pub gaussian_block: u64,
-    /// Number of columns of a container.
+    /// Number of columns (attributes) of a container.
     pub columns: u64,
-    /// Approximate CPU seconds on one core to read one state (one Gaussian at one frame).
+    /// Approximate CPU seconds on one core to read the state of one Gaussian at one frame.
     pub seconds_per_state: f64,
-    /// Bytes of all decoded values of a container; 0 if nothing is decoded or the values cannot be kept.
+    /// Bytes of memory that all decoded values of a container take; 0 if nothing is decoded or the values cannot be
+    /// kept.
     pub decoded: u64,
 }
 
 impl MemoryProfile {
-    /// Returns the profile of a container whose tiles hold `frame_block` frames.
+    /// Returns the profile of a container whose tiles (the units of decoding) each hold `frame_block` frames.
     pub fn for_tiles(frame_block: u64) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
@@ -289,133 +294,136 @@ impl MemoryProfile {
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: Attributes::all().iter().count() as u64,
-            // Decoding time of tiles that are read whole (`benches/scan.rs`).
+            // Measured decoding time of tiles that are read whole (`benches/scan.rs`).
             seconds_per_state: 5e-8,
             decoded: 0,
         }
     }
 }
 
-/// Statistics of one column of a container.
+/// Size and value range of one column (attribute) of a container.
 #[derive(Debug, Serialize)]
 pub struct ColumnInfo {
-    /// Name of the column.
+    /// Name of the column (attribute).
     pub name: String,
-    /// Number of f32 components per Gaussian.
+    /// Number of f32 components of the column per Gaussian.
     pub width: u32,
-    /// Maximum absolute error against the packed values, in the unit of the column; 0 means exact to the bit.
+    /// Maximum absolute error of decoded values against the values that were packed, in the unit of the column; 0 means
+    /// exact to the bit.
     pub max_error: f64,
-    /// Number of tiles.
+    /// Number of tiles (blocks of Gaussians × frames) of the column.
     pub tiles: usize,
-    /// Number of these tiles that store one frame for all frames.
+    /// Number of these tiles that store one frame, as their values are the same in all frames.
     pub constant_tiles: usize,
-    /// Number of these tiles stored without compression.
+    /// Number of these tiles that are stored without compression.
     pub raw_tiles: usize,
-    /// Stored bytes; shared tiles count once.
+    /// Bytes that the column takes in the file; bytes that several tiles share count once.
     pub stored_bytes: u64,
-    /// Bytes of the same values as one f32 per frame, component and Gaussian.
+    /// Bytes that the column would take with one f32 per frame, component and Gaussian.
     pub raw_bytes: u64,
-    /// Smallest finite value; `None` without finite values.
+    /// Smallest finite value of the column; `None` if it has no finite values.
     pub min: Option<f32>,
-    /// Largest finite value; `None` without finite values.
+    /// Largest finite value of the column; `None` if it has no finite values.
     pub max: Option<f32>,
 }
 
-/// Entry of a model format: how its files are recognized and opened.
+/// A model format: how its files are recognized and opened.
 pub(super) struct ModelFormat {
-    /// Returns whether the input has this format, judged by its content.
+    /// Returns whether the input has this format, judged by the content of its files.
     pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input; without frames if its timing is [`Timing::Continuous`].
+    /// Opens the input. If the model is continuous in time ([`Timing::Continuous`]), it has no frames until frame times
+    /// are set.
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
-/// Path to open and its type.
+/// Path to open, and what was found there.
 pub(super) struct FoundInput<'a> {
     pub(super) path: &'a Path,
     pub(super) is_folder: bool,
-    /// First 16 bytes of a file.
+    /// First 16 bytes of the file, if the path is a file.
     pub(super) head: Vec<u8>,
-    /// Maximum memory for recognizing the format.
+    /// Maximum memory that may be used to recognize the format.
     pub(super) memory: ReadLimit,
 }
 
 impl FoundInput<'_> {
-    /// Returns whether a file looks like one of `torch.save`: a ZIP archive that is not an `.npz` of NumPy.
+    /// Returns whether the file looks as if PyTorch's `torch.save` wrote it: a ZIP archive, but not an `.npz` of NumPy.
     pub(super) fn is_checkpoint(&self) -> bool {
         let is_npz = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
         !self.is_folder && self.head.starts_with(b"PK") && !is_npz
     }
 
-    /// Returns whether a file begins with `magic` or has `extension`. The extension also catches files with damaged
-    /// heads.
+    /// Returns whether the file begins with `magic` or has `extension`. The extension also catches files whose first
+    /// bytes are damaged.
     pub(super) fn is_file_of(&self, magic: &[u8], extension: &str) -> bool {
         let named = || self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension));
         !self.is_folder && (self.head.starts_with(magic) || named())
     }
 }
 
-/// Options of opening an input.
+/// Options for opening an input.
 #[derive(Debug, Clone, Default)]
 pub struct OpenOptions {
-    /// Training iteration of a model folder; `None` selects the largest.
+    /// Number K of the training iteration to open in a model folder; `None` selects the largest.
     pub iteration: Option<u32>,
-    /// Whether a folder of frames may have missing frames.
+    /// Whether frame numbers may be missing in a folder of frames.
     pub allow_gaps: bool,
-    /// Whether frames are linked.
+    /// Whether frames are linked, so that the same Gaussian is found across frames.
     pub link: Link,
-    /// Folder for scratch files (decoded archives, linked frames) while the input is open; `None` selects the temporary
-    /// folder of the system.
+    /// Folder for temporary files (decoded archives, linked frames) while the input is open; `None` selects the
+    /// temporary folder of the system.
     pub scratch: Option<PathBuf>,
-    /// Training conventions that the files do not record.
+    /// Training conventions that the files of the model do not record.
     pub conventions: Conventions,
-    /// Maximum memory for opening the input.
+    /// Maximum memory that may be used to open the input.
     pub memory: ReadLimit,
-    /// Receiver of progress events while opening.
+    /// Receiver of progress events while the input is opened.
     pub events: Events,
 }
 
-/// Training conventions that the files of some formats do not record, and how to treat ambiguous values.
+/// Training conventions that the files of some formats do not record, and how ambiguous values are treated.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Conventions {
-    /// Length of `time_duration`, the period after which colors repeat; `None` uses the guess of the model format and
-    /// adds a note.
+    /// Length of `time_duration` of 4D Gaussian Splatting, the period after which colors repeat, in the model's time
+    /// unit. `None` uses the guess of the model format and adds a note.
     pub time_duration: Option<f64>,
-    /// Whether 4D rotations use the convention before 15 September 2024, without the reversal of axes.
+    /// Whether 4D rotations use the convention from before 15 September 2024, without the reversal of axes.
     pub rot4d_unflipped: bool,
-    /// Treatment of zero quaternions of a `.splatv`; `None` means [`ZeroRotation::Drop`].
+    /// How Gaussians of a `.splatv` with a zero quaternion are treated; `None` means [`ZeroRotation::Drop`].
     pub zero_rotation: Option<ZeroRotation>,
 }
 
-/// Whether frames are linked to identify the same Gaussian across frames.
+/// Whether frames are linked: whether Gaussians of successive frames are matched, to find the same Gaussian in each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Link {
-    /// Links a folder of frames only if their numbers of Gaussians differ or their order does not identify Gaussians.
+    /// Links the frames of a folder only if their numbers of Gaussians differ or the order of Gaussians does not
+    /// identify them.
     #[default]
     Auto,
-    /// Always links, also frames in a common order, containers and streams.
+    /// Always links, even frames with Gaussians in a common order, containers and streams.
     Always,
-    /// Always links, but neither joins tracks that seem to be one Gaussian nor makes nearly constant attributes
-    /// constant.
+    /// Always links, but neither joins tracks (Gaussians followed through frames) that seem to be one Gaussian nor
+    /// makes nearly constant attributes constant.
     Apart,
-    /// Never links: the same index means the same Gaussian.
+    /// Never links: the same index means the same Gaussian in every frame.
     Never,
 }
 
 impl Link {
-    /// Returns whether inputs that already identify Gaussians across frames are linked as well.
+    /// Returns whether inputs that already identify each Gaussian across frames are linked as well.
     pub fn always_links(self) -> bool {
         matches!(self, Link::Always | Link::Apart)
     }
 
-    /// Returns whether tracks of the same Gaussian are joined.
+    /// Returns whether tracks (Gaussians followed through frames) that seem to be one Gaussian are joined.
     pub fn joins(self) -> bool {
         self != Link::Apart
     }
 }
 
 impl OpenOptions {
-    /// Returns the folder for scratch files.
+    /// Returns the folder for temporary files.
     pub(super) fn scratch(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }
@@ -425,7 +433,7 @@ impl OpenOptions {
         PlyOptions { scratch: self.scratch(), memory: self.memory, events: self.events.clone() }
     }
 
-    /// Refuses `--iteration` for an input that is not a model folder.
+    /// Fails if the user gave `--iteration`: the input at `path` is not a model folder.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
             Some(_) => Err(Error::usage(format!("{}: --iteration applies to model folders only", path.shown()))),

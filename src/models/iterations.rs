@@ -1,11 +1,11 @@
-//! Folders `iteration_K` of a model, as written by 3DGS and trainers derived from it.
+//! Subfolders `iteration_K` of a model, as 3DGS and trainers derived from it write them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 
-/// Returns the number K of each folder `iteration_K` in `within`, in increasing order.
+/// Returns the number K of each subfolder `iteration_K` of `within`, in increasing order.
 ///
 /// # Errors
 /// Fails if the folder cannot be listed.
@@ -21,10 +21,10 @@ pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     Ok(found)
 }
 
-/// Returns K and the path of the folder `iteration_K` in `within`: the requested K, or the largest.
+/// Returns K and the path of one subfolder `iteration_K` of `within`: of the iteration `asked`, or of the largest.
 ///
 /// # Errors
-/// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists those that do.
+/// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists the existing ones.
 pub(super) fn find_iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
     let found = iteration_numbers(within)?;
     let chosen = asked.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));

@@ -1,7 +1,7 @@
-//! Model formats: recognizes, opens, evaluates and writes back the output of each supported trainer.
+//! Model formats: each recognizes, opens, evaluates and writes the models of one trainer.
 //!
-//! A model format is one module here and one line of `MODEL_FORMATS`. Code outside its module never asks which format
-//! an input has.
+//! A model format is one module in this folder and one line of `MODEL_FORMATS`. Code outside its module never asks
+//! which format an input has.
 
 pub mod archive;
 mod container;
@@ -62,16 +62,16 @@ const MODEL_FORMATS: [ModelFormat; 14] = [
 
 /// Returns the background color that a model was trained with. `cameras` is the model folder or a file in it.
 ///
-/// The result is white if `cfg_args` in that folder says so, as 3DGS and trainers derived from it write it. Returns
-/// `None` if it does not say so or cannot be read.
+/// The color is white if `cfg_args` in that folder says so, as 3DGS and trainers derived from it write it. Returns
+/// `None` if `cfg_args` does not say so or cannot be read.
 pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
     let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
     let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;
     arguments.get("white_background").bool(false).ok()?.then_some([1.0; 3])
 }
 
-/// Opens the model, frames or container at `path`, recognized by its content. Formats that are continuous in time have
-/// no frames until [`InputModel::with_times`] is called.
+/// Opens the model, frames or container at `path`, whose format is recognized by its content. Models that are
+/// continuous in time have no frames until [`InputModel::with_times`] is called.
 ///
 /// # Errors
 /// Fails if the path does not exist, has no known format, or holds a damaged file.
@@ -93,13 +93,13 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     }
 }
 
-/// Refuses a folder inside a model folder. The error names the model folder.
+/// Fails if `path` is a folder inside a model folder; the error names the model folder.
 fn refuse_inside_a_model(path: &Path) -> Result<()> {
     // A path such as `.` has no file name, so resolve it first.
     let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
     let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
     let is_point_cloud_folder = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
-    // A PLY without deformation in such a folder is a model by itself.
+    // A PLY file in such a folder is a model by itself unless the Gaussians are deformed.
     let is_deformed_model = |folder: &Path| {
         folder.join("deformation.pth").exists()
             || spacetime_gaussians::has_marker_property(&folder.join("point_cloud.ply"))

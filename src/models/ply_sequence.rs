@@ -1,5 +1,5 @@
-//! Frames in PLY files: a folder with one file per frame, or a single file. Frames that do not identify Gaussians
-//! across frames are [linked](super::linked).
+//! Frames in PLY files: a folder with one file per frame, or a single file. If the files do not tell which Gaussian is
+//! which in other frames, the frames are [linked](super::linked).
 //!
 //! Output files keep the properties, comments and names of the input files.
 
@@ -29,7 +29,7 @@ use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, identity};
 
-/// Folder with one PLY per frame.
+/// Folder with one PLY file per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
@@ -45,13 +45,13 @@ fn has_ply(folder: &Path) -> bool {
         .map_or(true, |mut entries| entries.any(|entry| entry.map_or(true, |entry| is_ply(&entry.path()))))
 }
 
-/// Single PLY file.
+/// Single PLY file, read as one frame.
 pub(super) const FILE: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 
-/// Opens frames unchanged if the same index means the same Gaussian in all of them, else links them.
+/// Opens `frames` as they are if the same index means the same Gaussian in all of them; else links the frames.
 fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
@@ -69,21 +69,21 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     }
 }
 
-/// Maximum number of pairs of frames whose order is measured.
+/// Maximum number of pairs of neighboring frames that are compared to find whether their Gaussians have a common order.
 const MAX_MEASURED_PAIRS: usize = 5;
 
-/// Whether the order of Gaussians in frames identifies them.
+/// Whether the same index means the same Gaussian in every frame.
 enum FrameOrder {
-    /// Order trusted without measurement.
+    /// Assumed without measurement: the same index means the same Gaussian.
     Assumed,
-    /// Order that identifies Gaussians; the note gives the measured differences.
+    /// Measured: the same index means the same Gaussian. The note for the user gives the measured differences.
     Confirmed(String),
-    /// Order that does not identify Gaussians, with the reason.
+    /// The same index does not mean the same Gaussian, for the reason given.
     Lost(String),
 }
 
-/// Measures whether the index identifies Gaussians. It does if it holds in at least half of up to five evenly spread
-/// pairs of neighboring frames.
+/// Measures whether the same index means the same Gaussian in every frame. At most five evenly spread pairs of
+/// neighboring frames are compared; the index must identify Gaussians in at least half of them.
 ///
 /// Frames with different numbers of Gaussians have no common order.
 fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
@@ -158,7 +158,7 @@ impl InputModel for PlySequence {
             reader: 4,
             reduced: 0,
             jacobian: 0,
-            // Normals and other extra properties are stored beside the attributes.
+            // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             file: state_bytes(self.info().sh_degree, Attributes::all()) + 24,
             fixed: 0,
             frame_block: 0,
@@ -215,7 +215,7 @@ impl InputModel for PlySequence {
     }
 }
 
-/// Writes the file of every frame again with its original properties, comments and name.
+/// Writes the frames of the compressed model to PLY files with the properties, comments and names of the input files.
 fn write_files(
     sequence: &PlySequence,
     reduction: &CompressedModel,
@@ -239,7 +239,7 @@ fn write_files(
         progress.advance(1);
         Ok(())
     };
-    // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
+    // Frames are written in batches: while a thread waits for proxies, it would otherwise begin another frame.
     let all: Vec<usize> = (0..sequence.paths().len()).collect();
     all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
 }

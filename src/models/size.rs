@@ -1,4 +1,4 @@
-//! Size of a model on disk, by part.
+//! Size of a model on disk, divided into parts.
 
 use std::fs;
 use std::path::Path;
@@ -8,16 +8,17 @@ use serde::{Deserialize, Serialize};
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
-/// Bytes of all files that a renderer opens of a model, by part. Files that only training reads are not counted.
+/// Size in bytes of all files of a model that a renderer opens, divided into parts. Files that only training reads are
+/// not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Size {
     /// Bytes of the canonical Gaussians.
     pub cloud: u64,
     /// Bytes of the deformation field.
     pub field: u64,
-    /// Bytes of states stored frame by frame.
+    /// Bytes of the states of Gaussians that are stored frame by frame.
     pub frames: u64,
-    /// Bytes of everything else.
+    /// Bytes of everything else, such as the configuration.
     pub rest: u64,
 }
 
@@ -28,29 +29,29 @@ impl From<ArchiveSize> for Size {
 }
 
 impl Size {
-    /// Returns the size of a model that consists of `frames` bytes of frame states only.
+    /// Returns the size of a model that consists only of stored frames, which take `frames` bytes.
     pub fn from_frames(frames: u64) -> Size {
         Size { frames, ..Size::default() }
     }
 
-    /// Returns the sum of all parts, bytes.
+    /// Returns the size of the whole model in bytes.
     pub fn whole(&self) -> u64 {
         self.cloud + self.field + self.frames + self.rest
     }
 
-    /// Returns each part with its name.
+    /// Returns the name and the size in bytes of each part.
     pub fn named(&self) -> [(&'static str, u64); 4] {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
-    /// Formats the parts that are not 0 for messages: `cloud 248, field 1000`.
+    /// Formats the parts that are not 0 for messages, in bytes: `cloud 248, field 1000`.
     pub fn parts(&self) -> String {
         let parts = self.named().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// Formats the parts relative to the parts of `before` for messages: `cloud 248 of 2480 (10.0%)`. A part that
-    /// exists on one side only is compared with `none`.
+    /// Formats the size of each part next to the same part of `before` for messages: `cloud 248 of 2480 (10.0%)`. A
+    /// part that only one of the two models has is compared with `none`.
     pub fn format_relative_to(&self, before: &Size) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
@@ -61,8 +62,8 @@ impl Size {
         self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
 
-    /// Returns a message that explains why this output of an input of size `before` is larger; `None` if it is not
-    /// larger.
+    /// Returns a message that explains why this size of an output is larger than the size `before` of the input; `None`
+    /// if it is not larger.
     pub fn why_larger_than(&self, before: &Size) -> Option<String> {
         let (after, whole) = (self.whole(), before.whole());
         let why = match (self.frames > 0, before.frames > 0) {
@@ -76,17 +77,17 @@ impl Size {
     }
 }
 
-/// Formats bytes as `{after} of {before}` with a percentage.
+/// Formats two numbers of bytes as `{after} of {before}` with a percentage.
 pub fn compared(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }
 
-/// Returns the sum of the sizes of files, bytes. Fails if one cannot be read.
+/// Returns the sum of the sizes of the files `paths` in bytes. Fails if the size of a file cannot be read.
 pub(super) fn bytes_read_for<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
     paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }
 
-/// Returns the bytes of a file, or of all files below a folder.
+/// Returns the size in bytes of a file, or of all files below a folder.
 pub(super) fn bytes_below(path: &Path) -> Result<u64> {
     let found = fs::metadata(path).map_err(Error::io("read", path))?;
     if !found.is_dir() {

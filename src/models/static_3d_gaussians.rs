@@ -1,7 +1,7 @@
 //! Model folders of 3D Gaussian Splatting: Gaussians without a deformation field.
 //!
-//! Input: `<root>/point_cloud/iteration_K/point_cloud.ply` with the largest K unless one is chosen. Output: a folder of
-//! the same layout with fewer rows, `cfg_args` and `cameras.json`.
+//! Input: `<root>/point_cloud/iteration_K/point_cloud.ply` of the requested iteration K, or of the largest. Output: a
+//! folder of the same layout with fewer Gaussians, and copies of `cfg_args` and `cameras.json`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,9 +20,9 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Name of the folder of iterations.
+/// Name of the folder that holds the folders `iteration_K`.
 const POINT_CLOUD_FOLDER: &str = "point_cloud";
-/// Name of the point cloud file in an iteration folder.
+/// Name of the point cloud file in a folder `iteration_K`.
 const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
 /// Model folder with a point cloud file and no deformation field.
@@ -37,16 +37,17 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Ok(Box::new(StaticModel::open(path, options)?)),
 };
 
-/// Returns whether a model folder says that its Gaussians are deformed, even if the deformation file is missing.
+/// Returns whether `cfg_args` or a file of the model folder shows that its Gaussians are deformed, even if the
+/// deformation file is missing.
 fn has_deformation(root: &Path) -> bool {
     let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
     root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
 }
 
-/// Files of the model folder that are copied to the output.
+/// Files of the model folder that are copied to the output if they exist.
 const COPIED_FILES: [&str; 2] = ["cfg_args", "cameras.json"];
 
-/// Open model folder of 3DGS.
+/// Opened model folder of 3DGS.
 struct StaticModel {
     root: PathBuf,
     iteration: u32,
@@ -54,7 +55,7 @@ struct StaticModel {
 }
 
 impl StaticModel {
-    /// Opens the requested iteration of the model folder `root`, or the largest.
+    /// Opens the model folder `root` at the requested training iteration, or at the largest.
     fn open(root: &Path, options: &OpenOptions) -> Result<StaticModel> {
         let (iteration, folder) = find_iteration(&root.join(POINT_CLOUD_FOLDER), options.iteration)?;
         Ok(StaticModel {
@@ -64,12 +65,12 @@ impl StaticModel {
         })
     }
 
-    /// Returns the paths of existing files that are copied to the output.
+    /// Returns the paths of those of [`COPIED_FILES`] that exist in the model folder.
     fn copied_files(&self) -> impl Iterator<Item = PathBuf> {
         COPIED_FILES.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }
 
-    /// Returns the path of the point cloud file in a model folder `root`.
+    /// Returns the path of the point cloud file in the model folder `root`.
     fn cloud_path(&self, root: &Path) -> PathBuf {
         root.join(POINT_CLOUD_FOLDER).join(format!("iteration_{}", self.iteration)).join(POINT_CLOUD_FILE)
     }

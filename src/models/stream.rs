@@ -1,9 +1,9 @@
-//! Frame stream (format/STREAM.md) as a model format: packed into a container as it arrives, then read from that
-//! container.
+//! Frame stream (format/STREAM.md) as a model format: the frames are packed into a temporary container as they arrive,
+//! then read from that container.
 //!
-//! Memory, with N Gaussians, b bytes of varying columns per Gaussian, and F frames per block: N·b·F for held frames, at
-//! most 64 MiB or one frame; two more frames in transit; the constant columns; 24 bytes per received frame. A thread
-//! reads ahead while earlier frames are encoded.
+//! Memory, with N Gaussians, b bytes of time-varying attributes per Gaussian, and F frames per block: N·b·F for the
+//! frames of a block, at most 64 MiB or one frame; two more frames in transit; the constant attributes; 24 bytes per
+//! received frame. A thread reads ahead while earlier frames are encoded.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -24,25 +24,27 @@ use crate::passes::HeldFrames;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Maximum bytes of frames that are held together; at least one frame is held.
+/// Maximum bytes of received frames that are kept in memory together; at least one frame is kept.
 const HELD_BYTES: u64 = 64 << 20;
-/// Maximum number of frames in transit from the reading thread.
+/// Maximum number of frames that the reading thread has read ahead and that are not yet packed.
 pub const PREFETCH_FRAMES: usize = 2;
-/// Compression of the scratch container. Equals that of `pack`, so that the digest of the input is the same.
+/// Compression of the temporary container. Equals that of the command `pack`, so that the digest of the input is the
+/// same.
 const COMPRESSION: Compression = Compression::Zstd(1);
 
-/// Received frame stream.
+/// Frame stream that was received completely.
 pub struct ReceivedStream {
-    /// Container of the received frames.
+    /// Temporary container of the received frames.
     container: Container,
-    /// Number of bytes received.
+    /// Number of bytes received from the stream.
     received: u64,
-    /// Owner of the container's file, which is deleted when the stream is dropped.
+    /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
 }
 
 impl ReceivedStream {
-    /// Packs a stream into a scratch file in `folder`. Calls `take` with the frames of each frame block, in order.
+    /// Receives a stream and packs it into a temporary file in `folder`. Calls `take` with the frames of each block of
+    /// consecutive frames, in order.
     ///
     /// # Errors
     /// Fails if the stream is damaged or a write fails.
@@ -105,8 +107,8 @@ impl InputModel for ReceivedStream {
     }
 }
 
-/// Writes a stream to the container `path` and returns the number of bytes received. Calls `take` with the frames of
-/// each frame block, in order.
+/// Receives a stream, writes its frames to the container `path` and returns the number of bytes received. Calls `take`
+/// with the frames of each block of consecutive frames, in order.
 pub fn pack_stream(
     mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,
@@ -125,14 +127,14 @@ pub fn pack_stream(
         Ok(held.drain().collect())
     };
 
-    // A fixed set of buffers circulates: empty ones go to the reader, filled ones to the packer.
+    // A fixed set of frame buffers circulates: empty ones go to the reading thread, filled ones to the packer.
     let (to_fill, empty) = bounded(block + PREFETCH_FRAMES);
     for _ in 0..block + PREFETCH_FRAMES {
         let _ = to_fill.send(Gaussians::zeros(0, sh_degree));
     }
     let (filled, arrived) = bounded(PREFETCH_FRAMES);
-    // The thread is not joined on failure: it may be waiting for a program that writes no more. It ends at its next
-    // frame.
+    // On failure the reading thread is not joined: it may be waiting for a program that writes no more. It ends at its
+    // next frame.
     let reader = thread::spawn(move || {
         while let Ok(mut state) = empty.recv() {
             let frame = stream.next_frame(&mut state).map(|time| time.map(|time| (time, state)));
@@ -160,8 +162,8 @@ pub fn pack_stream(
     reader.join().map_err(|_| Error::internal("the thread that reads standard input failed"))
 }
 
-/// Returns the number of frames per tile of the container: as many as fit [`HELD_BYTES`], between 1 and
-/// [`FRAME_BLOCK`]. Depends on the header only, so that the bytes of the container do too.
+/// Returns the number of frames per tile of the container: as many as fit into [`HELD_BYTES`], between 1 and
+/// [`FRAME_BLOCK`]. It depends only on the header of the stream, so that the bytes of the container do too.
 pub fn frame_block(header: &StreamHeader) -> usize {
     (HELD_BYTES / header.frame_bytes().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
 }

@@ -1,5 +1,6 @@
-//! Functions shared by formats of explicit trajectories. The state of each Gaussian is stored for every frame, so a
-//! proxy is the moment match of its members in each frame and no parameters have to be solved for.
+//! Functions shared by formats of explicit trajectories, where the state of each Gaussian is stored for every frame. A
+//! proxy (Gaussian that replaces merged ones) is computed from its members in each frame (moment match), so it needs no
+//! parameters of its own.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -22,28 +23,29 @@ use crate::passes::{HeldFrames, States, WithDelta, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// zstd level of output containers. Higher levels gain about 1% on trained models.
+/// zstd compression level of output containers. Higher levels save about 1% of the bytes of trained models.
 const ZSTD_LEVEL: i32 = 1;
 
-/// Default kind of output of explicit trajectories.
+/// Kind of output that is written for explicit trajectories if the user chooses none.
 pub const DEFAULT_OUTPUT: OutputKind = OutputKind::PlySequence;
 
-/// Message for inputs that cannot be written as an archive.
+/// Error message for inputs that cannot be written as an archive.
 pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
                                      archive\n  write a .gseq instead, or pack the input into a .gseq first";
 
-/// Returns the bytes of the `columns` of one Gaussian at one frame.
+/// Returns the bytes that the attributes `columns` of one Gaussian at one frame take as f32.
 pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
-/// Returns the frames of `source` with Gaussians removed and merged as `reduction` says.
+/// Returns the frames of `source` after Gaussians have been removed and merged as `reduction` says.
 pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
     let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
     MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
 }
 
-/// Returns the frames of `source` with Gaussians removed and merged, parameter deltas added and the SH degree lowered.
+/// Returns the frames of the compressed model: Gaussians of `source` removed and merged, parameter deltas added and the
+/// SH degree lowered, as `reduction` says.
 pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a CompressedModel,
@@ -52,7 +54,7 @@ pub(super) fn reduced_trajectories<'a>(
     Box::new(WithDelta::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
-/// Checks that a sequence of `frames` frames can be written as `kind`.
+/// Checks that a sequence of `frames` frames can be written as the kind of output `kind` to `path`.
 pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
     match kind {
         OutputKind::Model => Err(Error::usage(
@@ -67,7 +69,8 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
-/// Writes the compressed model of `source` as `kind` to `path` and returns notes for the user.
+/// Writes the compressed model `reduction` of `source` as the kind of output `kind` to `path`; returns notes for the
+/// user.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
@@ -83,8 +86,9 @@ pub(super) fn write_trajectories(
     write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held, events)
 }
 
-/// Writes a container with proxies, whose members can be anywhere in the source. Works by frame block and by groups of
-/// Gaussians made of about `max_gaussians` source Gaussians.
+/// Writes a container of a compressed model with proxies. The members of a proxy can be anywhere in the source, so
+/// frame blocks are processed one by one, and within each the output Gaussians in groups that need about
+/// `max_gaussians` source Gaussians.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
@@ -116,7 +120,7 @@ fn write_merged(
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.change.pick(&places);
-            // Models with proxies have no trajectory delta.
+            // Compressed models with proxies have no delta that varies in time.
             let course = TrajectoryDelta::default();
             let held = WithDelta::new(Box::new(held), &change, &course, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
@@ -125,8 +129,8 @@ fn write_merged(
     writer.finish()
 }
 
-/// Divides the Gaussians of `merged` into ranges of whole blocks. Each range is made of at most `max_gaussians` Gaussians of the
-/// source, or is a single block.
+/// Divides the Gaussians of `merged` into ranges of whole blocks. The Gaussians of a range are made of at most
+/// `max_gaussians` source Gaussians, or the range is a single block.
 fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<usize>> {
     let count = merged.info().count;
     let (mut parts, mut start, mut source_gaussians) = (Vec::new(), 0, 0);
@@ -143,8 +147,8 @@ fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<
     parts
 }
 
-/// Writes every frame of `source` as a kind of output that consists of frames, and returns notes for the user. Readers
-/// of whole frames keep at most `held` of the frames that are decoded together.
+/// Writes the frames of `source` to `path` as `kind`, a kind of output for explicit frames, and returns notes for the
+/// user. A reader of whole frames keeps at most `held` of the frames that are decoded together in memory.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.

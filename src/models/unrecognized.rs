@@ -1,4 +1,5 @@
-//! Error for a path that no model format recognizes: the closest layout with its missing file, and the list of all layouts.
+//! Error for a path that no model format recognizes: names the most similar known layout and its missing file, or lists
+//! all layouts.
 
 use std::fs;
 use std::path::Path;
@@ -6,13 +7,14 @@ use std::path::Path;
 use crate::error::{Error, ShowPath};
 use crate::files::names::shown_name;
 
-/// Files by which a folder of a layout is recognized, relative to it. `iteration_N` stands for any such folder.
+/// Layout of a kind of model folder: paths, relative to the folder, of the files by which it is recognized.
+/// `iteration_N` stands for a folder with any number.
 struct FolderLayout {
     name: &'static str,
     files: &'static [&'static str],
 }
 
-/// Layouts of folders, the more specific ones first.
+/// Known layouts of model folders, the more specific ones first.
 const LAYOUTS: [FolderLayout; 6] = [
     FolderLayout {
         name: "4DGaussians model",
@@ -31,11 +33,12 @@ const LAYOUTS: [FolderLayout; 6] = [
     FolderLayout { name: "PLY frames", files: &["one .ply per frame, such as frame_00000.ply"] },
 ];
 
-/// Files that a data set for training has, and a model has not.
+/// Names of files that belong to a data set for training and not to a model.
 const DATA: [&str; 6] =
     ["transforms_train.json", "transforms.json", "poses_bounds.npy", "sparse", "dataset.json", "images"];
 
-/// Returns the error for a folder that is no input: what it looks like and what is missing, or all layouts.
+/// Returns the error for a folder that is no input: says what the folder looks like and what is missing, or lists all
+/// layouts.
 pub(super) fn unrecognized_folder(path: &Path) -> Error {
     let entries = names(path);
     let found = match entries.len() {
@@ -71,12 +74,12 @@ pub(super) fn unrecognized_folder(path: &Path) -> Error {
     error(found).hint(layouts())
 }
 
-/// Returns the error for a file that is no input.
+/// Returns the error for the file at `path`, which is no input.
 pub(super) fn unrecognized_file(path: &Path) -> Error {
     Error::input(path, "", "a model or frames in a file", "a file of none of the known formats").hint(layouts())
 }
 
-/// Returns a line for each input that can be read.
+/// Returns a text with one line for each kind of input that can be read.
 fn layouts() -> String {
     let folders = LAYOUTS.iter().map(|layout| format!("{}: a folder with {}", layout.name, layout.files.join(", ")));
     let files = "files: .gseq, .gsz, .splatv, .ply, params.npz, a checkpoint (.pth, .pt)".to_owned();
@@ -84,7 +87,7 @@ fn layouts() -> String {
     format!("inputs that can be read:\n    {}", lines.join("\n    "))
 }
 
-/// Returns whether `folder` holds `file`, a pattern of [`FolderLayout::files`].
+/// Returns whether `folder` contains `file`, which is a pattern of [`FolderLayout::files`].
 fn has(folder: &Path, file: &str) -> bool {
     let Some((head, rest)) = file.split_once('/') else {
         return match file {
@@ -101,7 +104,7 @@ fn has(folder: &Path, file: &str) -> bool {
     }
 }
 
-/// Returns the names of at most 1,000 entries of `folder`, sorted; none if it cannot be read.
+/// Returns the sorted names of at most 1,000 entries of `folder`; an empty list if it cannot be read.
 fn names(folder: &Path) -> Vec<String> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten().take(1000);
     let mut names: Vec<String> = entries.map(|entry| shown_name(&entry.path())).collect();
@@ -113,7 +116,7 @@ fn names(folder: &Path) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// Makes empty files in a new folder and returns the error for it.
+    /// Creates empty files in a new folder and returns the error message for this folder.
     fn message(files: &[&str]) -> String {
         let folder = tempfile::tempdir().unwrap();
         for file in files {

@@ -1,4 +1,4 @@
-//! Error bounds of the values in a container, per attribute.
+//! Maximum errors of the values in a container, one for each attribute.
 
 use std::str::FromStr;
 
@@ -7,27 +7,29 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result, quoted};
 use crate::model::Attributes;
 
-/// Maximum error of each attribute in its unit, in the order of [`Attributes::all`]; 0 keeps every bit.
+/// Maximum error of each attribute in its own unit, in the order of [`Attributes::all`]. 0 stores the attribute without
+/// loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Bounds([f64; 5]);
 
-/// Error bound of one attribute: `position=1e-3`, in the attribute's unit, or `position=0.01%` of the scene extent.
+/// Requested maximum error of one attribute: `position=1e-3` in the attribute's unit, or `position=0.01%` of the scene
+/// extent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaxError {
     column: Attributes,
     bound: f64,
-    /// Whether the bound is a multiple of the scene extent.
+    /// Whether the maximum error is a fraction of the scene extent.
     is_relative: bool,
 }
 
 impl Bounds {
-    /// Creates the bounds of all attributes, in the order of [`Attributes::all`].
+    /// Creates error bounds from the maximum errors of all attributes, in the order of [`Attributes::all`].
     pub fn new(bounds: [f64; 5]) -> Bounds {
         Bounds(bounds)
     }
 
-    /// Creates the bounds `requested`; `extent` returns the scene extent and is called only if a bound is relative to
-    /// it.
+    /// Creates error bounds from the maximum errors that the user requests. `extent` returns the scene extent in scene
+    /// units; it is called only if a maximum error is relative to the extent.
     ///
     /// # Errors
     /// Fails if an attribute is named twice, or if `extent` fails.
@@ -43,7 +45,7 @@ impl Bounds {
         Ok(bounds)
     }
 
-    /// Returns the bound of one attribute.
+    /// Returns the maximum error of the attribute `column`; 0 if it is stored without loss.
     pub fn column(&self, column: Attributes) -> f64 {
         self.0[column.bits().trailing_zeros() as usize]
     }

@@ -1,8 +1,9 @@
-//! Writes any sequence to a container: frame block by frame block, tile by tile.
+//! Writes any sequence to a container, one frame block (consecutive frames) after the other. A tile has the values of
+//! one attribute of one block of Gaussians in one frame block.
 //!
-//! Memory: for every thread one tile of every column ([`GAUSSIAN_BLOCK`] × frames of a block values of each of its
-//! components), and as much again while it is encoded (four times the tile for a column with an error bound); 80 bytes
-//! per column and block of Gaussians, 16 per frame.
+//! Memory per thread: one tile of every column ([`GAUSSIAN_BLOCK`] × frames of a block values of each of its
+//! components), and as much again while it is encoded (four times the tile for a column with an error bound). Also 80
+//! bytes per column and block of Gaussians, and 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -17,15 +18,16 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{FrameSource, Ids};
 
-/// Number of Gaussians per tile, which one task of a scan reads. Fixed, so that the bytes depend on nothing but the
-/// content.
+/// Number of Gaussians per tile, which one task of a scan reads. It is constant, so that the bytes of a container
+/// depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Number of frames per tile, except for streams with large frames.
+/// Number of frames per tile without error bounds, except for streams with large frames.
 pub const FRAME_BLOCK: usize = 32;
-/// Number of frames per tile with error bounds, where the first frame takes as much space as all others together.
+/// Number of frames per tile with error bounds. More frames pay then, because the first frame of a tile takes as much
+/// space as all others together.
 pub const BOUNDED_FRAME_BLOCK: usize = 64;
 
-/// Encoding of the values in a container.
+/// Encoding of the values in a container: compression and maximum errors.
 #[derive(Debug, Clone, Copy)]
 pub struct Packing {
     compression: Compression,
@@ -33,35 +35,35 @@ pub struct Packing {
 }
 
 impl From<Compression> for Packing {
-    /// Returns the lossless encoding with `compression`.
+    /// Creates the lossless encoding that uses `compression`.
     fn from(compression: Compression) -> Packing {
         Packing { compression, bounds: Bounds::default() }
     }
 }
 
 impl Packing {
-    /// Returns the encoding with errors within `bounds`, compressed by zstd at `level`.
+    /// Creates the encoding with errors of at most `bounds`, compressed by zstd at `level`.
     pub fn within(bounds: Bounds, level: i32) -> Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
-    /// Returns the number of frames per tile.
+    /// Returns the number of frames per tile: more if there are error bounds.
     pub fn frame_block(&self) -> usize {
         if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }
 
-    /// Returns the number of frame blocks of `source`.
+    /// Returns the number of frame blocks (ranges of consecutive frames, as many as a tile has) that `source` needs.
     pub fn frame_blocks(&self, source: &dyn FrameSource) -> usize {
         source.info().times.len().div_ceil(self.frame_block())
     }
 
-    /// Returns the frames of frame block `block`.
+    /// Returns the frames of `source` that are in frame block number `block`.
     pub fn frames(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
         let start = block * self.frame_block();
         start..source.info().times.len().min(start + self.frame_block())
     }
 
-    /// Returns the cache key of this encoding; the values are not included.
+    /// Returns the cache key of this encoding. The values to be encoded are not part of it.
     pub fn key(&self) -> CacheKey {
         let column_key = |column| match self.column(column) {
             Compression::Raw => (0, 0.0, 0),
@@ -72,7 +74,7 @@ impl Packing {
         CacheKey::new(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
-    /// Returns the encoding of one attribute.
+    /// Returns the compression of the attribute `column`.
     fn column(&self, column: Attributes) -> Compression {
         match (self.compression, self.bounds.column(column)) {
             (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
@@ -81,8 +83,8 @@ impl Packing {
     }
 }
 
-/// Writes `source` to the container `path`, which appears complete or not at all. `advance` is called with the number
-/// of Gaussian states encoded since the last call.
+/// Writes all frames of `source` to the container `path`. The file appears only when it is complete. Calls `advance`
+/// with the number of Gaussian states (Gaussians × frames) encoded since the last call.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -98,8 +100,9 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes the frame blocks `blocks` of `source` and writes them to `to`, for [`join_container`]: one record per tile,
-/// in order. An empty record repeats the tile of the block before.
+/// Encodes the frame blocks `blocks` of `source` and writes them to the scratch file `to`, from which
+/// [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the tile equals the
+/// one in the frame block before.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -119,8 +122,8 @@ pub fn spill_blocks(
     Ok(())
 }
 
-/// Writes the container that [`write_container`] would write from the frame blocks that [`spill_blocks`] encoded.
-/// `spills` must hold all frame blocks, in order. Memory: a tile, and the index of the container.
+/// Writes the container `path` from frame blocks that [`spill_blocks`] encoded. The file is the same as that of
+/// [`write_container`]. `spills` must have all frame blocks, in order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
 /// Fails if a spill cannot be read back or the container cannot be written.
@@ -150,8 +153,8 @@ pub fn join_container(
     writer.finish()
 }
 
-/// Writer of a container, one frame block at a time. If it is dropped before [`ContainerWriter::finish`], no file
-/// remains.
+/// Writer of a container, which receives one frame block (consecutive frames) at a time. If it is dropped before
+/// [`ContainerWriter::finish`], no file remains.
 pub struct ContainerWriter {
     writer: Writer,
     packing: Packing,
@@ -159,7 +162,7 @@ pub struct ContainerWriter {
 }
 
 impl ContainerWriter {
-    /// Creates the container `path` of `count` Gaussians in blocks of `frame_block` frames.
+    /// Creates the container `path` for `count` Gaussians, with `frame_block` frames in a frame block.
     pub fn create(
         path: &Path,
         count: usize,
@@ -184,7 +187,7 @@ impl ContainerWriter {
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
     }
 
-    /// Creates the container of `source`.
+    /// Creates the container `path` for the Gaussians of `source`.
     fn from_source(
         source: &dyn FrameSource,
         path: &Path,
@@ -195,8 +198,8 @@ impl ContainerWriter {
         ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
     }
 
-    /// Adds the next frame block: `frames` of `source`, as many as a block has; a block with fewer frames ends the
-    /// sequence. Attributes that do not vary must have the same values as in the blocks before.
+    /// Adds the next frame block: `frames` of `source`. There must be as many frames as in a block; a block with fewer
+    /// must be the last one. Attributes that do not vary with time must have the same values as in the blocks before.
     pub fn append(
         &mut self,
         source: &dyn FrameSource,
@@ -207,15 +210,16 @@ impl ContainerWriter {
         self.add(source, 0, frames, advance)
     }
 
-    /// Begins the next frame block, to which [`ContainerWriter::add`] adds all Gaussians in several parts.
+    /// Begins a frame block with frames at `times`. Afterwards [`ContainerWriter::add`] must add all Gaussians, in one
+    /// or several parts.
     pub fn begin(&mut self, times: &[f64]) -> Result<()> {
         self.writer.append_times(times)?;
         self.frame_blocks += 1;
         Ok(())
     }
 
-    /// Adds Gaussians to the frame block: those of `source` at its `frames`, which are Gaussians `first` and following
-    /// of the container. `first` is a multiple of [`GAUSSIAN_BLOCK`].
+    /// Adds some Gaussians to the present frame block: all those of `source`, at its `frames`. In the container they
+    /// are Gaussian `first` and those that follow. `first` is a multiple of [`GAUSSIAN_BLOCK`].
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
@@ -230,9 +234,9 @@ impl ContainerWriter {
         })
     }
 
-    /// Adds a frame block, `frames` of `source` at `times`, like [`ContainerWriter::append`]. `presence` says for every
-    /// block of Gaussians whether it changes. A block that does not change is read and encoded once for all frames, or
-    /// not at all.
+    /// Adds a frame block like [`ContainerWriter::append`]: `frames` of `source`, with the time stamps `times`.
+    /// `presence` tells how each block of Gaussians changes within the frame block. A block that does not change is
+    /// read and encoded once for all frames, or not at all if it equals that of the frame block before.
     pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
@@ -252,7 +256,7 @@ impl ContainerWriter {
         )
     }
 
-    /// Writes a tile of the frame block; `None` repeats the tile of the block before.
+    /// Writes one tile of the present frame block. `None` means that the tile equals the one in the frame block before.
     fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
@@ -262,42 +266,44 @@ impl ContainerWriter {
         Ok(())
     }
 
-    /// Completes the container, which then appears under its name.
+    /// Completes the container and moves it to its final path.
     pub fn finish(self) -> Result<()> {
         self.writer.finish()?;
         Ok(())
     }
 }
 
-/// Change of a block of Gaussians within a block of frames.
+/// How a block of Gaussians changes within a frame block (consecutive frames).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
-    /// Varying attributes change; the others are those of the frame block before.
+    /// Attributes that vary with time may change from frame to frame; all others equal those of the frame block before.
     Varying,
-    /// Varying attributes change; the others are written anew.
+    /// Attributes that vary with time may change from frame to frame; all others are constant in the frame block but
+    /// may differ from the block before.
     New,
-    /// Every frame is equal to the first one.
+    /// All frames of the frame block are equal.
     Still,
-    /// Every frame is equal to the frame block before, in which every frame was equal.
+    /// All frames equal those of the frame block before, in which all frames were equal.
     Repeating,
 }
 
-/// Returns the change of every block of Gaussians of `source`, in the first block of frames or a later one.
+/// Returns the change of every block of Gaussians of `source`, which is the same for all. `is_first`: for the first
+/// frame block.
 fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
-    // An attribute that never varies is encoded for the first block only.
+    // An attribute that never varies is encoded for the first frame block only.
     let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
     vec![presence; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
-/// Returns the Gaussians of block `block`, of `count` Gaussians.
+/// Returns which of `count` Gaussians are in block number `block`.
 pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     let start = block * GAUSSIAN_BLOCK;
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes `source` at the `frames` of a block; `presence` gives the change of each block of Gaussians. Passes every
-/// tile to `each` in the order of the container, with its block of Gaussians and its column; `None` stands for the tile
-/// of the block before.
+/// Encodes `frames` of `source` as one frame block. `presence` tells how each block of Gaussians changes. Calls `each`
+/// for every tile in the order of the container, with the number of its block of Gaussians, the number of its column,
+/// and the tile; `None` means that the tile equals the one in the frame block before.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
@@ -308,7 +314,7 @@ fn encode_frames(
 ) -> Result<()> {
     let info = source.info();
     let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
-    // Processing one batch of blocks at a time bounds the number of tiles that wait for the writer.
+    // Only one batch of blocks is processed at a time, which bounds the number of tiles that wait for the writer.
     for batch in blocks.chunks(2 * rayon::current_num_threads()) {
         let tiles: Vec<Vec<Option<EncodedTile>>> = batch
             .par_iter()
@@ -335,8 +341,8 @@ fn encode_frames(
     Ok(())
 }
 
-/// Returns the bytes of every column for the blocks `blocks` of Gaussians of `source` over `frames`, the frames of one
-/// frame block.
+/// Encodes the blocks `blocks` of Gaussians of `source` over `frames`, one frame block, and returns the number of bytes
+/// of each column.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -356,8 +362,8 @@ pub fn column_bytes(
     Ok(bytes)
 }
 
-/// Encodes the tiles of one block of Gaussians over `frames`: one entry per column, `None` for columns not in
-/// `columns`.
+/// Encodes the tiles of one block of Gaussians over `frames`. Returns one entry per column; it is `None` for columns
+/// that are not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,

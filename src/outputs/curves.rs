@@ -1,7 +1,7 @@
-//! Writes any sequence as a `.splatv` file: cubic curves fitted to the trajectory of every Gaussian.
+//! Writes any sequence as a `.splatv` file: curves with cubic motion, fitted to the trajectory of every Gaussian.
 //!
-//! Players cover times in [0, 1], so other times are scaled to that range. The format has no SH coefficients above
-//! degree 0. Memory: all curves.
+//! Players of the format show times from 0 to 1, so other times are scaled to that range. The format has no SH
+//! coefficients above degree 0. Memory: all curves.
 
 use std::path::Path;
 
@@ -15,7 +15,8 @@ use crate::passes::{gather_all, tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Writes all frames of `source` and returns a message about the accuracy.
+/// Writes all frames of `source` to the `.splatv` file `path`. Returns a message with the errors of positions and
+/// opacities.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -49,7 +50,7 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     ))
 }
 
-/// Returns `times`, scaled to 0 to 1 if one of them is outside that range.
+/// Returns `times`, scaled to the range from 0 to 1 if one of them is outside that range.
 fn scale_to_unit(times: &[f64]) -> Vec<f64> {
     match (times.first(), times.last()) {
         (Some(&first), Some(&last)) if first < 0.0 || last > 1.0 => {
@@ -105,7 +106,7 @@ mod tests {
         for frame in 0..30 {
             let time = scene.info().times[frame];
             let state = gather_all(&scene, frame, Attributes::all()).unwrap();
-            // States that the viewer draws, by its own formulas.
+            // States of the curves at this time, computed by the formulas of the viewer.
             let shown: Vec<([f64; 3], f64)> = rows
                 .iter()
                 .map(|row| {
@@ -132,7 +133,7 @@ mod tests {
                     .collect();
                 seen += 1;
                 missing += f64::from(nearby.is_empty());
-                // Other Gaussians may lie there too, so only a missing contribution can be detected.
+                // Other Gaussians may lie there too, so the test can detect only a missing contribution.
                 too_faint += f64::from(1.0 - nearby.iter().sum::<f64>().exp() < visible - 0.1);
             }
         }

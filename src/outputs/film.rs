@@ -1,6 +1,7 @@
-//! Films: an animated PNG or GIF, or a video that `ffmpeg` encodes.
+//! Films: an animated PNG or GIF, or a video that the program `ffmpeg` encodes.
 //!
-//! Input: images of one size, one after the other. Output: a file. Memory: one frame, beside the memory of the encoder.
+//! Input: images of one size, one after the other. Output: a file. Memory: one frame, in addition to the memory of the
+//! encoder.
 
 use std::env;
 use std::fs::File;
@@ -13,22 +14,22 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::image::write::{png_error_to_io, rgb};
 use crate::render::Image;
 
-/// Program that encodes the video formats.
+/// Name of the program that encodes video formats.
 const ENCODER: &str = "ffmpeg";
-/// Speed of the color selection of a GIF: 1 gives the best colors, 30 is fastest; 10 is the compromise that the library
-/// recommends.
+/// Speed of the color selection of a GIF, from 1 (best colors) to 30 (fastest). The library recommends 10 as a
+/// compromise.
 const GIF_SPEED: i32 = 10;
-/// Maximum number of bytes kept of the encoder's messages.
+/// Maximum number of bytes of the encoder's messages that are kept to be shown in an error.
 const MAX_MESSAGE_BYTES: u64 = 1 << 16;
 
 /// File format of a film.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FilmFormat {
-    /// Animated PNG: every bit of every frame.
+    /// Animated PNG, which stores every frame without loss.
     Apng,
     /// Animated GIF: 256 colors per frame, delays in whole hundredths of a second.
     Gif,
-    /// Video encoded by the program at this path.
+    /// Video, encoded by the program at the path of the first field.
     Encoded(PathBuf, Codec),
 }
 
@@ -42,10 +43,10 @@ pub enum Codec {
 }
 
 impl FilmFormat {
-    /// Returns the format for the file name `path`.
+    /// Returns the film format that belongs to the ending of `path`.
     ///
     /// # Errors
-    /// Fails if the name has none of the known endings, or if it needs an encoder that is not installed.
+    /// Fails if the ending is not that of a film format, or if the format needs an encoder that is not installed.
     pub fn from_path(path: &Path) -> Result<FilmFormat> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let codec = match extension.as_str() {
@@ -73,9 +74,9 @@ impl FilmFormat {
     }
 }
 
-/// Writer of a film.
+/// Writer of a film to a file.
 pub struct FilmOutput {
-    /// Path for messages, as the user named it.
+    /// Path of the film as the user named it, for messages.
     shown: PathBuf,
     size: (u32, u32),
     fps: u32,
@@ -91,8 +92,8 @@ enum FilmWriter {
 }
 
 impl FilmOutput {
-    /// Creates a film of `frames` frames of `size` (width, height) pixels, `fps` per second, in the file `path`. Errors
-    /// name the path `shown`.
+    /// Creates the film `path`. It will have `frames` frames of `size` (width, height) pixels and show `fps` frames per
+    /// second. Messages name the path `shown` instead of `path`.
     ///
     /// # Errors
     /// Fails if the format cannot have that size, if the file cannot be created, or if the encoder cannot be run.
@@ -131,11 +132,11 @@ impl FilmOutput {
         Ok(FilmOutput { shown: shown.to_owned(), size, fps, frames, added: 0, writer })
     }
 
-    /// Adds a frame.
+    /// Adds the next frame.
     ///
     /// # Errors
-    /// Fails if the frame has another size or cannot be written, or if the encoder ended early; the message contains
-    /// the encoder's output.
+    /// Fails if the frame has another size, if it cannot be written, or if the encoder ended early; the message then
+    /// contains the encoder's output.
     pub fn add(&mut self, image: &Image) -> Result<()> {
         let added = if (image.width, image.height) == self.size {
             self.write(image)
@@ -158,7 +159,8 @@ impl FilmOutput {
             FilmWriter::Gif(encoder) => {
                 let [width, height] = gif_size(self.size)?;
                 let mut frame = gif::Frame::from_rgb_speed(width, height, &bytes, GIF_SPEED);
-                // Rounded so that the time up to each frame is correct to half a hundredth of a second.
+                // Returns the time up to a frame in hundredths of a second, rounded, so that each frame starts within
+                // half a hundredth of its exact time.
                 let hundredths_until =
                     |frame: u32| (2 * 100 * u64::from(frame) + u64::from(self.fps)) / (2 * u64::from(self.fps));
                 frame.delay = (hundredths_until(self.added + 1) - hundredths_until(self.added)) as u16;
@@ -168,7 +170,7 @@ impl FilmOutput {
         }
     }
 
-    /// Completes the film.
+    /// Completes the film file.
     ///
     /// # Errors
     /// Fails if fewer frames were added than announced, if the file cannot be written, or if the encoder failed; the
@@ -201,12 +203,12 @@ fn gif_error_to_io(error: gif::EncodingError) -> io::Error {
     }
 }
 
-/// A running encoder process.
+/// Running process of the program `ffmpeg`.
 struct FrameEncoder {
     child: Child,
-    /// Standard input of the encoder; `None` after it was closed.
+    /// Standard input of the encoder process; `None` after it was closed.
     to: Option<ChildStdin>,
-    /// Thread that collects the encoder's messages.
+    /// Thread that collects the messages of the encoder process.
     messages: Option<JoinHandle<String>>,
 }
 
@@ -236,7 +238,7 @@ impl FrameEncoder {
             std::thread::spawn(move || {
                 let mut messages = Vec::new();
                 let _ = from.by_ref().take(MAX_MESSAGE_BYTES).read_to_end(&mut messages);
-                // Reads on, because an encoder whose output nobody reads would block.
+                // Reads on, because the encoder would block if nobody read its output.
                 let _ = io::copy(&mut from, &mut io::sink());
                 String::from_utf8_lossy(&messages).into_owned()
             })
@@ -247,7 +249,7 @@ impl FrameEncoder {
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         let Some(to) = &mut self.to else { return Err(io::Error::other(format!("{ENCODER} has ended"))) };
         match to.write_all(bytes) {
-            // The encoder has ended; its exit status and messages describe the cause.
+            // Writing failed because the encoder has ended; its exit status and messages describe the cause.
             Err(_) => Err(self.end().err().unwrap_or_else(|| io::Error::other(format!("{ENCODER} ended too early")))),
             Ok(()) => Ok(()),
         }

@@ -1,9 +1,9 @@
-//! Writes a sequence as a `.4dgs` file: pieces of straight motion in windows of time, encoded and checked by the crate
-//! `fourdgs`.
+//! Writes a sequence as a `.4dgs` file: pieces of straight motion, each shown in a window of time. The crate `fourdgs`
+//! encodes and checks them.
 //!
-//! Frames are 1/30 s apart, whatever the source's times; a piece lasts until the frame after its last one. As the
-//! format requires, base colors are clamped to [0, 1] and SH coefficients above degree 0 are stored as bytes over [−4,
-//! 4]. Memory: all pieces, about 600 bytes each while they are encoded.
+//! Frames are 1/30 s apart, whatever the times of the source. A piece is shown until the start of the frame that
+//! follows its last frame. As the format requires, base colors are clamped to [0, 1], and SH coefficients above degree
+//! 0 are stored as bytes over [−4, 4]. Memory: all pieces, about 600 bytes each while they are encoded.
 
 use std::path::Path;
 
@@ -19,10 +19,10 @@ use crate::passes::tracks;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Frame rate in the file, in frames per second, because sequences state none.
+/// Frame rate stored in the file, in frames per second. Sequences have no frame rate of their own.
 const FRAME_RATE: f64 = 30.0;
 
-/// Writes all frames of `source` and returns a message about the accuracy.
+/// Writes all frames of `source` to the `.4dgs` file `path`. Returns a message with the errors of the pieces.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if the format cannot hold a value, or if the file cannot be written.
@@ -65,9 +65,9 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Rounds positions and velocities to the grid of the file. The encoder checks decoded values against its bounds
-/// without allowing for their rounding to f32. For coordinates of a few units that rounding moves values that are half
-/// a step off beyond the bound.
+/// Rounds positions and velocities to the quantization grid of the file. The encoder compares decoded values with its
+/// bounds without allowing for their rounding to f32. For coordinates of a few units, this rounding would move values
+/// half a step away from the grid beyond the bound.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
@@ -91,7 +91,8 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     }
 }
 
-/// Checks that the grid leaves the Gaussians `ids`, piece by piece, close to the positions `wanted`.
+/// Checks that the rounded positions in `set` are close to the positions `wanted`. `ids`: index of the Gaussian that
+/// each piece belongs to.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
     let mut accuracy = Accuracy::new(&AttributeValues::from_planes(3, planes));
@@ -109,7 +110,7 @@ fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = 
     accuracy.check("a .4dgs")
 }
 
-/// Adds `piece`; `starts` holds the start time of each frame and the end of the last one, in seconds.
+/// Adds `piece` to `set`. `starts`: start time of each frame, then the end of the last frame, in seconds.
 fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     let to_f32 = |value: f64| value as f32;
     set.positions.extend(piece.position.map(to_f32));
@@ -154,8 +155,8 @@ mod tests {
         let (mut missing, mut apart, mut seen) = (0, 0.0f64, 0);
         for frame in 0..24 {
             let expected = gather_all(&scene, frame, Attributes::all()).unwrap();
-            // Evaluates just after the start of the frame; pieces are straight, so positions are off by a fraction of a
-            // step.
+            // The state is evaluated shortly after the start of the frame. Pieces move in straight lines, so positions
+            // are off by a fraction of a step.
             let state = read.gaussians.state_at(frame as f64 / FRAME_RATE + 1e-4, read.header.cutoff);
             let seen_now = (0..400)
                 .filter(|&id| opacity(expected.opacity_logit.row::<1>(id)[0]) >= crate::fit::MIN_VISIBLE_OPACITY);
@@ -166,7 +167,7 @@ mod tests {
                     continue;
                 }
                 let at = expected.position.row::<3>(id);
-                // The file has no order, so look for the nearest Gaussian with the same opacity.
+                // The file keeps no order, so the test looks for the nearest Gaussian with the same opacity.
                 let distance =
                     |k: usize| (0..3).map(|c| f64::from(state.centers[3 * k + c] - at[c]).powi(2)).sum::<f64>();
                 let similar =
@@ -177,8 +178,8 @@ mod tests {
                 };
                 seen += 1;
                 let size = f64::from(expected.log_scale.row::<3>(id).map(f32::exp).iter().copied().fold(0.0, f32::max));
-                // The fit may be off by a tenth of the Gaussian's scale, and the file by twice a twentieth of the
-                // median scale.
+                // The fit may be off by a tenth of the Gaussian's scale, and the positions in the file by twice a
+                // twentieth of the median scale.
                 apart = apart.max(distance / (0.1 * size + 0.2 * median));
             }
         }

@@ -1,4 +1,4 @@
-//! Writes a sequence as a frame stream, for another program to read from a pipe (format/STREAM.md).
+//! Writes a sequence as a frame stream, which another program reads from a pipe (format/STREAM.md).
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::files::frame_stream::{FrameMark, StreamHeader};
 use crate::model::{AttributeValues, Attributes, Gaussians};
 
-/// Writer of a frame stream. The stream is incomplete until [`StreamWriter::finish`].
+/// Writer of a frame stream. The stream is complete only after [`StreamWriter::finish`].
 #[derive(Debug)]
 pub struct StreamWriter<W> {
     to: W,
@@ -18,11 +18,11 @@ pub struct StreamWriter<W> {
 }
 
 impl<W: Write> StreamWriter<W> {
-    /// Writes the header and, from `constant`, the attributes that hold for every frame. Messages call the stream
-    /// `name`.
+    /// Creates a writer to `to`. Writes `header` and those attributes of `constant` that are the same in all frames.
+    /// `name`: name of the stream in messages.
     ///
     /// # Errors
-    /// Fails if an attribute has another length than the header says, or if the stream cannot be written.
+    /// Fails if an attribute has another length than `header` says, or if the stream cannot be written.
     pub fn new(to: W, name: &Path, header: StreamHeader, constant: &Gaussians) -> Result<StreamWriter<W>> {
         let mut stream = StreamWriter { to, name: name.to_owned(), header, frames: 0, last_time: None };
         stream.write_bytes(&header.to_bytes())?;
@@ -30,14 +30,14 @@ impl<W: Write> StreamWriter<W> {
         Ok(stream)
     }
 
-    /// Writes the next frame: the varying attributes of `state`.
+    /// Writes the next frame, at `time`: those attributes of `state` that vary with time.
     ///
     /// # Errors
-    /// Fails if the time is not finite or not above the last one, if an attribute has another length, if there are more
-    /// than 2³² − 1 frames, or if the stream cannot be written.
+    /// Fails if `time` is not finite or not later than that of the frame before, if an attribute has another length
+    /// than the header says, if there are more than 2³² − 1 frames, or if the stream cannot be written.
     pub fn frame(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         let mark = FrameMark::Frame { index: self.frames, time, bytes: self.header.frame_bytes() }.to_bytes();
-        // A reader would reject the mark for the same reason.
+        // A reader would reject the mark (the record before each frame) for the same reason.
         if let Err(illegal) = FrameMark::from_bytes(&mark, &self.header, self.frames, self.last_time) {
             let (frame, expected, found) = (self.frames, illegal.expected, illegal.found);
             return Err(Error::usage(format!("frame {frame}: expected {expected}, found {found}")));
@@ -51,7 +51,7 @@ impl<W: Write> StreamWriter<W> {
         Ok(())
     }
 
-    /// Writes the end mark and all buffered bytes.
+    /// Writes the mark that ends the stream, and all bytes still in the buffer.
     pub fn finish(mut self) -> Result<()> {
         self.write_bytes(&FrameMark::End(self.frames).to_bytes())?;
         self.to.flush().map_err(Error::io("write", &self.name))

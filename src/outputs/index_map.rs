@@ -1,7 +1,8 @@
-//! Index map: the new index of each Gaussian of the input.
+//! Index map: a file with the index in the output of each Gaussian of the input.
 //!
-//! Input: for every Gaussian of the input its new index, or `None`. Output: a `.npy` file of int64 `[N]`, −1 for pruned
-//! Gaussians, so that other per-Gaussian tensors can be reordered likewise. Memory: none of its own.
+//! Input: for every Gaussian of the input its index in the output, or `None` if it was pruned. Output: a `.npy` file of
+//! int64 `[N]`, −1 for pruned Gaussians. With it, other tensors with one entry per Gaussian can be reordered likewise.
+//! Memory: none of its own.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -11,7 +12,8 @@ use npyz::{WriteOptions, WriterBuilder};
 
 use crate::error::{Error, Result};
 
-/// Writes `new_index` (`[N]`) to `path`; members of a cluster have their proxy's index.
+/// Writes the index map `new_index` (`[N]`) to `path`. Gaussians that were merged have the index of the proxy that
+/// replaces them.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

@@ -1,4 +1,4 @@
-//! Kinds of output, and the kind that a file name asks for.
+//! Kinds of output, and which kind a file name stands for.
 
 use std::path::Path;
 
@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, ShowPath};
 
-/// Kind of output.
+/// Kind of output: the file format, or the layout of the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OutputKind {
-    /// Files of a trained model, in the format of its training code.
+    /// Files of a trained model, in the format that its training code writes.
     Model,
     /// A `.gseq` container of all frames.
     Gseq,
@@ -18,24 +18,25 @@ pub enum OutputKind {
     PlySequence,
     /// One PLY file: the canonical Gaussians of a model, or a sequence of one frame.
     Ply,
-    /// A `.gsz` archive for storage and transfer; for frames, a container with error bounds.
+    /// A `.gsz` archive for storage and transfer; for a sequence of frames, a container with error bounds.
     Archive,
-    /// A `.splatv` file: Gaussians with cubic motion in windows of time, for its viewers.
+    /// A `.splatv` file for web viewers: Gaussians with cubic motion in windows of time.
     Splatv,
-    /// A `.4dgs` file: pieces of straight motion.
+    /// A `.4dgs` file: pieces of straight motion in windows of time.
     #[serde(rename = "4dgs")]
     FourDgs,
-    /// A `.spz` file: one frame, in few bytes.
+    /// A `.spz` file: one frame, strongly compressed.
     Spz,
 }
 
 impl OutputKind {
-    /// Returns the kind `asked` if given, else the kind of the name `path`, else `input_kind`, the kind of the input.
+    /// Returns the kind of output: `asked` if the user named one, else the kind that the file name `path` stands for,
+    /// else `input_kind`, the kind of the input.
     pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
         asked.or(Self::from_name(path)).unwrap_or(input_kind)
     }
 
-    /// Checks that the name `path`, given without a kind, is a name of a known kind of output.
+    /// Checks that the file name `path` stands for a known kind of output, for users who do not name a kind.
     ///
     /// # Errors
     /// Returns [`Error::Usage`] with the possible outputs if the name has the ending of another kind of file.
@@ -69,17 +70,17 @@ impl OutputKind {
         }
     }
 
-    /// Returns whether the output is a folder.
+    /// Returns whether this kind of output is a folder rather than a file.
     pub fn is_folder(self) -> bool {
         matches!(self, OutputKind::Model | OutputKind::PlySequence)
     }
 
-    /// Returns whether the output holds every frame, as opposed to a model from which frames are computed.
+    /// Returns whether this kind of output stores every frame, unlike a model from which frames are computed.
     pub fn holds_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }
 
-    /// Checks that an output of this kind, named `path`, can hold `frames` frames.
+    /// Checks that this kind of output can hold `frames` frames. Messages name `path`.
     ///
     /// # Errors
     /// Fails for a `.spz` file if the number of frames is not 1.
@@ -94,10 +95,10 @@ impl OutputKind {
     }
 }
 
-/// Checks that `path` is a possible name of a folder that the command `what` writes.
+/// Checks that `path` can be the name of an output folder. `what`: the command that writes the folder, for messages.
 ///
 /// # Errors
-/// Returns [`Error::Usage`] if the name has the ending of a file.
+/// Returns [`Error::Usage`] if the name has an ending like a file.
 pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path) {
         Some(ending) => Err(Error::usage(format!(
@@ -108,7 +109,7 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Checks that `path` is a possible name of a container.
+/// Checks that `path` can be the name of a container. `what`: the command that writes the container, for messages.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] if the name has the ending of another kind of file.
@@ -122,8 +123,8 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Returns the ending of a name that looks like the name of a file: letters only, or one of a few endings with digits.
-/// `small.v2` and `run.2024` are names of folders, and an existing folder may have any name.
+/// Returns the ending of `path` if it looks like that of a file: letters only, or one of a few endings with digits.
+/// `small.v2` and `run.2024` count as names of folders, and an existing folder may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
     let ending = path.extension()?.to_str()?;

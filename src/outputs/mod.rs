@@ -1,4 +1,5 @@
-//! Writers that drive passes over a sequence: containers, fitted curves, frame streams, films and tables.
+//! Writers that read a sequence from beginning to end and write it as containers, fitted curves, frame streams, films
+//! or tables.
 //!
 //! Each writer creates the file at the path it is given. Callers pass a temporary name from [`crate::files::atomic`],
 //! which moves the finished file to the path that the user asked for.

@@ -1,8 +1,8 @@
-//! Tables of statistics, scores and decisions, for people and notebooks.
+//! Tables of the statistics, scores and decisions of all Gaussians, for people and notebooks.
 //!
-//! Input: [`RowTable`]. Output: `.npz` (one array per column) or `.csv` (one line per Gaussian) with the same columns
-//! and the same values to the bit. Memory: none that grows with N. The bytes depend on the rows alone: entries of the
-//! archive are stored uncompressed, dated 1980-01-01.
+//! Input: [`RowTable`]. Output: `.npz` (one array per column) or `.csv` (one line per Gaussian), with the same columns
+//! and, to the bit, the same values. Memory: none that grows with the number of Gaussians. The bytes depend only on the
+//! table: the entries of the `.npz` are stored uncompressed and dated 1980-01-01.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -17,22 +17,23 @@ use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 use crate::model::{self, Rows, Statistic};
 
-/// Statistics, scores and decisions of N Gaussians after selection; every slice has N entries.
+/// Statistics, scores and decisions of N Gaussians after the selection. Every slice has one value per Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics, one column each ([`Statistic::column`]); W, if measured, is the last column of the table.
+    /// Statistics, one column each ([`Statistic::column`]). The peak contribution W, if measured, is the last column of
+    /// the table.
     pub rows: &'a Rows,
-    /// Static score S_static.
+    /// Static score S_static of each Gaussian, from its contribution and shape.
     pub static_score: &'a [f64],
-    /// Dynamic score S_dynamic.
+    /// Dynamic score S_dynamic of each Gaussian, from its motion and opacity.
     pub dynamic_score: &'a [f64],
-    /// Score S.
+    /// Total score S of each Gaussian.
     pub score: &'a [f64],
-    /// Whether the Gaussian survives stage 2.
+    /// Whether each Gaussian is kept by stage 2 of the selection.
     pub keep: &'a [bool],
 }
 
-/// Values of one column of the table.
+/// Values of one column of the table, one per Gaussian.
 #[derive(Clone, Copy)]
 enum TableColumn<'a> {
     F64(&'a [f64]),
@@ -59,28 +60,29 @@ impl TableColumn<'_> {
 }
 
 impl RowTable<'_> {
-    /// Writes an archive that `numpy.load` opens: arrays `[N]` of float64, `life` as uint32, `keep` as bool.
+    /// Writes the table as an archive that `numpy.load` opens. Its arrays `[N]` are float64, except `life`, which is
+    /// uint32, and `keep`, which is bool.
     ///
     /// # Errors
-    /// Fails if slices have different lengths or the file cannot be written.
+    /// Fails if the slices have different lengths or the file cannot be written.
     pub fn write_npz(&self, path: &Path) -> Result<()> {
         self.check_lengths()?;
         let file = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
         self.write_npz_to(file).map_err(Error::io("write", path))
     }
 
-    /// Writes a table with a header line: `id`, then the columns. Floats are the shortest text that reads back as the
-    /// same f64 (`NaN`, `inf` where they occur), `keep` is `true` or `false`.
+    /// Writes the table as text with a header line: `id`, then the columns. Floats are written as the shortest text
+    /// that reads back as the same f64 (or `NaN`, `inf`), and `keep` as `true` or `false`.
     ///
     /// # Errors
-    /// Fails if slices have different lengths or the file cannot be written.
+    /// Fails if the slices have different lengths or the file cannot be written.
     pub fn write_csv(&self, path: &Path) -> Result<()> {
         self.check_lengths()?;
         let file = File::create(path).map_err(Error::io("create", path))?;
         self.write_csv_to(file).map_err(Error::io("write", path))
     }
 
-    /// Returns the columns in order, with their names in both formats.
+    /// Returns the columns of the table in order, each with its name.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
         let column = |statistic: Statistic| match statistic.values() {
             model::StatisticAccess::F64(values, _) => (statistic.column(), TableColumn::F64(values(self.rows))),
@@ -110,7 +112,7 @@ impl RowTable<'_> {
 
     fn write_npz_to(&self, out: impl Write + io::Seek) -> io::Result<()> {
         let mut archive = NpzWriter::new(ZipOutput::new(out));
-        // Each value takes 8 bytes, plus a header: an entry beyond 4 GiB needs the 64-bit zip format.
+        // An entry has at most 8 bytes per Gaussian and a header. Beyond 4 GiB it needs the 64-bit zip format.
         let large = self.rows.len() as u64 * 8 + 4096 > u64::from(u32::MAX);
         let options = FileOptions::default()
             .compression_method(CompressionMethod::Stored)

@@ -1,11 +1,13 @@
-//! Source that adds parameter deltas to another source, or omits its higher SH degrees, frame by frame as it is read.
+//! Frame source that adds parameter deltas (changes made by refinement) to the Gaussians of another source, or omits
+//! their higher SH degrees, as each frame is read.
 
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Source whose parameters are changed by a delta that is constant in time and by a trajectory delta.
+/// Frame source that adds two changes to the Gaussians of another source: a parameter delta, which is constant in time,
+/// and a trajectory delta, which varies in time.
 pub struct WithDelta<'a> {
     source: Box<dyn FrameSource + 'a>,
     delta: &'a ParamDelta,
@@ -14,8 +16,8 @@ pub struct WithDelta<'a> {
 }
 
 impl<'a> WithDelta<'a> {
-    /// Returns `source` with `delta` and `trajectory` added to its Gaussians, and SH up to `sh_degree` only. If both
-    /// deltas are empty and no SH degree is above `sh_degree`, the frames equal those of `source`.
+    /// Wraps `source`: adds `delta` and `trajectory` to its Gaussians, and keeps SH coefficients up to `sh_degree`
+    /// only. If both deltas are empty and `source` has no higher SH degree, its frames are returned unchanged.
     pub fn new(
         source: Box<dyn FrameSource + 'a>,
         delta: &'a ParamDelta,
@@ -41,7 +43,7 @@ impl<'a> WithDelta<'a> {
         ChangedReader { reader, delta, trajectory, frames: self.info.times.len(), all_sh: self.dropped_sh_buffer() }
     }
 
-    /// Returns a buffer for all SH coefficients of `source` if some of them are dropped.
+    /// Returns a buffer for all SH coefficients of `source` if some of them are dropped; otherwise `None`.
     fn dropped_sh_buffer(&self) -> Option<AttributeValues> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)
@@ -87,7 +89,7 @@ struct ChangedReader<'a> {
     trajectory: TrajectoryDelta,
     /// Number of frames of the sequence.
     frames: usize,
-    /// Buffer into which all SH coefficients are read if some of them are dropped.
+    /// Buffer into which all SH coefficients of the source are read; `None` if all of them are kept.
     all_sh: Option<AttributeValues>,
 }
 
@@ -107,7 +109,7 @@ impl BlockReader for ChangedReader<'_> {
         }
         match self.trajectory.is_empty() {
             true => self.delta.add_to(out, want),
-            // The trajectory delta has no higher SH degrees.
+            // The trajectory delta has no coefficients of the dropped SH degrees.
             false => self.trajectory.at(frame, self.frames).and(self.delta.clone()).add_to(out, want),
         }
         Ok(())
@@ -153,7 +155,7 @@ mod tests {
             assert!(got == expected, "{ids:?}");
         }
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
-            // Without SH degree 1, whose change is dropped with it.
+            // SH degree 1 is dropped here, and the change of its coefficients with it.
             let fewer = WithDelta::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, 0);
             assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
             let mut expected = Gaussians::zeros(ids.len(), 1);

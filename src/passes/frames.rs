@@ -1,4 +1,4 @@
-//! Readers of many Gaussians of a source at one frame after the other, in blocks on all threads.
+//! Readers of many Gaussians of a frame source, for one frame after the other, in blocks of Gaussians on all threads.
 
 use rayon::prelude::*;
 
@@ -8,9 +8,9 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Readers over blocks of Gaussians, kept open for all frames to be read.
+/// Readers of many Gaussians, one per block of Gaussians, which stay open for all frames to be read.
 ///
-/// Memory: the reader of every Gaussian; per thread one block's state at one frame.
+/// Memory: one reader for every block; on each thread the attributes of one block at one frame.
 pub struct FrameReaders<'a> {
     info: &'a SequenceInfo,
     columns: Attributes,
@@ -19,7 +19,7 @@ pub struct FrameReaders<'a> {
 }
 
 impl<'a> FrameReaders<'a> {
-    /// Opens readers for the columns `columns` of the Gaussians `ids` at the frames `wanted`.
+    /// Opens readers for the attributes `columns` of the Gaussians `ids`. `wanted` names the frames that will be read.
     ///
     /// # Errors
     /// A source that cannot be opened.
@@ -46,19 +46,19 @@ impl<'a> FrameReaders<'a> {
         Ok(FrameReaders { info: source.info(), columns, count, readers })
     }
 
-    /// Returns a state to read into.
+    /// Returns a buffer with space for all these Gaussians, for reading frames into.
     pub fn state(&self) -> Gaussians {
         Gaussians::zeros(self.count, self.sh_degree())
     }
 
-    /// Returns the SH degree of the state: 0 if SH is not read, which avoids its memory.
+    /// Returns the SH degree of the frames that are read: 0 if `columns` excludes SH, which saves the memory for it.
     fn sh_degree(&self) -> usize {
         if self.columns.contains(Attributes::SH) { self.info.sh_degree } else { 0 }
     }
 }
 
 impl BlockReader for FrameReaders<'_> {
-    /// Reads the columns of `want` for which the readers were opened.
+    /// Reads those attributes of `want` for which the readers were opened.
     fn read(&mut self, frame: usize, want: Attributes, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
         if want.is_empty() {
@@ -80,10 +80,10 @@ impl BlockReader for FrameReaders<'_> {
     }
 }
 
-/// Opens a reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open for all
-/// of them.
+/// Opens a reader of the attributes `columns` of all Gaussians of a source. It stays open for all frames that `wanted`
+/// names.
 ///
-/// Memory: that of [`FrameReaders`], or of the source's own reader ([`FrameSource::open_all`]).
+/// Memory: that of [`FrameReaders`], or that of the source's own reader if it has one ([`FrameSource::open_all`]).
 pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
     columns: Attributes,

@@ -1,5 +1,6 @@
-//! State of many Gaussians at one frame, read in blocks on all threads. To read several frames, use readers that stay
-//! open ([`super::FrameReaders`], [`super::States`]); they decode each tile once.
+//! Reads the attributes of many Gaussians at one frame, in blocks of Gaussians on all threads. For several frames, use
+//! readers that stay open ([`super::FrameReaders`], [`super::States`]): they decode each tile of a container
+//! (consecutive Gaussians × frames) only once.
 
 use rayon::prelude::*;
 
@@ -10,9 +11,10 @@ use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Reads the columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
+/// Returns the attributes `want` of the Gaussians `ids` at frame `frame`, in the order of `ids`; all other attributes
+/// are empty.
 ///
-/// Memory: the result, and per thread a reader over one block and that block's state.
+/// Memory: the result; on each thread a reader of one block of Gaussians, and the attributes of that block.
 ///
 /// # Errors
 /// A frame that cannot be read.
@@ -34,7 +36,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Attribu
     Ok(all)
 }
 
-/// Reads the columns `want` of all Gaussians at `frame`; all other columns are empty.
+/// Returns the attributes `want` of all Gaussians at frame `frame`; all other attributes are empty.
 ///
 /// # Errors
 /// A frame that cannot be read.
@@ -44,8 +46,8 @@ pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Attributes) -> R
     Ok(all)
 }
 
-/// Reader of all Gaussians of a source that does not decode frames together. It opens a reader per block and frame,
-/// because readers kept open would take memory and save nothing.
+/// Reader of all Gaussians of a source that decodes every frame on its own. It opens a new reader for each block of
+/// Gaussians and frame, because readers that stay open would take memory and save nothing.
 pub struct BlockwiseReader<'a> {
     source: &'a dyn FrameSource,
     ids: Vec<u32>,
@@ -60,7 +62,7 @@ impl<'a> BlockwiseReader<'a> {
 
 impl BlockReader for BlockwiseReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        // Free the old columns before the new ones are read.
+        // Free the memory of the old attributes before the new ones are read.
         out.columns_mut(want).for_each(|column| *column = AttributeValues::default());
         let mut found = gather(self.source, &self.ids, frame, want)?;
         out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(old, new)| std::mem::swap(old, new));

@@ -1,5 +1,5 @@
-//! Consecutive frames that are held in memory together, so that passes which read block by block can process input that
-//! arrives frame by frame.
+//! Consecutive frames that are kept in memory together. Input that arrives frame by frame can thus be processed by
+//! passes that read one block of Gaussians after the other.
 
 use std::ops::Range;
 
@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Source of frames held in memory with all columns. Its frame 0 is the first frame held.
+/// Frame source whose frames are in memory with all attributes. Its frame 0 is the first of these frames.
 pub struct HeldFrames {
     info: SequenceInfo,
     constant: Gaussians,
@@ -15,36 +15,37 @@ pub struct HeldFrames {
 }
 
 impl HeldFrames {
-    /// Creates a source of `count` Gaussians without frames. `constant` holds the columns outside `varying`.
+    /// Creates a source of `count` Gaussians without any frame. `varying` names the attributes that vary in time;
+    /// `constant` holds the values of all others.
     pub fn new(count: usize, sh_degree: usize, varying: Attributes, constant: Gaussians) -> Self {
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
         HeldFrames { info, constant, frames: Vec::new() }
     }
 
-    /// Adds a frame. Only the varying columns of `state` are used; they hold all Gaussians.
+    /// Adds the frame at time `time`. `state` holds all Gaussians; only its time-varying attributes are used.
     pub fn push(&mut self, time: f64, state: Gaussians) {
         self.info.times.push(time);
         self.frames.push(state);
     }
 
-    /// Removes and returns all frames.
+    /// Removes all frames from memory and returns them.
     pub fn drain(&mut self) -> impl Iterator<Item = Gaussians> {
         self.info.times.clear();
         self.frames.drain(..)
     }
 
-    /// Returns the positions of all Gaussians at a held frame.
+    /// Returns the positions of all Gaussians at frame `frame` of this source.
     pub fn position(&self, frame: usize) -> &AttributeValues {
         let varies = self.info.varying.contains(Attributes::POSITION);
         if varies { &self.frames[frame].position } else { &self.constant.position }
     }
 
-    /// Returns the number of frames held.
+    /// Returns the number of frames in memory.
     pub fn len(&self) -> usize {
         self.frames.len()
     }
 
-    /// Returns whether no frame is held.
+    /// Returns whether no frame is in memory.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
@@ -70,7 +71,7 @@ impl FrameSource for HeldFrames {
 struct HeldReader<'a> {
     held: &'a HeldFrames,
     len: usize,
-    /// Ranges of consecutive ids, in the order of the requested ids.
+    /// Ranges of consecutive ids which together are the Gaussians to read, in the requested order.
     runs: Vec<Range<usize>>,
 }
 

@@ -1,4 +1,4 @@
-//! Passes over the frames or views of a source on all threads.
+//! Passes over the frames or views of a frame source, each on all threads.
 
 mod changed;
 mod frames;
@@ -20,6 +20,6 @@ pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, spread, spr
 pub use states::States;
 pub use tracks::{TRACK_BLOCK, tracks};
 
-/// Number of Gaussians per unit of parallel work: their state at a frame and their accumulators fit into the caches. No
-/// result depends on it.
+/// Number of Gaussians per unit of parallel work: their attributes at one frame and the sums computed from them fit
+/// into the processor's caches. No result depends on this number.
 pub const BLOCK: usize = 1024;

@@ -1,14 +1,15 @@
-//! Division of a state into slices that blocks of Gaussians are written to, each from its own thread.
+//! Division of the Gaussians' attributes at a frame into slices, one for each block of Gaussians, so that threads can
+//! write blocks in parallel.
 
 use super::BLOCK;
 use crate::model::{Attributes, Gaussians};
 
-/// Destination of one block: a slice for every component of every column, in order.
+/// Place where one block of Gaussians is written: a mutable slice for every component of every attribute, in order.
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
-    /// Resizes the columns `want` of `state` to `count` Gaussians and divides them, one part for each [`BLOCK`] of
-    /// Gaussians.
+    /// Resizes the attributes `want` of `state` to `count` Gaussians and divides them into slices, one set for each
+    /// block of [`BLOCK`] Gaussians.
     pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
@@ -20,7 +21,7 @@ impl<'a> BlockSlices<'a> {
         parts
     }
 
-    /// Copies the columns `want` of `block` to the slices.
+    /// Copies the attributes `want` of `block` to the slices, which must be those of the same attributes.
     pub fn write(self, block: &Gaussians, want: Attributes) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));

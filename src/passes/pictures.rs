@@ -1,7 +1,7 @@
-//! Passes over views: reads the states that a list of views shows, and hands them on in batches.
+//! Passes over views: reads the Gaussians at the frame of each view, and passes the views on in batches.
 //!
-//! The order is by frame, because occlusion needs all Gaussians of a frame at once. Frames are read in blocks on all
-//! threads; then the views of a batch of frames are handed on together, to be distributed among the threads.
+//! Views are in the order of their frames, because occlusion needs all Gaussians of a frame at once. Frames are read in
+//! blocks of Gaussians on all threads; then the views of a batch of frames are distributed among the threads.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -17,27 +17,28 @@ use crate::model::{AttributeValues, Attributes, Camera, FrameView, Gaussians};
 use crate::render::{Image, blend_features, render};
 use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
-/// Number of views of a batch per thread: enough that the last ones to finish cost little time.
+/// Number of views per thread in a batch: enough that waiting for the last view to finish costs little time.
 pub const VIEWS_PER_THREAD: usize = 4;
 
-/// Gaussians that views show.
+/// Gaussians of a frame source to render, and the attributes to read for this.
 pub struct RenderedSource<'a> {
-    /// Source of the states.
+    /// Frame source that is read.
     pub source: &'a dyn FrameSource,
-    /// Gaussians for which readers are kept open over all frames. `None`: all Gaussians, read in the way that is
+    /// Gaussians to render, for which readers stay open over all frames. `None`: all Gaussians, read in the way that is
     /// cheapest for the source ([`FrameSource::open_all`]).
     pub ids: Option<Ids<'a>>,
-    /// Columns that are read; the others are empty.
+    /// Attributes that are read; the others are empty.
     pub columns: Attributes,
 }
 
 impl<'a> RenderedSource<'a> {
-    /// Returns the subject of all Gaussians of `source` with all columns.
+    /// Returns all Gaussians of `source`, with all attributes.
     pub fn all(source: &'a dyn FrameSource) -> RenderedSource<'a> {
         RenderedSource { source, ids: None, columns: Attributes::all() }
     }
 
-    /// Returns the decoder of the source's features, if all Gaussians are shown and have features.
+    /// Returns the decoder that computes pixel colors from the source's features, if the source has one and all
+    /// Gaussians are rendered.
     fn decoder(&self) -> Option<&'a dyn FeatureDecoder> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
@@ -53,29 +54,30 @@ impl<'a> RenderedSource<'a> {
 /// Maximum size of a batch of views.
 #[derive(Debug, Clone, Copy)]
 pub struct Batch {
-    /// Maximum number of frames, each with a state of every subject.
+    /// Maximum number of different frames. For each of them, the Gaussians of every rendered source are in memory.
     pub frames: usize,
-    /// Maximum number of views.
+    /// Maximum number of views in a batch.
     pub pictures: usize,
-    /// Maximum number of frames that a reader keeps of those decoded together.
+    /// Maximum number of frames that a reader keeps in memory of those that it decodes together.
     pub held: usize,
 }
 
 impl Batch {
-    /// Returns the batch size for many views that take little memory each: views of several frames keep all threads
-    /// busy.
+    /// Returns the batch size for many views that take little memory each: views of several frames together, to keep
+    /// all threads busy.
     fn many_views(limits: &Limits) -> Batch {
         let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
         Batch { frames: limits.frames_together, pictures, held: limits.frames_held }
     }
 
-    /// Returns the batch size for views that are kept until their batch ends: one frame, one view per thread.
+    /// Returns the batch size for views whose renders stay in memory until the batch ends: one frame, one view per
+    /// thread.
     pub fn one_frame(limits: &Limits) -> Batch {
         let pictures = rayon::current_num_threads().min(limits.pictures_together);
         Batch { frames: 1, pictures, held: limits.frames_held }
     }
 
-    /// Returns how many of the first `pictures` form a batch.
+    /// Returns how many of the views at the start of `pictures` form a batch.
     fn batch_length(&self, pictures: &[FrameView]) -> usize {
         let (mut frames, mut last) = (0, None);
         let fits = |picture: &&FrameView| {
@@ -87,33 +89,33 @@ impl Batch {
     }
 }
 
-/// View to render, with the states of `S` subjects at its frame.
+/// View to render, with the Gaussians of `S` sources (the subjects) at the view's frame.
 #[derive(Clone, Copy)]
 pub struct ViewStates<'a, const S: usize> {
-    /// Frame, view number and camera index.
+    /// The view: its frame, view number and camera index.
     pub picture: FrameView,
     /// Camera of the view.
     pub camera: &'a Camera,
-    /// States of the subjects at the view's frame.
+    /// Gaussians of each subject at the view's frame.
     pub states: [&'a Gaussians; S],
-    /// Decoder and features of each subject that has features in place of colors.
+    /// Decoder and features of each subject whose colors are computed from features; `None` for the others.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// Renders the subject with index `subject` over `background`, on all threads of the pool, as the subject's own
-    /// renderer does. The features of a subject that has some are blended and decoded, without a background.
+    /// Renders the subject with index `subject` over `background` on all threads of the pool, as the subject's own
+    /// renderer does. If the subject has features, these are blended and decoded to colors, without a background.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
         self.render_as(subject, self.states[subject], self.features(subject), background)
     }
 
-    /// Returns the features of the subject with index `subject`, if its renders use features.
+    /// Returns the features of the subject with index `subject`; `None` if its colors are not computed from features.
     pub fn features(&self, subject: usize) -> Option<&AttributeValues> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// Renders the subject as [`ViewStates::render`] does, but with another `state`, which has as many Gaussians as
-    /// `features`.
+    /// Renders other Gaussians, `state`, as [`ViewStates::render`] renders those of the subject. `state` must have as
+    /// many Gaussians as `features`.
     pub fn render_as(
         &self,
         subject: usize,
@@ -139,19 +141,19 @@ impl<const S: usize> ViewStates<'_, S> {
     }
 }
 
-/// States of all subjects at a frame; the buffers are reused for later frames.
+/// Gaussians of all subjects at one frame, in buffers that are reused for later frames.
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
-    /// Features of each subject that has some.
+    /// Features of each subject whose colors are computed from features; empty for the others.
     features: [AttributeValues; S],
 }
 
-/// Calls `visit` with batches of `pictures`, in order. `pictures` must be in the order of their frames, with cameras as
-/// indices into `cameras`. Every state is read once; columns that do not vary are read once for each frame slot of a
-/// batch.
+/// Reads the Gaussians of all `subjects` for the views `pictures` and calls `visit` with batches of these views, in
+/// order. `pictures` must be in the order of their frames, with cameras as indices into `cameras`. Every frame is read
+/// once. Attributes that do not vary in time are read once into each buffer; there is one buffer per frame of a batch.
 ///
-/// Memory: for each subject its reader, the frames that the reader keeps, and a state for every frame of a batch.
+/// Memory: for each subject its reader, the frames that this reader keeps, and the Gaussians at every frame of a batch.
 ///
 /// # Errors
 /// Frames that cannot be read; errors of `visit`.
@@ -172,7 +174,7 @@ pub fn show<const S: usize>(
     while !rest.is_empty() {
         let (batch, later) = rest.split_at(max_batch.batch_length(rest));
         rest = later;
-        // If a frame has more views than a batch, its state is already in a slot.
+        // If a frame has more views than a batch, a slot holds its Gaussians already.
         if let Some(slot) = slots.iter().position(|slot| slot.frame == batch[0].frame) {
             slots.swap(0, slot);
         }
@@ -215,13 +217,13 @@ pub fn show<const S: usize>(
     Ok(())
 }
 
-/// Workers that accumulate results over views, one per thread at most.
+/// Workers that accumulate results over views; at most one per thread works at a time.
 ///
-/// Memory per Gaussian: its reader; the columns read, for each frame of a batch (at most 4 × threads views and
+/// Memory per Gaussian: its reader; the attributes read, for each frame of a batch (at most 4 × threads views and
 /// [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::pictures_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
-    /// Workers without a view at the moment.
+    /// Workers that process no view at the moment.
     free: Mutex<Vec<W>>,
 }
 
@@ -231,7 +233,7 @@ impl<W: Send> Workers<W> {
         Workers { limits, free: Mutex::default() }
     }
 
-    /// Passes each of `pictures` to one of the workers.
+    /// Passes each of the views `pictures` of the Gaussians `subject` to one of the workers.
     ///
     /// # Errors
     /// Frames that cannot be read.
@@ -260,7 +262,7 @@ impl<W: Send> Workers<W> {
         })
     }
 
-    /// Returns the workers in no particular order; their results must be combined in a way that does not depend on the
+    /// Returns the workers in no particular order. Their results must be combined in a way that does not depend on this
     /// order.
     pub(crate) fn into_inner(self) -> Vec<W> {
         self.free.into_inner().unwrap_or_else(PoisonError::into_inner)
@@ -273,7 +275,7 @@ mod tests {
     use crate::diagnostics::demo_scene::Scene;
     use crate::passes::gather_all;
 
-    /// Returns `views` views of every frame of `frames`.
+    /// Returns the views 0 to `views` − 1 of every frame of `frames`.
     fn pictures(frames: &[usize], views: u32) -> Vec<FrameView> {
         let of_frame = |&frame: &usize| (0..views).map(move |view| FrameView { frame, view, camera: view });
         frames.iter().flat_map(of_frame).collect()
@@ -307,7 +309,7 @@ mod tests {
         }
     }
 
-    /// Scene whose Gaussians have features and whose pixel colors are the rays through the pixels.
+    /// Scene whose Gaussians have features; a pixel's color is the direction of the ray through the pixel.
     struct RayScene(Scene);
 
     impl FrameSource for RayScene {
@@ -351,7 +353,7 @@ mod tests {
                 for (at, color) in image.data.as_chunks::<3>().0.iter().enumerate() {
                     let seen = DVec3::from(color.map(f64::from));
                     assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
-                    // The camera sees that point at the center of the pixel.
+                    // The camera sees this point at the center of the pixel.
                     let point = camera.rotation * seen + camera.translation;
                     let found = [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
                     let pixel = [at % camera.width as usize, at / camera.width as usize];

@@ -1,25 +1,25 @@
-//! Selection of the views of a schedule that a pass renders.
+//! Selection of the views of a schedule (list of the views at each frame) that a pass renders.
 
 use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
 
-/// Number of views per frame for which a frame is worth reading. A selection of few views takes this many of each
-/// frame.
+/// Number of views for which reading a frame is worth its time. A selection of few views takes this many of each frame,
+/// and so reads fewer frames.
 pub const VIEWS_PER_FRAME: usize = 3;
 
-/// Selection of views frame by frame.
+/// Selection of every n-th frame and of every m-th view in it, for frames that arrive one by one.
 #[derive(Debug, Clone)]
 pub struct Sampler {
     frame_stride: usize,
     view_stride: usize,
-    /// Number of frames so far that have views.
+    /// Number of frames with views that have been passed so far.
     frames_with_views: usize,
 }
 
 impl Sampler {
-    /// Creates a selection with the strides of `scan`. Of the frames that have views, it takes the first and every
-    /// `frame_stride`-th. Of the views of a frame, it takes every `view_stride`-th; the first one moves on from frame
-    /// to frame, so that all views are used.
+    /// Creates a selection with the strides `frame_stride` and `view_stride` of `scan`. Of the frames that have views,
+    /// it takes the first and then every `frame_stride`-th. Of the views of such a frame, it takes every
+    /// `view_stride`-th. The first view taken moves on from frame to frame, so that all views are used in turn.
     pub fn new(scan: &recipe::ScanParams) -> Self {
         Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
     }
@@ -28,8 +28,8 @@ impl Sampler {
         Sampler { frame_stride, view_stride, frames_with_views: 0 }
     }
 
-    /// Returns the selected views of the next frame. `frame` is its number and `views` are its (view number, camera)
-    /// pairs.
+    /// Returns the selected views of the next frame. `frame` is its number; `views` lists its views as (view number,
+    /// camera index).
     pub fn next<'a>(&mut self, frame: usize, views: &'a [(u32, u32)]) -> impl Iterator<Item = FrameView> + use<'a> {
         let first_view = self.frames_with_views / self.frame_stride;
         let is_taken = self.frames_with_views.is_multiple_of(self.frame_stride);
@@ -39,7 +39,7 @@ impl Sampler {
         taken.map(move |&(view, camera)| FrameView { frame, view, camera })
     }
 
-    /// Returns the selected part of `schedule`.
+    /// Returns the schedule of the selected views of `schedule`.
     fn thin(mut self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
@@ -51,9 +51,9 @@ impl Sampler {
     }
 }
 
-/// Returns the views of `schedule` that `scan` renders: those that its strides select (see [`Sampler`]). If they exceed
-/// the maximum of `scan`, they are thinned to it, spread over at least `frames` frames if possible (see
-/// [`spread_over`]).
+/// Returns the views of `schedule` that the scoring pass described by `scan` renders. The strides of `scan` select them
+/// (see [`Sampler`]). If these are more than the maximum `look_pictures`, as many as the maximum are kept, spread over
+/// at least `frames` frames if possible (see [`spread_over`]).
 pub fn looked_at(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = Sampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pairs() <= scan.look_pictures {
@@ -66,8 +66,8 @@ pub fn looked_at(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usi
 }
 
 /// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians that are ever alive are alive
-/// in one of them, provided that each is alive without a gap. `life` is the life span of each Gaussian, of `frames`
-/// frames.
+/// in one of them, provided that each is alive without a gap. `life` holds for each Gaussian the number of frames in
+/// which it is alive, out of `frames` frames.
 pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
     if lives.is_empty() {
@@ -78,14 +78,15 @@ pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
     frames.div_ceil(shortest as usize)
 }
 
-/// Selects at most `pictures` views as [`spread`] does, over at least `frames` frames if there are as many views; else
-/// over as few frames as [`VIEWS_PER_FRAME`] allows.
+/// Selects at most `pictures` views as [`spread`] does. Takes them from at least `frames` frames if there are that many
+/// views, but with at most [`VIEWS_PER_FRAME`] views of each frame.
 pub fn spread_over(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
     spread(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }
 
-/// Selects at most `pictures` views, spread evenly over all frames and views. Uses no more frames than are needed with
-/// `views` views of each (see [`VIEWS_PER_FRAME`]). Selects all views if there are no more than `pictures`.
+/// Selects at most `pictures` views, spread evenly over all frames and view numbers. Uses no more frames than are
+/// needed with `views` views of each (see [`VIEWS_PER_FRAME`]). Selects all views if `schedule` has no more than
+/// `pictures`.
 pub fn spread(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let pictures = pictures.min(schedule.pairs());
@@ -97,7 +98,7 @@ pub fn spread(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<Fra
         let wanted = (2 * k + 1) * seen / (2 * count);
         let Some((_, (frame, views))) = frames.find(|&(place, _)| place == wanted) else { break };
         let wanted = (pictures * (k + 1) / count - pictures * k / count).min(views.len());
-        // Starts at the view after the last one of the previous frame, so that all views are used.
+        // Starts at the view after the last one taken of the previous frame, so that all views are used in turn.
         let first = selected.len();
         let mut places: Vec<usize> = (0..wanted).map(|j| (first + j * views.len() / wanted) % views.len()).collect();
         places.sort_unstable();
@@ -177,12 +178,13 @@ mod tests {
 
     #[test]
     fn short_life_spans_spread_views_over_more_frames() {
-        // Of 300 Gaussians three are alive for at most 5 frames and the others for at least 12; one is never alive.
+        // Of the 300 Gaussians that are ever alive, three are alive for at most 5 frames and the others for at least
+        // 12. One more is never alive.
         let life: Vec<u32> = [0, 1, 5, 5].into_iter().chain((0..297).map(|k| 12 + k)).collect();
         assert_eq!((frames_to_see(&life, 300), frames_to_see(&[0, 0], 300), frames_to_see(&[300], 300)), (25, 0, 1));
         let frame_count = |frames_at_least: usize| frames(&spread_over(&schedule(300, 18), 48, frames_at_least));
         assert_eq!([0, 1, 16, 17, 24, 25, 48, 300].map(frame_count), [16, 16, 16, 24, 24, 48, 48, 48]);
-        // A Gaussian with the life span of 99% of them is alive in one of these frames.
+        // A Gaussian that is alive as long as 99% of the Gaussians are is alive in one of these frames.
         let seen: Vec<usize> = spread_over(&schedule(300, 18), 48, 25).iter().map(|picture| picture.frame).collect();
         assert!((0..=288).all(|birth| seen.iter().any(|frame| (birth..birth + 12).contains(frame))));
     }

@@ -1,23 +1,24 @@
-//! States of all Gaussians of a source at one frame after the other.
+//! Reader of the attributes of all Gaussians of a source, for one frame after the other.
 
 use super::frames::open_all;
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, FrameSource, ReadPlan};
 
-/// Reader of all columns of all Gaussians at one frame after the other. Columns that do not vary are read once.
+/// Reader of all attributes of all Gaussians, for one frame after the other. Attributes that do not vary in time are
+/// read only once.
 ///
-/// Memory: one state, and that of [`open_all`].
+/// Memory: the attributes at one frame, and the reader (see [`open_all`]).
 pub struct States<'a> {
     reader: Box<dyn BlockReader + 'a>,
     varying: Attributes,
-    /// Columns to read next.
+    /// Attributes that the next read must fill; those that do not vary in time are removed after the first read.
     unread: Attributes,
     current: Gaussians,
 }
 
 impl<'a> States<'a> {
-    /// Opens `source` for the frames `wanted`.
+    /// Opens a reader of `source` for the frames that `wanted` names.
     ///
     /// # Errors
     /// A source that cannot be opened.
@@ -31,14 +32,14 @@ impl<'a> States<'a> {
         })
     }
 
-    /// Returns the state at `frame`.
+    /// Reads and returns the Gaussians at frame `frame`.
     pub fn at(&mut self, frame: usize) -> Result<&Gaussians> {
         self.reader.read(frame, self.unread, &mut self.current)?;
         self.unread = self.varying;
         Ok(&self.current)
     }
 
-    /// Returns the state of the last frame read; without Gaussians if none was read.
+    /// Returns the Gaussians at the frame that was read last; none before the first read.
     pub fn current(&self) -> &Gaussians {
         &self.current
     }
@@ -67,8 +68,8 @@ mod tests {
             let expected = gather_all(&scene, frame, Attributes::all()).unwrap();
             assert!(*states.at(frame).unwrap() == expected && *states.current() == expected, "frame {frame}");
         }
-        // The file has two blocks of Gaussians, and each varying column has one tile per block of Gaussians and block
-        // of frames.
+        // The file has two blocks of Gaussians. Each attribute that varies has one tile per block of Gaussians and
+        // block of frames.
         let varying = container.info().varying.iter().count() as u64;
         assert_eq!(container.reads().tiles, 2 * (constant.iter().count() as u64 + 2 * varying));
     }

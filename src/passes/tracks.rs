@@ -1,4 +1,5 @@
-//! Passes over Gaussians with all frames of each: a block of Gaussians at a time on every thread.
+//! Passes over trajectories: every Gaussian with its attributes at all frames, a block of Gaussians at a time on each
+//! thread.
 
 use std::ops::Range;
 
@@ -10,13 +11,13 @@ use crate::model::{Attributes, Gaussians};
 use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
 
-/// Number of Gaussians of which a thread holds all frames.
+/// Number of Gaussians whose attributes at all frames a thread holds in memory at once.
 pub const TRACK_BLOCK: usize = 64;
 
-/// Calls `make` with the track of every Gaussian and returns the results in order. The frames of a track are at
-/// `times`, in any unit of time.
+/// Calls `make` with the trajectory of every Gaussian, which is its attributes at every frame, and returns the results
+/// in the order of the Gaussians. `times` holds the times of the frames, in any unit.
 ///
-/// Memory: the results, and for every thread a reader and all states of [`TRACK_BLOCK`] Gaussians.
+/// Memory: the results; on every thread a reader and the attributes of [`TRACK_BLOCK`] Gaussians at all frames.
 pub fn tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
@@ -29,7 +30,7 @@ pub fn tracks<R: Send>(
         let mut states: Vec<Gaussians> = Vec::with_capacity(info.times.len());
         let mut want = Attributes::all();
         for frame in 0..info.times.len() {
-            // Columns that do not vary keep the values of the previous frame.
+            // Attributes that do not vary in time keep the values of the previous frame.
             let mut state = states.last().cloned().unwrap_or_else(|| Gaussians::zeros(0, info.sh_degree));
             reader.read(frame, want, &mut state)?;
             want = info.varying;

@@ -1,4 +1,5 @@
-//! Dry run: reports what a run would do, cost and write. It only opens the input and runs a short calibration.
+//! Dry run: reports what a run would do, how long it would take and what it would write. Only opens the input and
+//! measures the speed of this machine for a short time.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -21,10 +22,10 @@ use crate::pipeline::stages::write::beside_names;
 use crate::pipeline::throughput::forecast;
 use crate::scene::{InputOptions, open_scene};
 
-/// Report of a dry run.
+/// Report of a dry run, which tells what a run would do without doing it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct DryRunReport {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Always true; tells this report from the summary of a run.
     pub dry_run: bool,
@@ -38,15 +39,15 @@ pub struct DryRunReport {
     pub frames: usize,
     /// SH degree of the input.
     pub sh_degree: usize,
-    /// Bytes of the input.
+    /// Number of bytes of the input.
     pub bytes: u64,
     /// Cameras whose views would be rendered.
     pub cameras: CameraSummary,
-    /// Number of Gaussians in the output, if it is known in advance; otherwise renders decide.
+    /// Number of Gaussians in the output, if it is known in advance; `None` if it depends on renders.
     pub gaussians: Option<usize>,
-    /// Rule that determines the number of Gaussians.
+    /// Description of how the number of Gaussians in the output is determined.
     pub size_by: String,
-    /// Numbers of Gaussians that ranking and refinement would leave, as text.
+    /// Description of how many Gaussians ranking and refinement would leave.
     pub counts: String,
     /// Path of the output.
     pub output: String,
@@ -54,7 +55,7 @@ pub struct DryRunReport {
     pub output_kind: OutputKind,
     /// Paths that would be written: the output, and the files in or beside it.
     pub would_write: Vec<String>,
-    /// Expected time and memory.
+    /// Expected time and memory of the run.
     pub forecast: Forecast,
     /// Stages that would be omitted, with reasons.
     pub left_out: Vec<LeftOut>,
@@ -62,7 +63,8 @@ pub struct DryRunReport {
     pub notes: Vec<String>,
 }
 
-/// Returns the report of a dry run of `request`. Opens the input and renders a few views to calibrate time estimates.
+/// Returns the report of a dry run of `request`. Opens the input and renders a few views to measure the speed of this
+/// machine for the time estimates.
 ///
 /// # Errors
 /// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
@@ -112,7 +114,7 @@ pub fn foresee(request: &Request) -> Result<DryRunReport> {
     })
 }
 
-/// Returns a text that tells how the number of Gaussians in the output is determined.
+/// Returns a description of how the number of Gaussians in the output is determined.
 fn size_by(request: &Request) -> String {
     match (&request.goal, &request.target) {
         (Some(Goal::Quality(Quality::Psnr(least))), _) => {

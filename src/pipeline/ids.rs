@@ -1,18 +1,20 @@
-//! Parser for lists of ids of Gaussians that the user keeps or drops.
+//! Parser for lists of ids of Gaussians that the user wants to keep or drop.
 
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
 use crate::files::text::read_text;
 
-/// Maximum number of bytes of a file of ids; enough for four million ids.
+/// Maximum number of bytes of a file of ids; enough for four million ids of eight bytes.
 const MAX_LIST: u64 = 32 << 20;
 
-/// Reads ids and ranges from a file, where `#` begins a comment, or from a list such as `3,10-20`. Commas, blanks or
-/// line ends separate them. Returns the ids in increasing order without repetition.
+/// Reads the ids of Gaussians that `spec` names: a list of ids and ranges such as `3,10-20`, or the path of a file with
+/// such a list, in which `#` begins a comment. Commas, blanks or line ends separate ids. Returns the ids in increasing
+/// order without repetition.
 ///
 /// # Errors
-/// Fails if a word is no id or range, if a range is reversed, or if an id is not below `count`.
+/// Fails if a word is no id or range, if a range is reversed, or if an id is not below `count`, the number of
+/// Gaussians.
 pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
     let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-') || c.is_ascii_whitespace());
     let (text, origin) = if is_list {

@@ -1,7 +1,7 @@
 //! The pipeline of a compression: scan, score, rank, prune, merge, refine, write.
 //!
-//! A request is turned into a [`RunPlan`] once, before any work. The plan lists the stages of [`stages::STAGES`] that
-//! the request needs, in their order. [`run_stages`] runs them.
+//! Before any work, a request is turned into a [`RunPlan`], which lists those of [`stages::STAGES`] that the request
+//! needs, in the order in which they run. [`run_stages`] runs them.
 
 pub mod dry_run;
 mod ids;
@@ -39,7 +39,7 @@ use stage::{Measured, Phase, RunState};
 use stages::measure::Measure;
 use summary::{InputSummary, Summary};
 
-/// Compresses the input of `request`, writes the result and returns its summary.
+/// Compresses the input of `request`, writes the result and returns the summary of the run.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe or the output is invalid. An error leaves no output behind.
@@ -58,21 +58,22 @@ fn compress_whole(request: &Request) -> Result<Summary> {
     Ok(run_stages(&scene, &plan, arrived, request, journal)?.0)
 }
 
-/// Compresses a scene that is already open, like [`compress`]. Returns the summary and the index of every input
-/// Gaussian in the output.
+/// Compresses a scene that is already open, like [`compress`]. Returns the summary, and for every input Gaussian its
+/// index in the output, or `None` if it was removed.
 ///
 /// # Errors
-/// See [`compress`].
+/// Fails where [`compress`] fails.
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
     run_stages(scene, &plan, None, request, Journal::default())
 }
 
-/// Returns the stages of a run that can be divided among several processes, in order, with their units of work.
+/// Returns the stages of a run that several processes can divide among themselves, in order, each as a line with its
+/// number of units of work.
 ///
 /// # Errors
-/// Fails if the input cannot be opened. Reads nothing else.
+/// Fails if the input cannot be opened. Apart from opening the input nothing is read.
 pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |input, work: &Workload| RunPlan::within_memory(request, input, work);
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
@@ -81,25 +82,26 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     Ok(plan.shardable_units(&scene))
 }
 
-/// Sets the limits of a scene that is already open so that the request stays within its memory budget.
+/// Sets the memory limits of a scene that is already open so that a run of `request` stays within its memory budget.
 ///
 /// # Errors
-/// Fails if the budget is too small, and where [`RunPlan::new`] fails.
+/// Fails if the budget is too small for the request, and where [`RunPlan::new`] fails.
 pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<()> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
-/// Measures a scene, scores its Gaussians and selects survivors with the parameters of `recipe`.
+/// Measures the statistics of a scene, scores its Gaussians and selects the survivors (Gaussians that are not removed)
+/// by the parameters of `recipe`. `user` holds Gaussians that the user keeps or drops.
 ///
 /// # Errors
-/// Fails if frames cannot be read or their times cannot be scanned.
+/// Fails if frames cannot be read, or if their times do not allow statistics of motion.
 pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Result<Scored> {
     Measure::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. Returns the summary and the index of every input Gaussian in the
-/// output.
+/// Runs the stages of `plan`, one after the other. `arrived` holds statistics that were taken while a stream arrived.
+/// Returns the summary, and for every input Gaussian its index in the output, or `None` if it was removed.
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,
@@ -140,8 +142,8 @@ fn run_stages(
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
 }
 
-/// Returns the text of `recipe.toml` beside the result of an input with the digest `own`. Adds a note if the recipe was
-/// made for another input.
+/// Returns the text of the file `recipe.toml` that is written beside the result. `own` is the digest of the input. Adds
+/// a note to `journal` if the recipe was made for an input with another digest.
 fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
     if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
@@ -150,7 +152,7 @@ fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journ
     RecipeRecord::new(request, &plan.measure.score.user, own.to_owned()).text(request, &folder)
 }
 
-/// Returns the error for a result without any Gaussian: nothing could render it.
+/// Returns the error for a result without any Gaussian, which no renderer could show.
 fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let all = scored.count();
     let dropped = scored.selection.counts.forced_drop;
@@ -185,7 +187,8 @@ pub(crate) mod tests {
         super::score_scene(scene, recipe, user).unwrap()
     }
 
-    /// Returns the workload of a container with `gaussians` Gaussians and 600 frames of two views.
+    /// Returns the workload (sizes for estimates) of a container with `gaussians` Gaussians and 600 frames of two
+    /// views.
     pub(crate) fn work(gaussians: u64) -> Workload {
         let info = SequenceInfo {
             count: gaussians as usize,

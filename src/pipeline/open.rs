@@ -1,11 +1,12 @@
-//! Opens a scene for measuring. A stream is measured while it arrives, so that it is read only once.
+//! Opens a scene and takes its statistics. A stream is measured while it arrives, so that it is read only once.
 //!
-//! Memory of a stream: packing ([`crate::models::stream`]) and, when measuring, the accumulators of all Gaussians
-//! ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and the memory of [`RunningContribution`].
+//! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). When measuring, also the
+//! running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes each) and the memory of
+//! [`RunningContribution`].
 //!
-//! The time span and the number of frames are known only at the end of the stream. Until then evenly spaced frames are
-//! assumed, and views whose times equal those of the frames. If an assumption proves wrong, the packed frames are
-//! measured instead; the result is the same in both cases.
+//! The time span and the number of frames are known only at the end of the stream. Until then two assumptions are made:
+//! frames are evenly spaced, and views have exactly the times of frames. If an assumption proves wrong, the packed
+//! frames are measured again from the container; the result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
@@ -38,12 +39,11 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens a scene for measuring and sets its limits within the memory budget. `plan` makes the plan of the run from
-/// facts about the scene. A stream is measured while it arrives, see [`receive_measured`]; then the statistics are
-/// returned, too.
+/// Opens a scene and sets its limits within the memory budget. `plan` makes the plan of the run from facts about the
+/// scene. A stream is measured while it arrives, see [`receive_measured`]; then its statistics are returned as well.
 ///
 /// # Errors
-/// Fails if the input, the cameras or the budget is invalid, and if `plan` fails, which happens before any frame of a
+/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails. `plan` is called before any frame of a
 /// stream is read.
 pub fn open_to_measure(
     options: &InputOptions,
@@ -68,14 +68,14 @@ pub fn open_to_measure(
     let plan =
         Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
-    // Reads of the calibration are not part of the plan, so they are counted before it.
+    // Reads of the calibration of the time forecast are not part of the memory plan, so reads are counted before it.
     let reads = scene.source().reads();
     send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
-/// Sends the plan and the time forecast as messages, if the user asked for them.
+/// Sends the plan of the run and the time forecast as messages, if the user asked for them.
 fn send_forecast(
     scene: &mut Scene,
     plan: &Plan,
@@ -85,7 +85,7 @@ fn send_forecast(
     journal: &mut Journal,
 ) -> Result<()> {
     let tell = options.memory.tell;
-    // A shard cannot tell which fraction of the run it does, so it has no forecast.
+    // A run of one shard cannot tell which fraction of the whole run it does, so it has no forecast.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
         options.events.send(Message::Plan(&stages.text()));
@@ -98,8 +98,9 @@ fn send_forecast(
     Ok(())
 }
 
-/// Packs a stream into a scratch container. Measures it meanwhile if memory suffices beside the frames held. `loaded`
-/// is the rig of the user's cameras, if any. Returns the statistics if the assumptions about the stream proved right.
+/// Packs a stream into a scratch container. If memory suffices, also takes statistics of the frames as they arrive.
+/// `loaded` holds the user's cameras, if any. Returns the statistics unless the assumptions about the times of the
+/// stream (see the module) proved wrong.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -185,8 +186,9 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends the limits of a stream as a message, if the user asked for the plan or the forecast: the maximum memory `peak`,
-/// bytes, or the numbers of frames that fit the memory limit (`most`) and that are measured on arrival (`to_measure`).
+/// Sends a message about the limits of a stream, if the user asked for the plan or the forecast. `peak`: maximum
+/// memory, bytes. `most`: number of frames that fit the memory limit. `to_measure`: number of frames that can be
+/// measured as they arrive.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
@@ -200,14 +202,14 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Returns the statistics that were taken while the frames arrived. Returns `None` and adds a note to the scene if an
-/// assumption about the stream proved wrong.
+/// Returns the statistics that were taken while the frames arrived. Returns `None`, and adds a note to the scene, if an
+/// assumption about the times of the stream proved wrong or Gaussians have to be dropped.
 fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
         None => {
             let found = measuring.finish(&complete);
-            // The frames were measured with these Gaussians before they proved not to be finite.
+            // The frames were measured with all Gaussians, before some of them proved to have NaN or infinity.
             match measure.score.absent(&found.scanned.rows).is_empty() {
                 true => Ok(found),
                 false => Err("Gaussians with NaN or infinity are dropped from all frames"),
@@ -225,18 +227,18 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Sce
     }
 }
 
-/// Returns a virtual rig around the first of the held frames.
+/// Returns a virtual rig (cameras placed by the program) around the first of the frames `held` in memory.
 fn rig_around(held: &HeldFrames) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.middle, bounds.extent())
 }
 
-/// Running statistics of the frames received so far.
+/// Running statistics of the frames of a stream received so far.
 struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Assignment of cameras to the frames so far, as assumed.
+    /// Views of the frames so far, under the assumption that views have exactly the times of frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,
@@ -275,7 +277,7 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// Returns which assumption proved wrong, if any.
+    /// Returns a description of the assumption about the stream that proved wrong, if any.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.finishes(self.plan) {
             return Some("the frames are not evenly spaced in time");
@@ -288,11 +290,11 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Cameras that see a frame, assigned while the other frames are still unknown: views taken at exactly the time of the
-/// frame, and views without a time.
+/// Assignment of views to the frames of a stream while later frames are unknown: a frame has the views with exactly its
+/// time, and all views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
-    /// (Time, index in the rig) of the views of the split that have a time, sorted by time, then index.
+    /// Time and index in the rig of each view of the split that has a time, sorted by time, then index.
     timed: Vec<(f64, usize)>,
     timeless: Vec<usize>,
     tolerance: f64,
@@ -313,7 +315,7 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// Returns (view number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
+    /// Returns the view number and camera index of each view of a frame at `time`, in the order of the rig.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

@@ -1,5 +1,5 @@
-//! The plan of a run: its stages with their parameters, the omitted stages and their reasons, and the numbers of
-//! Gaussians that ranking and refinement leave. It is made in one place, before any work.
+//! The plan of a run: its stages with their parameters, the omitted stages with reasons, and the numbers of Gaussians
+//! that ranking and refinement leave. Everything is decided in this module, before any work.
 
 use std::path::Path;
 
@@ -20,15 +20,16 @@ use crate::pruning::visible::Visible;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
-/// Plan of a run.
+/// Plan of a run: its stages with their parameters, and the stages that it omits.
 pub struct RunPlan {
-    /// Stages in their order.
+    /// Stages in the order in which they run, and the omitted stages.
     pub(super) stages: StageList,
-    /// Stages that measure; a stream is measured by them while it arrives.
+    /// Stages that take statistics. A stream is measured by them while it arrives.
     pub measure: Measure,
-    /// Stage that writes the result; `None` if only statistics are wanted.
+    /// Stage that writes the result; `None` if the run only measures and scores.
     pub output: Option<WriteStage>,
-    /// Search that repeats the stages of [`Phase::Reduce`] until a quality is reached.
+    /// Search that repeats the stages of [`Phase::Reduce`] with different numbers of Gaussians until a requested
+    /// quality is met; `None` without such a request.
     pub search: Option<SearchStage>,
     /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
@@ -39,27 +40,27 @@ pub struct RunPlan {
 }
 
 impl RunPlan {
-    /// Returns the plan of a compression by `request`, regardless of memory.
+    /// Returns the plan of a run for `request`, without regard to its memory limit.
     ///
     /// # Errors
-    /// Fails if the recipe is out of range, if the input does not have the target count or the ids, or if options
-    /// exclude each other.
+    /// Fails if a parameter of the recipe is out of range, if the input has fewer Gaussians than the target or lacks an
+    /// id of the request, or if options exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
         RunPlan::with_fallback(request, input, MemoryFallback::Nothing, true)
     }
 
-    /// Returns the plan of a run that only measures and scores.
+    /// Returns the plan of a run that only measures and scores, with the stages `measure`.
     pub fn to_measure(measure: Measure, input: InputMeta) -> RunPlan {
         let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
         plan.stages.add(Phase::Rank, measure);
         plan
     }
 
-    /// Returns the plan of a run within the memory limit of `request`. If full refinement does not fit, parameter
-    /// deltas are constant in time; if that does not fit, SH coefficients above degree 0 are not refined either; if
-    /// that does not fit, nothing is refined. If even this exceeds the limit, the full plan is returned; it is refused
-    /// later with the smallest sufficient limit. The quality of the
-    /// result is measured if there is memory for this as well.
+    /// Returns the plan of a run within the memory limit of `request`. Refinement is reduced until the plan fits: first
+    /// its parameter deltas (what it adds to stored values) become constant in time, then SH coefficients above degree
+    /// 0 are not refined either, then nothing is refined. If even this exceeds the limit, the full plan is returned; it
+    /// is refused later with an error that names the smallest sufficient limit. The quality of the result is measured
+    /// if there is memory for this as well.
     ///
     /// # Errors
     /// Fails where [`RunPlan::new`] fails.
@@ -71,7 +72,7 @@ impl RunPlan {
         Ok(if fits(&with_quality) { with_quality } else { plan })
     }
 
-    /// Returns the plan of [`RunPlan::within_memory`] without the measurement of quality.
+    /// Returns the plan of [`RunPlan::within_memory`] but without measuring the quality of the result.
     fn refining_within_memory(
         request: &Request,
         input: InputMeta,
@@ -147,8 +148,8 @@ impl RunPlan {
             MemoryFallback::WithoutHarmonics { .. } => Some(refine.with_constant_deltas().with_fixed_higher_sh()),
             MemoryFallback::WithoutRefinement { .. } => None,
         });
-        // At the same count refinement gains more quality than merging. Prune steps rank anew, so the order does not
-        // matter.
+        // For the same number of Gaussians, refinement keeps more quality than merging. Prune steps of refinement rank
+        // anew, so the order does not matter.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
         planning.merges = !prunes_alone && !recipe.merge.passes.is_empty();
 
@@ -165,13 +166,13 @@ impl RunPlan {
         Ok(plan)
     }
 
-    /// Returns the resource estimates of all stages.
+    /// Returns the resource estimates (memory, time, reads) of all stages of the plan.
     pub fn estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         self.remaining_estimates(work, limits, MeasuredOnArrival::default())
     }
 
-    /// Returns the resource estimates of the stages that are still to run. They exclude statistics that were taken
-    /// while a stream arrived.
+    /// Returns the resource estimates (memory, time, reads) of the stages that are still to run. `measured` states
+    /// which statistics were already taken while a stream arrived; these are not counted.
     pub fn remaining_estimates(
         &self,
         work: &Workload,
@@ -181,8 +182,8 @@ impl RunPlan {
         self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns the resource estimates of the stages that are still to run, without stages that may turn out to be
-    /// unnecessary because views hardly change when the fraction `hardly_seen` of the Gaussians is removed.
+    /// Returns the resource estimates of the stages that certainly have to run. Leaves out stages that may find nothing
+    /// to do, because renders hardly change when the fraction `hardly_seen` of the Gaussians is removed.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -215,23 +216,23 @@ impl RunPlan {
         [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
     }
 
-    /// Returns whether the amount of work depends on results of stages, which widens the range of time estimates.
+    /// Returns whether the amount of work depends on results of stages, so that the time of the run is less certain.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
 
-    /// Returns the stages that several processes can divide among themselves, with their units of work. Stages have the
-    /// names under which the cache keeps them.
+    /// Returns the stages that several processes can divide among themselves, each as a line with its number of units
+    /// of work. Stages have the names of their cache entries (files with results).
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }
 
-    /// Returns the numbers of Gaussians that ranking and refinement leave, as text for display.
+    /// Returns a description of how many Gaussians ranking and refinement leave, for display.
     pub fn counts_text(&self) -> String {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
-    /// Returns the plan as text for display: counts, parameters of the stages, and omitted stages.
+    /// Returns the plan as text for display: numbers of Gaussians, parameters of the stages, and omitted stages.
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
@@ -240,7 +241,7 @@ impl RunPlan {
         self.counts_text() + &lines.collect::<String>()
     }
 
-    /// Checks, before the input is opened, that a run which reads `input` may write its output.
+    /// Checks that a run which reads `input` may write its output. Called before the input is opened.
     ///
     /// # Errors
     /// Fails if the output exists already or cannot be created.
@@ -248,7 +249,7 @@ impl RunPlan {
         self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// Checks, before any work, that the scene has the files that the stages need.
+    /// Checks, before any work, that the scene has the files that the stages of the plan need.
     ///
     /// # Errors
     /// Fails if the check of a stage fails.
@@ -260,10 +261,11 @@ impl RunPlan {
     }
 }
 
-/// Returns the kind of output that `request` asks for. `own` is the default kind of the input.
+/// Returns the kind of output (such as archive or model folder) that `request` asks for. `own` is the default for the
+/// input.
 ///
 /// # Errors
-/// Fails if the name of the output does not tell its kind, or if options exclude each other.
+/// Fails if neither the name of the output nor an option tells its kind, or if options exclude each other.
 fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
@@ -317,7 +319,8 @@ mod tests {
         Budget { bytes: Some(bytes), ..Budget::default() }
     }
 
-    /// Returns a function that estimates all stages of a compression with the recipe `preset`.
+    /// Returns a function that estimates memory, time and reads of all stages of a compression with the preset
+    /// `preset`.
     fn all_estimates(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
         let plan = RunPlan::new(&request(recipe), INPUT).unwrap();
@@ -389,7 +392,7 @@ mod tests {
         let (spared, refine, _, named) = within(bands - 1);
         assert_eq!((spared, refine), (MemoryFallback::WithoutRefinement { required_bytes: bands }, None));
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
-        // A limit below every fallback returns the full plan, which is refused later.
+        // With a limit below all reduced plans, the full plan is returned, which is refused later.
         assert_eq!(within(1 << 20).0, MemoryFallback::Nothing);
     }
 
@@ -437,7 +440,7 @@ mod tests {
         let (unrefined, text) = counts(default().unrefined(), Some(0.1), None);
         assert_eq!(unrefined, [100, 100]);
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
-        // A search ranks once, down to the smallest size that it may try.
+        // A search ranks only once, down to the smallest number of Gaussians that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
         assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
         assert_eq!(counts(default().unrefined(), None, psnr()).0, [20, 100]);

@@ -1,4 +1,4 @@
-//! Inputs of planning: the request, and facts about the input that several stages depend on.
+//! What the planning of stages starts from: the request, and facts about the input that several stages depend on.
 
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
@@ -12,14 +12,14 @@ use crate::scene::Scene;
 pub struct InputMeta {
     /// Number of Gaussians, N.
     pub gaussians: usize,
-    /// Whether the cameras belong to the scene; `false` for a virtual rig.
+    /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
-    /// Kind of output that is written if neither the user nor the output's name determines one.
+    /// Kind of output that is written if neither the user nor the name of the output determines one.
     pub own_output: OutputKind,
 }
 
 impl InputMeta {
-    /// Returns the facts about an open scene.
+    /// Returns the facts about the open scene `scene`.
     pub fn from_scene(scene: &Scene) -> InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
@@ -29,7 +29,8 @@ impl InputMeta {
     }
 }
 
-/// Inputs from which stages are planned.
+/// What the planning of stages starts from: the request of the user, and decisions and facts that several stages depend
+/// on.
 pub struct Planning<'a> {
     /// Request of the user.
     pub request: &'a Request,
@@ -39,66 +40,67 @@ pub struct Planning<'a> {
     pub output: OutputKind,
     /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
-    /// Decisions of the user about single Gaussians: ids and boxes to keep or drop.
+    /// Gaussians that the user keeps or drops, by ids and boxes.
     pub user: UserOverrides,
     /// Whether views of the scene are rendered to measure the contribution of every Gaussian.
     pub renders_views: bool,
-    /// Whether Gaussians are pruned by rank, beside those that the user drops.
+    /// Whether Gaussians are pruned by rank, in addition to those that the user drops.
     pub prunes: bool,
-    /// Whether survivors are merged.
+    /// Whether survivors (Gaussians that are not removed) are merged.
     pub merges: bool,
-    /// Refinement of the survivors, if there is any.
+    /// Refinement stage, which fits the survivors to renders of the original; `None` if nothing is refined.
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,
-    /// Parts of refinement that are omitted to stay within the memory limit.
+    /// Parts of refinement that are omitted to stay within the memory limit (`--memory`).
     pub(super) fallback: MemoryFallback,
 }
 
 impl Planning<'_> {
-    /// Returns the requested fraction of the Gaussians, if a target was requested.
+    /// Returns the requested number of Gaussians as a fraction of the input's, if a target was requested.
     pub fn part(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 
-    /// Returns whether the SH degree is chosen by refinement: among the degrees whose Gaussians fit a size on disk, the
-    /// one with the best quality is taken.
+    /// Returns whether refinement chooses the SH degree for a requested size on disk. For each degree it refines as
+    /// many Gaussians as fit the size, and takes the degree with the best quality.
     pub fn chooses_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
     }
 
-    /// Returns whether Gaussians are ranked by rendered views and removed.
+    /// Returns whether Gaussians are removed by a ranking that rendered views determine.
     pub fn prunes_by_views(&self) -> bool {
         self.renders_views && self.prunes
     }
 }
 
-/// Parts of refinement that are omitted because they do not fit within the memory limit.
+/// Parts of refinement that are omitted because they do not fit within the memory limit (`--memory`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum MemoryFallback {
-    /// Full refinement.
+    /// Nothing is omitted: full refinement.
     #[default]
     Nothing,
-    /// Parameter deltas are constant in time.
+    /// Parameter deltas (what refinement adds to stored values) are constant in time.
     ConstantInTime {
-        /// Smallest memory limit with which deltas vary in time, bytes.
+        /// Smallest memory limit with which deltas would vary in time, bytes.
         required_bytes: u64,
     },
     /// Parameter deltas are constant in time, and SH coefficients above degree 0 are not refined.
     WithoutHarmonics {
-        /// Smallest memory limit with which these coefficients are refined, bytes.
+        /// Smallest memory limit with which SH coefficients above degree 0 would be refined, bytes.
         required_bytes: u64,
     },
-    /// No refinement.
+    /// Nothing is refined.
     WithoutRefinement {
-        /// Smallest memory limit with which anything is refined, bytes.
+        /// Smallest memory limit with which anything would be refined, bytes.
         required_bytes: u64,
     },
 }
 
 impl MemoryFallback {
-    /// Returns the omitted parts of refinement, each with the memory limit at which it would be included, bytes.
+    /// Returns the names of the omitted parts of refinement, each with the smallest memory limit, bytes, with which it
+    /// would be included.
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {
         match self {
             MemoryFallback::Nothing => Vec::new(),

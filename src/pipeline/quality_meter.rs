@@ -1,4 +1,5 @@
-//! Quality of a compressed model, measured on views for the search and on views held back for the report.
+//! Quality of a compressed model: on views by which a search for a quality compares models, and on other views, held
+//! back from the search, for the report.
 
 use rayon::prelude::*;
 
@@ -12,28 +13,29 @@ use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
 
-/// Images that renders of a model are compared with.
+/// Images with which renders of a compressed model are compared.
 pub(super) enum QualityReference<'a> {
-    /// Renders of the original: targets, and the indices of the views among them.
+    /// Renders of the original: stored target renders, and for each view of the meter the index of its target.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
     Photographs(Photographs),
 }
 
-/// Set of views on which models are measured.
+/// Views on which compressed models are measured, with the images that their renders are compared with.
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// Views in order of frames; the flag tells whether a view is held back.
+    /// Views in order of frames. The flag is true for a view held back from the search.
     pictures: Vec<(FrameView, bool)>,
     comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// Returns a meter for `pictures`, in order of frames, each with a flag that tells whether it is held back.
+    /// Returns a meter for the views `pictures`, in order of frames. The flag of a view is true if it is held back from
+    /// the search. `comparison` holds the images to compare with.
     ///
     /// # Errors
-    /// Fails if no view is held back, or all are.
+    /// Fails if no view is held back from the search, or all are.
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
@@ -51,8 +53,8 @@ impl<'a> QualityMeter<'a> {
         Ok(QualityMeter { scene, cameras, pictures, comparison })
     }
 
-    /// Returns the mean PSNR of renders of `source`, dB: on the views held back if `held`, otherwise on the views for
-    /// the search.
+    /// Returns the mean PSNR of renders of `source`, dB. If `held`, measures on the views held back from the search,
+    /// otherwise on the views of the search.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read.
@@ -70,7 +72,7 @@ impl<'a> QualityMeter<'a> {
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
                     QualityReference::Original(targets, numbers) => {
-                        // Rendered like the targets.
+                        // Must be rendered in the same way as the targets.
                         let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
                     }
@@ -83,13 +85,13 @@ impl<'a> QualityMeter<'a> {
         Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 
-    /// Returns the number of views for the search.
+    /// Returns the number of views by which the search compares models.
     pub(super) fn search_view_count(&self) -> usize {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
-    /// Returns the names of the views held back, made of frame and view. A view between the cameras of the scene is
-    /// named by its frame.
+    /// Returns the names of the views held back from the search, made of frame and view number. A view between the
+    /// cameras of the scene has only the frame in its name.
     pub(super) fn held_back_names(&self) -> Vec<String> {
         let name = |picture: &FrameView| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),

@@ -1,7 +1,7 @@
-//! The file `recipe.toml` beside a result: everything that is needed to repeat the run.
+//! The file `recipe.toml` beside a result, which holds everything that is needed to repeat the run.
 //!
-//! Contents of the file: `[provenance]` with the tool and the digest of the input; `[run]` with every option beside the
-//! parameters that affects a byte of the result; then every parameter of the method.
+//! Contents of the file: the table `[provenance]` with the program and the digest of the input; the table `[run]` with
+//! every option that affects a byte of the result, except parameters; then every parameter of the method.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ use crate::models::{Link, ZeroRotation};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 
-/// Origin of a recipe.
+/// Program and input with which a recipe file was written.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
     /// Name and version of the program.
@@ -25,68 +25,68 @@ pub struct Provenance {
     pub input_digest: String,
 }
 
-/// Options that affect the result, beside the parameters of the recipe. `None` means not given.
+/// Options of a run that affect the result, except the parameters of the recipe. `None` means not given.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunOptions {
-    /// Choice of pruning, merging or both.
+    /// Whether the run prunes, merges or does both.
     pub mode: Only,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
-    /// Exact fraction of the Gaussians in the output.
+    /// Exact number of Gaussians in the output, as a fraction of those in the input.
     pub target_ratio: Option<f64>,
-    /// Minimum PSNR against renders of the original, dB.
+    /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     pub min_psnr: Option<f64>,
-    /// Maximum loss of PSNR against photographs, dB.
+    /// Maximum loss of mean PSNR against photographs, compared with the original model, dB.
     pub max_loss: Option<f64>,
-    /// Folder of these photographs. In a file the path is relative to the folder of the recipe.
+    /// Folder of the photographs for `max_loss`. In a recipe file the path is relative to the folder of the file.
     pub ground_truth: Option<PathBuf>,
-    /// Maximum number of bytes of all written files.
+    /// Maximum number of bytes of all output files together.
     pub target_size: Option<u64>,
-    /// Minimum PSNR of an archive's views against views of the result before quantization, dB.
+    /// Minimum PSNR, dB, of renders of an archive against renders of the result before its values are quantized.
     pub archive_psnr: Option<f64>,
-    /// Ids to keep, as a list with ranges.
+    /// Ids of Gaussians to keep, as a list with ranges such as `3,10-20`.
     pub keep_ids: Option<String>,
-    /// Ids to drop, as a list with ranges.
+    /// Ids of Gaussians to drop, as a list with ranges such as `3,10-20`.
     pub drop_ids: Option<String>,
-    /// Box whose Gaussians are kept: low corner, high corner.
+    /// Box, in scene units, whose Gaussians are kept: the three low coordinates, then the three high ones.
     pub keep_box: Option<[f64; 6]>,
-    /// Kind of output, as `--as` names it.
+    /// Kind of output, by the name that the option `--as` has for it.
     pub output: Option<OutputKind>,
-    /// Training iteration of a model folder.
+    /// Training iteration whose files are read from a model folder.
     pub iteration: Option<u32>,
-    /// Value of `--time-duration` for the model.
+    /// Value of the option `--time-duration` for the input model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time_duration: Option<f64>,
-    /// Whether `--rot4d unflipped` was given for the model.
+    /// Whether the option `--rot4d unflipped` was given for the input model.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
-    /// Value of `--zero-rotation` for a `.splatv`.
+    /// Value of the option `--zero-rotation` for an input in the format `.splatv`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_rotation: Option<ZeroRotation>,
-    /// File or folder of the cameras. In a file the path is relative to the folder of the recipe.
+    /// File or folder of the cameras. In a recipe file the path is relative to the folder of the file.
     pub cameras: Option<PathBuf>,
-    /// Split of the views that was scored; `None`: all views.
+    /// Split (training, test …) whose views were used for scoring; `None`: all views.
     pub split: Option<Split>,
-    /// Number of evenly spaced frames of a model that is continuous in time.
+    /// Number of evenly spaced frames that a model continuous in time is divided into.
     pub frames: Option<usize>,
-    /// Width and height of views in pixels, for cameras that do not name any.
+    /// Width and height of views in pixels, for cameras that state no size.
     pub size: Option<(u32, u32)>,
-    /// Source of the times of views, as for `--times`; `None`: the views' own times. In a file the path of a table is
-    /// relative to the folder of the recipe.
+    /// Source of the times of views, in the form of the option `--times`; `None`: the views' own times. In a recipe
+    /// file the path of a table of times is relative to the folder of the file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
-    /// Whether frames were linked; `None` if this was determined automatically.
+    /// Whether Gaussians were linked between frames; `None` if the program decided this.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub link: Option<Link>,
 }
 
-/// Tables of a recipe file beside the parameters of the method.
+/// Tables of a recipe file other than the parameters of the method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecipeRecord {
-    /// Origin of the recipe.
+    /// Program and input with which the recipe file was written.
     pub provenance: Option<Provenance>,
-    /// Options of the run.
+    /// Options of the run that affect the result.
     pub run: Option<RunOptions>,
 }
 
@@ -96,7 +96,7 @@ impl RunOptions {
         self.target_count.map(Target::Count).or(self.target_ratio.map(Target::Ratio))
     }
 
-    /// Returns the requested goal, if any.
+    /// Returns the requested goal (a quality or a size on disk), if any.
     ///
     /// # Errors
     /// Fails with a message if several goals are given, if a goal is incomplete, or if a value in decibels is out of
@@ -121,7 +121,7 @@ impl RunOptions {
 }
 
 impl RunOptions {
-    /// Returns the options with every path replaced by the result of `path`.
+    /// Returns the options with every path replaced by what `path` returns for it.
     fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> RunOptions {
         self.cameras = self.cameras.as_deref().map(&path);
         self.ground_truth = self.ground_truth.as_deref().map(&path);
@@ -134,7 +134,8 @@ impl RunOptions {
 }
 
 impl RecipeRecord {
-    /// Returns the record of `request`, with the ids that `user` keeps and drops.
+    /// Returns the record of a run of `request`. `user` holds the ids that the user keeps and drops, `input_digest` the
+    /// digest of the input.
     pub(super) fn new(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),
@@ -177,17 +178,18 @@ impl RecipeRecord {
         RecipeRecord { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
     }
 
-    /// Parses the tables beside the parameters from the text of a recipe file in `folder`. Relative paths in the text
-    /// are resolved against `folder`.
+    /// Parses the tables `[provenance]` and `[run]` from the text of a recipe file in `folder`. Relative paths in the
+    /// text are resolved against `folder`.
     ///
     /// # Errors
-    /// Fails with a message if a table does not have the form of [`RunOptions`].
+    /// Fails with a message if one of the two tables has unknown or wrong entries.
     pub fn read(text: &str, folder: &Path) -> std::result::Result<RecipeRecord, String> {
         let record: RecipeRecord = toml::from_str(text).map_err(|error| error.to_string())?;
         Ok(RecipeRecord { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
-    /// Returns the record for a recipe file in `folder`, with paths relative to this folder and without absolute paths.
+    /// Returns the record for a recipe file in `folder`: every path is relative to `folder`, or is only a file name if
+    /// it cannot be.
     fn seen_from(&self, folder: &Path) -> RecipeRecord {
         RecipeRecord {
             run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))),
@@ -195,7 +197,7 @@ impl RecipeRecord {
         }
     }
 
-    /// Returns the text of the file `recipe.toml` in `folder`.
+    /// Returns the text of the file `recipe.toml` that is written to `folder`.
     pub(super) fn text(&self, request: &Request, folder: &Path) -> String {
         format!(
             "# What this result was made with; give it to --recipe to repeat the run.\n{}\n{}",

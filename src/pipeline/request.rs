@@ -1,4 +1,4 @@
-//! The request of a user: input, output, recipe and size or quality of the result.
+//! The request of a user: input, output, recipe, and the size or quality of the result.
 
 use std::path::PathBuf;
 
@@ -10,41 +10,42 @@ use crate::outputs::kind::OutputKind;
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
-/// Choice of pruning, merging or both.
+/// Whether a run prunes, merges or does both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Only {
-    /// Prunes, then merges.
+    /// Prunes Gaussians, then merges the survivors.
     #[default]
     Both,
-    /// Prunes only (the paper's "pruned").
+    /// Only prunes Gaussians (the paper's "pruned").
     Prune,
-    /// Merges only (the paper's "merged").
+    /// Only merges Gaussians (the paper's "merged").
     Merge,
 }
 
 /// Requested number of Gaussians in the output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Target {
-    /// Exact number.
+    /// Exact number of Gaussians.
     Count(u64),
-    /// Fraction of the input in (0, 1], rounded to the nearest number and at least one.
+    /// Fraction of the input's Gaussians, above 0 and at most 1. The product is rounded to the nearest number, at least
+    /// 1.
     Ratio(f64),
 }
 
-/// Goal by which the size of the output is found.
+/// Goal by which the number of Gaussians in the output is found.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// Smallest output that has at least this quality.
+    /// The smallest output that has at least this quality.
     Quality(Quality),
-    /// Best output whose files together have at most this many bytes.
+    /// The best output whose files together have at most this number of bytes.
     Bytes(u64),
 }
 
-/// Requested quality of an output.
+/// Quality that the output must have.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Quality {
-    /// Minimum mean PSNR against renders of the original, dB.
+    /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     Psnr(f64),
     /// Maximum loss of mean PSNR against photographs, compared with the original model.
     Loss {
@@ -55,10 +56,10 @@ pub enum Quality {
     },
 }
 
-/// Returns `value` if it is a valid quality in decibels: above 0 and at most 100.
+/// Returns `value` if it is a valid number of decibels for a quality: above 0 and at most 100.
 ///
 /// # Errors
-/// Fails with a message that names the parameter `name` if it is not.
+/// Fails with a message that names the parameter `name` if `value` is out of this range.
 pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, String> {
     match value > 0.0 && value <= 100.0 {
         true => Ok(value),
@@ -66,41 +67,41 @@ pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, Strin
     }
 }
 
-/// Complete request of a compression.
+/// Everything that a user asks for in a compression.
 #[derive(Debug, Clone)]
 pub struct Request {
-    /// Input to read.
+    /// Input to read, with the options for reading it.
     pub input: InputOptions,
-    /// Path to write to.
+    /// Path of the output.
     pub output: PathBuf,
-    /// Kind of output; `None`: determined by the output's name.
+    /// Kind of output, such as archive or model folder; `None`: determined by the name of the output.
     pub kind: Option<OutputKind>,
-    /// Recipe with the parameters of the method.
+    /// Parameters of the method.
     pub recipe: Recipe,
-    /// Digest of the input for which the recipe was written, if known. A different input causes a note.
+    /// Digest of the input for which the recipe was written, if known. For another input the user gets a note.
     pub made_for: Option<String>,
-    /// Minimum PSNR of an archive's views against views of the result before quantization, dB. `None`: derived from the
-    /// quality of the result.
+    /// Minimum PSNR, dB, of renders of an archive against renders of the result before its values are quantized.
+    /// `None`: derived from the quality of the result.
     pub archive_psnr: Option<f64>,
-    /// Choice of pruning, merging or both.
+    /// Whether the run prunes, merges or does both.
     pub only: Only,
     /// Exact number or fraction of Gaussians in the output, if requested.
     pub target: Option<Target>,
-    /// Goal by which the number of Gaussians is found, if requested; then `target` is `None`.
+    /// Goal (quality or size on disk) by which the number of Gaussians is found, if requested; then `target` is `None`.
     pub goal: Option<Goal>,
-    /// Ids to keep: a list such as `3,10-20`, or a file.
+    /// Ids of Gaussians to keep: a list such as `3,10-20`, or the path of a file with a list.
     pub keep_ids: Option<String>,
-    /// Ids to drop: a list such as `3,10-20`, or a file.
+    /// Ids of Gaussians to drop: a list such as `3,10-20`, or the path of a file with a list.
     pub drop_ids: Option<String>,
-    /// Box whose Gaussians are kept: low corner, high corner, scene units.
+    /// Box, in scene units, whose Gaussians are kept: the three low coordinates, then the three high ones.
     pub keep_box: Option<[f64; 6]>,
-    /// Policy for an output that exists already.
+    /// What to do if the output exists already.
     pub overwrite: Replace,
 }
 
 impl Request {
-    /// Returns a request that prunes and merges `input` to the size that the recipe gives. It keeps and drops no single
-    /// Gaussians and replaces no existing output.
+    /// Returns a request that compresses `input` by the parameters of `recipe` and writes to `output`. Keeps and drops
+    /// no particular Gaussians and replaces no existing output.
     pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
         Request {
             input,
@@ -121,11 +122,11 @@ impl Request {
 }
 
 impl Target {
-    /// Returns the target number of Gaussians for an input of `count` Gaussians.
+    /// Returns the requested number of output Gaussians for an input of `count` Gaussians.
     ///
     /// # Errors
-    /// Fails if the ratio is not in (0, 1] or the number is not in 1..=`count`. An input without Gaussians always gives
-    /// 0.
+    /// Fails if the fraction is not above 0 and at most 1, or if the number is not from 1 to `count`. For an input
+    /// without Gaussians the number is always 0.
     pub fn count(self, count: usize) -> Result<usize> {
         let wanted = match self {
             Target::Count(wanted) => wanted,

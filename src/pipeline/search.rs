@@ -1,9 +1,11 @@
-//! Search for the smallest model that has the requested quality: a loop around the stages that reduce the model.
+//! Search for the smallest model that has a requested quality: repeats the stages that reduce the model to a number of
+//! Gaussians.
 //!
-//! Sizes are tried one after the other, each refined as if it had been requested. The next size follows from the
-//! surplus of quality at the last sizes, and lies between the largest size that failed and the smallest that passed.
-//! Refinement states after prune steps are kept, so that a smaller size continues from there. A quarter of the views is
-//! never used by the search and gives the reported figure (method.md, section 6.3).
+//! Sizes (numbers of Gaussians) are tried one after the other; each model is refined as if its size had been requested.
+//! The next size is computed from the surplus of quality at the last sizes, and lies between the largest size that
+//! failed and the smallest that passed. The states of refinement after prune steps (removals of the lowest-ranked
+//! Gaussians) are kept, so that a smaller size continues from one of them. A quarter of the views is never used by the
+//! search and gives the reported quality (method.md, section 6.3).
 
 use super::planning::Planning;
 use super::quality_meter::{QualityMeter, QualityReference};
@@ -34,51 +36,54 @@ use crate::scene::pictures::{ViewSet, pictures};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "search";
-/// Fraction of the Gaussians that is tried first.
+/// Fraction of the Gaussians in the first model that is tried.
 const FIRST_FRACTION: f64 = 0.2;
-/// Usual number of sizes that are tried, for estimates.
+/// Usual number of sizes (numbers of Gaussians) that are tried; used for estimates of time.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Maximum number of sizes that are tried.
+/// Maximum number of sizes (numbers of Gaussians) that are tried, apart from the full size if all of them fail.
 const MAX_SIZES: usize = 8;
-/// Ratio of two sizes up to which they count as equal, so that the search ends.
+/// The search ends when the smallest size that passed is at most this factor times the largest size that failed.
 const SAME_SIZE_RATIO: f64 = 1.04;
-/// Approximate cost of halving the number of Gaussians: PSNR in dB, and the factor by which a loss grows. The search
-/// derives its guesses from it.
+/// Approximate cost of halving the number of Gaussians: the PSNR that is lost, dB, and the factor by which a loss of
+/// PSNR grows. The search guesses its next size from them.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
-/// Maximum surplus of quality of an accepted size, in halvings of the number of Gaussians.
+/// Surplus of quality that is small enough to end the search. Unit: number of times that the surplus would allow the
+/// number of Gaussians to be halved.
 const MAX_SURPLUS: f64 = 0.03;
-/// Smallest loss that the search distinguishes, dB.
+/// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
-/// Interval of held-back views among those with photographs: every fourth is held back.
+/// One of this many views with photographs is held back from the search, for the report.
 const HELD_EVERY: usize = 4;
 
-/// Search of a run: repeats the stages that reduce the model, once for every size it tries.
+/// Search of a run for the smallest model with a requested quality. Repeats the stages that reduce the model.
 #[derive(Debug, Clone)]
 pub struct SearchStage {
     /// Quality that the user requested.
     quality: Quality,
-    /// Quality that is searched for. For an archive it is higher than requested, because quantization costs quality.
+    /// Quality that the search must reach. For an archive it is higher than requested, because quantization costs
+    /// quality.
     searched: Quality,
-    /// Number of views of the original by which sizes are refined and compared.
+    /// Number of views of the original that models are refined on and compared with.
     pictures: usize,
-    /// Refinement of each size; `None` if nothing is refined.
+    /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// Margins, dB, of the half-precision field and of dropped SH degrees; `None`: the field or the degree stays.
+    /// Margins of quality, dB, required for writing the deformation field in half precision and for dropping SH
+    /// degrees; `None` if the field or the degrees are not reduced.
     margins: [Option<f64>; 2],
 }
 
-/// Size that was tried, with its result.
+/// Model of one size (number of Gaussians) that was tried, with its quality.
 struct TriedSize {
     result: CompressedModel,
-    /// PSNR or loss of PSNR, dB, on the views of the search.
+    /// PSNR, or loss of PSNR, dB, on the views of the search.
     value: f64,
     journal: Journal,
 }
 
 impl SearchStage {
-    /// Returns the search of a run that asks for a quality.
+    /// Returns the search of a run; `None` if no quality is requested.
     pub fn from_planning(planning: &Planning<'_>) -> Option<SearchStage> {
         let Planning { request, output, .. } = *planning;
         let Some(Goal::Quality(quality)) = &request.goal else { return None };
@@ -102,9 +107,9 @@ impl SearchStage {
         format!("search: {} sizes at most, for {} {}", MAX_SIZES, self.name(), self.goal())
     }
 
-    /// Returns the estimate of the search. `repeated` are the estimates of the stages that run for every size. Memory
-    /// is that of the largest of them plus the models that the search keeps; time and reads are the sums over all, for
-    /// each size.
+    /// Returns the resource estimate (memory, time, reads) of the search. `repeated` holds the estimates of the stages
+    /// that run for every size. Memory is that of the largest of these stages plus the models that the search keeps;
+    /// time and reads are their sums, times the usual number of sizes.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state(Attributes::all());
@@ -128,18 +133,19 @@ impl SearchStage {
         need.stage = NAME;
         need.seconds = SIZES_USUALLY_TRIED * seconds.max(measured.seconds);
         need.reads = SIZES_USUALLY_TRIED * reads.max(measured.reads);
-        // A rendered view, and its comparison image as it is read and as it is used.
+        // A rendered view, and the image that it is compared with: once as read, once as used.
         need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
-        // Prune steps remove a fifth each, starting from two fifths: together twice the Gaussians.
+        // Prune steps remove a fifth of the Gaussians each, starting from two fifths of all: the states kept after them
+        // hold twice the number of Gaussians together.
         need.per_gaussian.extend([("ways", 3 * (whole + 8)), ("result", work.input.reduced), ("kept", CLUSTERED)]);
         need
     }
 
-    /// Finds the smallest result with the requested quality. Stores the result and the summary of the search in `run`.
+    /// Finds the smallest model with the requested quality. Stores the model and the summary of the search in `run`.
     ///
     /// # Errors
-    /// Fails if frames or photographs cannot be read, or if there are too few views.
+    /// Fails if frames or photographs cannot be read, or if there are too few views for a search.
     pub fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scene, scored, ranking) = (run.scene, run.scored()?, run.ranking()?);
         let key = self.key(scene, &scored, &ranking, &run.template)?;
@@ -182,7 +188,8 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns the meter by which sizes are compared: against photographs, or against renders of the original.
+    /// Returns the meter by which models are compared, against photographs if `photographs` is given, otherwise against
+    /// renders of the original.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -213,7 +220,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the cache key of everything that the search depends on.
+    /// Returns the cache key, a digest of everything that the search depends on.
     fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, template: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
@@ -232,7 +239,7 @@ impl SearchStage {
         )))
     }
 
-    /// Checks, before any work, that there are enough photographs if a maximum loss is requested.
+    /// Checks, before any work, that there are enough photographs if a maximum loss against photographs is requested.
     ///
     /// # Errors
     /// Fails if photographs are missing or too few.
@@ -240,8 +247,8 @@ impl SearchStage {
         self.photographs(scene).map(|_| ())
     }
 
-    /// Returns the test views that have a photograph, with their photographs; `None` unless a maximum loss is
-    /// requested.
+    /// Returns the test views for which photographs exist, with the photographs; `None` unless a maximum loss against
+    /// photographs is requested.
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<FrameView>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
@@ -256,14 +263,15 @@ impl SearchStage {
         Ok(Some(found))
     }
 
-    /// Tries sizes between the number of protected Gaussians and the number that may stay. Returns the smallest size
-    /// that has the requested quality, or the model with all Gaussians that may stay if none has. Also returns every
-    /// tried size with its value in dB.
+    /// Tries sizes from the number of Gaussians that must stay to the number that may stay. Returns the smallest model
+    /// that has the requested quality, or the model of all Gaussians that may stay if none has. Also returns every
+    /// tried size with the PSNR or loss of its model, dB.
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
-        // Sizes, each with its surplus in halvings: `low` fails, `high` passes. `None`: not tried.
+        // Bounds of the search, each with its surplus of quality in halvings: size `low` fails, size `high` passes.
+        // `None`: not tried.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
         let mut next = FIRST_FRACTION * all as f64;
         while tried.len() < MAX_SIZES && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE_RATIO * low.0 as f64 {
@@ -281,7 +289,7 @@ impl SearchStage {
             }
             next = match (low, high) {
                 ((low, Some(below)), (high, Some(above))) => {
-                    // Slightly above the size at which the line between both surpluses crosses zero.
+                    // Slightly above the size at which the line through both surpluses crosses zero.
                     let part = ((0.5 * MAX_SURPLUS - below) / (above - below)).clamp(0.1, 0.9);
                     low as f64 * (high as f64 / low as f64).powf(part)
                 }
@@ -299,7 +307,8 @@ impl SearchStage {
         Ok((best, tried))
     }
 
-    /// Runs the stages that reduce the model to `size` Gaussians and measures the result.
+    /// Runs the stages that reduce the model to `size` Gaussians, and measures the quality of the result on the views
+    /// of the search.
     fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;
@@ -310,8 +319,8 @@ impl SearchStage {
         Ok(TriedSize { result, value, journal })
     }
 
-    /// Returns the value that the goal limits, PSNR or loss of PSNR in dB, of `result`: on the views held back if
-    /// `held`, otherwise on the views of the search.
+    /// Returns the quality of the model `result` in the form of the request, PSNR or loss of PSNR, dB. If `held`,
+    /// measures on the views held back from the search, otherwise on the views of the search.
     fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
         let found = meter.measure(result, held)?;
         match self.searched {
@@ -320,18 +329,18 @@ impl SearchStage {
         }
     }
 
-    /// Returns the surplus of quality of `value` over the goal, in approximate halvings of the number of Gaussians.
-    /// Negative if the goal is missed.
+    /// Returns by how much `value` (PSNR or loss, dB) is better than requested, as the approximate number of times that
+    /// the number of Gaussians could be halved. Negative if the quality is missed.
     fn surplus(&self, value: f64) -> f64 {
         match self.searched {
-            // Renders that are not finite never pass.
+            // Renders with NaN or infinity never pass.
             _ if value.is_nan() => f64::NEG_INFINITY,
             Quality::Loss { most, .. } => (most / value.max(MIN_LOSS)).ln() / COST_OF_HALVING.1.ln(),
             Quality::Psnr(least) => (value - least) / COST_OF_HALVING.0,
         }
     }
 
-    /// Returns the PSNR or the loss that is searched for, dB.
+    /// Returns the PSNR or the loss of PSNR, dB, that the search must reach.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,
@@ -339,7 +348,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the name of the goal as in a recipe file.
+    /// Returns the name of the requested quality in a recipe file: `min_psnr` or `max_loss`.
     fn name(&self) -> &'static str {
         match self.quality {
             Quality::Psnr(_) => "min_psnr",
@@ -359,8 +368,8 @@ impl SearchStage {
     }
 }
 
-/// Returns a note about the result of the search for display. `searched` is the number of views of the search, `is_met`
-/// tells whether the result has the requested quality.
+/// Returns a note for display about the result of the search. `searched`: number of views of the search. `gaussians`:
+/// number of Gaussians in the result. `is_met`: whether the result has the requested quality.
 fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());

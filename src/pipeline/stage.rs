@@ -1,7 +1,7 @@
-//! Interface of the stages of a run, and the state that they pass on to one another.
+//! Interface of the stages of a run, and the state of the run, through which stages pass on their results.
 //!
-//! A stage is one file in [`stages`](super::stages): a type that implements [`Stage`], and a function that plans it.
-//! The list `STAGES` there holds these functions in the order in which stages run.
+//! A stage is one file in [`stages`](super::stages): a type that implements [`Stage`], and a function that adds it to
+//! the plan of a run. The list `STAGES` in that module holds these functions in the order in which stages run.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -27,54 +27,55 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// Fraction of the Gaussians that ranking leaves in a search without refinement.
+/// Fraction of the Gaussians that ranking keeps in a search for a quality without refinement.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
-/// Phase of a run that a stage belongs to.
+/// Phase of a run to which a stage belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// From frames to a ranking of all Gaussians.
+    /// Stages from the input's frames to a ranking of all Gaussians.
     Rank,
-    /// From a ranking to a model of one size. A search for a quality repeats these stages, once for every size it
-    /// tries.
+    /// Stages from the ranking to a model with one number of Gaussians. A search for a quality repeats these stages,
+    /// once for every number it tries.
     Reduce,
-    /// From the model to files.
+    /// Stages from the model to the output files.
     Write,
 }
 
-/// Inputs of the estimates of memory and time.
+/// What the estimates of a stage's memory, time and reads depend on.
 #[derive(Debug, Clone, Copy)]
 pub struct EstimateInput<'a> {
-    /// Size of the input and of its views.
+    /// Sizes of the input and of its views.
     pub work: &'a Workload,
-    /// Limits on the data that is in memory at a time.
+    /// Maximum amounts that stages keep in memory at a time.
     pub limits: &'a Limits,
-    /// Fraction of the Gaussians in the output, above 0 and at most 1; 1 if it is not known in advance.
+    /// Number of Gaussians in the output, as a fraction of the input's, above 0 and at most 1; 1 if not known in
+    /// advance.
     pub left: f64,
-    /// Statistics that were taken while a stream arrived.
+    /// Statistics of a stream that were already taken while it arrived.
     pub measured: MeasuredOnArrival,
 }
 
-/// A stage of a run, with its parameters.
+/// Stage of a run, with its parameters.
 pub trait Stage: Debug + Send + Sync {
-    /// Returns the estimates of the stage, one for each part that progress lines name. Empty if the stage has nothing
-    /// to do for such an input or takes a negligible amount.
+    /// Returns the estimates of the memory, time and reads of the stage, one for each part with a progress line of its
+    /// own. Empty if the stage has nothing to do for the input, or needs only a negligible amount.
     fn estimates(&self, input: EstimateInput<'_>) -> Vec<ResourceEstimate>;
 
-    /// Returns the parameters that determine the duration of the stage, for display: "NAME: 3000 steps". Empty if there
-    /// are none.
+    /// Returns the parameters that determine the duration of the stage, for display in the form "NAME: 3000 steps".
+    /// Empty if there are none.
     fn parameters(&self) -> String {
         String::new()
     }
 
-    /// Returns whether the stage may find nothing to do if views hardly change when the fraction `hardly_seen` of the
-    /// Gaussians is removed. The shortest time of a run is estimated without such stages.
+    /// Returns whether the stage may find nothing to do, because renders hardly change when the fraction `_hardly_seen`
+    /// of the Gaussians is removed. The lower bound of the time of a run leaves out such stages.
     fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
         false
     }
 
-    /// Returns the work that several processes can divide among themselves, one line per unit kind: "NAME: 12 blocks of
-    /// Gaussians".
+    /// Returns the work that several processes can divide among themselves, one line per kind of unit: "NAME: 12 blocks
+    /// of Gaussians".
     fn shardable_units(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
         Vec::new()
     }
@@ -87,28 +88,29 @@ pub trait Stage: Debug + Send + Sync {
         Ok(())
     }
 
-    /// Runs the stage. It reads its input from `run`, stores its results there, and records in the journal its part of
-    /// the summary. Results are cached under the stage's own key, so that an interrupted run continues from them.
+    /// Runs the stage: reads its input from `run` and stores its results there, and adds its entries to the journal.
+    /// Results are cached under a key of the stage, so that a repeated run after an interruption does not compute them
+    /// again.
     ///
     /// # Errors
     /// Fails if the input cannot be read, the output cannot be written, or the input cannot meet the request.
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Kinds of statistics of a stream that were taken while it arrived.
+/// Kinds of statistics of a stream that were already taken while it arrived.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
-    /// Whether the scan was done: statistics of every Gaussian at every frame.
+    /// Whether all frames were scanned for the statistics of every Gaussian, except its visible contribution.
     pub scanned: bool,
     /// Whether the visible contribution of every Gaussian was measured on views.
     pub seen: bool,
 }
 
-/// Statistics of the frames before scoring.
+/// Statistics of all Gaussians before scoring.
 pub struct Measured {
-    /// Statistics of every Gaussian from the scan.
+    /// Statistics of every Gaussian from the scan of all frames.
     pub scanned: ScanResult,
-    /// Visible contribution of every Gaussian, if views were rendered.
+    /// Visible contribution of every Gaussian to renders, if views were rendered.
     pub seen: Option<VisibleContribution>,
 }
 
@@ -119,32 +121,33 @@ impl Measured {
     }
 }
 
-/// Number of Gaussians that each part of a run leaves: ranking removes the first ones, refinement the rest in prune
-/// steps.
+/// How many Gaussians each part of a run leaves: ranking removes the first ones; refinement then removes the rest in
+/// prune steps (removals of the lowest-ranked Gaussians between optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Smallest fraction of all Gaussians with which refinement begins, if it removes the rest in prune steps. `None`:
-    /// ranking alone removes Gaussians.
+    /// Refinement begins with at least this fraction of all Gaussians and removes those above the target in prune
+    /// steps. `None`: ranking alone removes Gaussians.
     pub refinement_starts_at: Option<f64>,
-    /// Whether the number of Gaussians in the output is searched for.
+    /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
 }
 
 impl CountPlan {
-    /// Returns the number of Gaussians, of `all`, with which refinement begins if `wanted` are to stay.
+    /// Returns with how many of `all` Gaussians refinement begins if the output is to have `wanted`.
     pub fn before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
-    /// Returns the number of Gaussians, of `all`, that ranking leaves if `wanted` are to stay. A search ranks down to
-    /// the number that its smallest size needs.
+    /// Returns how many of `all` Gaussians ranking leaves if the output is to have `wanted`. A search for a quality
+    /// ranks only once, down to the number that its smallest model needs.
     pub fn after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
         self.before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
-    /// Returns both counts as text for display, for a run from `all` Gaussians to `target`.
+    /// Returns as text for display how many of `all` Gaussians ranking and refinement leave. `target` is the number of
+    /// Gaussians in the output, if known; `merges` tells whether survivors are merged.
     pub(super) fn text(&self, target: Option<usize>, all: usize, merges: bool) -> String {
         let share =
             |count: usize| format!("{count} of {all} Gaussians ({:.0}%)", 100.0 * count as f64 / all.max(1) as f64);
@@ -166,25 +169,25 @@ impl CountPlan {
     }
 }
 
-/// Function that returns the resource estimate of a stage for an input, within limits.
+/// Function that returns the resource estimate (memory, time, reads) of a stage for an input, within limits.
 type Estimate = Box<dyn Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync>;
 
-/// Stage that a run omits.
+/// Stage or step that a run omits, with the reason.
 struct LeftOutStage {
     what: &'static str,
     why: String,
-    /// Estimate of the omitted work.
+    /// Estimate of the memory, time and reads that are saved.
     estimate: Option<Estimate>,
 }
 
-/// Stages of a run in their order, and the stages that it omits.
+/// Stages of a run in the order in which they run, and the stages that it omits.
 #[derive(Default)]
 pub struct StageList {
     stages: Vec<(Phase, Box<dyn Stage>)>,
     left_out: Vec<LeftOutStage>,
-    /// Numbers of Gaussians that ranking and refinement leave.
+    /// How many Gaussians ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether the amount of work depends on results of stages, which widens the range of time estimates.
+    /// Whether the amount of work depends on results of stages, so that the time of the run is less certain.
     is_open_ended: bool,
 }
 
@@ -199,7 +202,8 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
     }
 
-    /// Adds the omitted stage `what` with the reason `why`; `estimate` returns its cost.
+    /// Adds the omitted stage `what` with the reason `why`; `estimate` returns the memory, time and reads that are
+    /// saved.
     pub fn leave_out_stage(
         &mut self,
         what: &'static str,
@@ -209,7 +213,7 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
-    /// Marks the amount of work as dependent on results of stages.
+    /// Notes that the amount of work depends on results of stages.
     pub fn set_open_ended(&mut self) {
         self.is_open_ended = true;
     }
@@ -219,12 +223,12 @@ impl StageList {
         self.is_open_ended
     }
 
-    /// Returns all stages.
+    /// Returns all stages in the order in which they run.
     pub fn all(&self) -> impl Iterator<Item = &dyn Stage> {
         self.stages.iter().map(|(_, stage)| &**stage)
     }
 
-    /// Returns the stages of `phase`.
+    /// Returns the stages of `phase` in the order in which they run.
     pub fn in_phase(&self, phase: Phase) -> impl Iterator<Item = &dyn Stage> {
         self.stages.iter().filter(move |(stage_phase, _)| *stage_phase == phase).map(|(_, stage)| &**stage)
     }
@@ -242,7 +246,7 @@ impl StageList {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
-    /// Records the omitted stages in the journal, with the saved time and reads where an estimate exists.
+    /// Adds the omitted stages to the journal, with the saved time and reads where an estimate exists.
     pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
         for LeftOutStage { what, why, estimate } in &self.left_out {
             match estimate.as_ref().map(|estimate| estimate(work, limits)) {
@@ -256,39 +260,39 @@ impl StageList {
     }
 }
 
-/// Content of an archive.
+/// Content of an archive (compact file of the result, with quantized values).
 #[derive(Debug, Serialize, Deserialize)]
 pub enum Archived {
-    /// Encoded model or point cloud.
+    /// Encoded model or point cloud, ready to be written.
     Content(Encoded),
-    /// Error bounds within which the frames are stored.
+    /// Error bounds of the values, within which the frames are written later.
     Frames(Bounds),
 }
 
-/// Number of Gaussians that fits a byte limit at one SH degree.
+/// Number of Gaussians with which an output of one SH degree fits the requested size on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ByteLimitFit {
-    /// Highest SH degree of the result.
+    /// SH degree of the output.
     pub sh_degree: usize,
-    /// Number of Gaussians that fits at this degree.
+    /// Number of Gaussians that fits with this SH degree.
     pub gaussians: usize,
 }
 
-/// State of a run: its inputs and the results of its stages so far.
+/// State of a run: its inputs, and the results of the stages that have run.
 pub struct RunState<'a> {
-    /// Scene that is compressed.
+    /// Open input that is compressed, with its cameras.
     pub scene: &'a Scene,
     /// Request of the user.
     pub request: &'a Request,
-    /// Stages of the run, and the numbers of Gaussians that its parts leave.
+    /// Stages of the run, and how many Gaussians ranking and refinement leave.
     pub stages: &'a StageList,
-    /// Records for the summary.
+    /// Journal of the run so far, for the summary.
     pub journal: Journal,
-    /// Description of the input for the summary. Its digest reads the whole input, so it is computed once.
+    /// Description of the input for the summary. Computed only once, because its digest reads the whole input.
     pub input: Option<InputSummary>,
-    /// Text of the file `recipe.toml` beside the result.
+    /// Text of the file `recipe.toml` that is written beside the result.
     pub recipe: String,
-    /// Statistics of a stream that were taken while it arrived.
+    /// Statistics of a stream that were already taken while it arrived.
     pub arrived: Option<Measured>,
     /// Statistics and scores of all Gaussians.
     pub scored: Option<Arc<Scored>>,
@@ -296,27 +300,30 @@ pub struct RunState<'a> {
     pub ranking: Option<Arc<Ranking>>,
     /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
-    /// Numbers of Gaussians that fit the requested size on disk, in order of decreasing SH degree.
+    /// Numbers of Gaussians with which the output fits the requested size on disk, in order of decreasing SH degree.
     pub fits: Vec<ByteLimitFit>,
-    /// Model without Gaussians that holds the settings shared by all results of this run: SH degree, merge parameters.
+    /// Model without Gaussians from which results of this run are made; holds the settings that they share, such as SH
+    /// degree and merge parameters.
     pub template: CompressedModel,
-    /// Compressed model so far.
+    /// Compressed model as the stages so far have made it.
     pub result: CompressedModel,
-    /// Number of Gaussians of [`result`](RunState::result) that refinement leaves.
+    /// Number of Gaussians of [`result`](RunState::result) that refinement is to leave.
     pub wanted: usize,
-    /// Refinement state of a search after its prune steps, from which the next smaller size continues.
+    /// In a search for a quality: states of refinement after prune steps (removals of the lowest-ranked Gaussians),
+    /// from which a smaller model continues.
     pub prune_steps: Option<PruneSteps<'a>>,
-    /// Counts of the merge stage.
+    /// Counts of the merge stage, if Gaussians were merged.
     pub merge: Option<MergeSummary>,
-    /// Result of the search for a quality.
+    /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
-    /// Content of the archive, if one is written.
+    /// Content of the archive, if the output is an archive.
     pub archived: Option<Archived>,
-    /// Quality and size of the archive.
+    /// Quality and size of the archive, if the output is an archive.
     pub archive: Option<ArchiveSummary>,
-    /// Quality of the result, where it was measured.
+    /// Quality of the result, if it was measured.
     pub quality: Option<QualitySummary>,
-    /// Summary, and the index of every input Gaussian in the output; set once the result is written.
+    /// Summary of the run, and the index in the output of every input Gaussian (`None` if removed). Set once the result
+    /// is written.
     pub written: Option<(Summary, Vec<Option<u32>>)>,
 }
 
@@ -353,7 +360,7 @@ impl<'a> RunState<'a> {
         }
     }
 
-    /// Returns statistics and scores.
+    /// Returns the statistics and scores of all Gaussians.
     ///
     /// # Errors
     /// Fails with an internal error if no earlier stage has computed them.
@@ -361,7 +368,7 @@ impl<'a> RunState<'a> {
         self.scored.clone().ok_or_else(|| Error::internal("a stage needs scores before they were computed"))
     }
 
-    /// Returns the ranking.
+    /// Returns the ranking of all Gaussians that may stay.
     ///
     /// # Errors
     /// Fails with an internal error if no earlier stage has computed it.
@@ -369,7 +376,8 @@ impl<'a> RunState<'a> {
         self.ranking.clone().ok_or_else(|| Error::internal("a stage needs the ranking before it was computed"))
     }
 
-    /// Takes the model out of the state so that a stage can change it; leaves the template.
+    /// Takes the compressed model out of the state so that a stage can change it. Leaves the empty template in its
+    /// place.
     pub fn take_result(&mut self) -> CompressedModel {
         std::mem::replace(&mut self.result, self.template.clone())
     }

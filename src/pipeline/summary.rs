@@ -1,7 +1,7 @@
 //! Summary of a run for people and programs: counts before and after every stage, omitted stages with reasons, memory
-//! and time. It is the only output whose bytes differ between runs.
+//! and time. Of all output files only the summary has bytes that differ between equal runs.
 //!
-//! These types are the only definition of the schema of `summary.json`: `compress` writes and `report` reads the file
+//! These types are the only definition of the format of `summary.json`: `compress` writes and `report` reads the file
 //! through them. `format/SUMMARY.md` documents the fields for other programs.
 
 use std::collections::BTreeMap;
@@ -23,71 +23,73 @@ use crate::pruning::Counts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 
-/// Result of the search for a quality.
+/// Result of the search for the smallest model with a requested quality.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GoalSummary {
-    /// Kind of the goal: `min_psnr` or `max_loss`, both in dB.
+    /// Requested kind of quality: `min_psnr` (PSNR against the original) or `max_loss` (loss of PSNR against
+    /// photographs), both in dB.
     pub name: String,
-    /// Requested value, dB.
+    /// Requested PSNR or loss, dB.
     pub asked: f64,
-    /// Value of the output on the views of the search, dB.
+    /// PSNR or loss of the output on the views that the search used, dB.
     #[serde(deserialize_with = "number")]
     pub searched: f64,
-    /// Value of the output on views that were held back from the search, dB.
+    /// PSNR or loss of the output on views that the search did not use, dB.
     #[serde(deserialize_with = "number")]
     pub held: f64,
-    /// Names of the held-back views. A view between the cameras of the scene is named by its frame.
+    /// Names of the views that the search did not use. A view between the cameras of the scene has only the frame in
+    /// its name.
     pub held_pictures: Vec<String>,
-    /// Every tried number of Gaussians, with its value on the views of the search, dB.
+    /// Every number of Gaussians that was tried, with its PSNR or loss on the views that the search used, dB.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
 }
 
-/// Quality and contents of an archive.
+/// Quality and contents of an archive (compact file of the result, with quantized values).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ArchiveSummary {
-    /// Requested PSNR of the archive's views against views of the result before quantization, dB.
+    /// Requested PSNR of renders of the archive, compared with renders of the result before quantization, dB.
     pub asked: f64,
-    /// PSNR that was reached, dB.
+    /// PSNR of renders of the archive, compared with renders of the result before quantization, dB.
     pub psnr: f64,
-    /// PSNR of the result before quantization against the original, on the same views, dB.
+    /// PSNR of renders of the result before quantization, compared with renders of the original on the same views, dB.
     pub level: f64,
-    /// Loss of PSNR against the original caused by quantization, dB.
+    /// By how much quantization lowers the PSNR against the original, dB.
     pub loss: f64,
-    /// Bytes by part; `None` for an archive of frames, which has one part.
+    /// Number of bytes of each part of the archive; `None` for an archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parts: Option<ArchiveSize>,
-    /// Error bound of every attribute, by name, in the attribute's unit; only for an archive of frames.
+    /// Error bound of every attribute by its name, in the unit of the attribute; only for an archive of frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bounds: Option<BTreeMap<String, f64>>,
-    /// Bits of every attribute and tensor, by name; empty for an archive of frames.
+    /// Number of bits of every attribute and tensor, by name; empty for an archive of frames.
     pub bits: BTreeMap<String, f64>,
-    /// Measurements from which the quantization steps were derived, one entry per attribute or tensor: name, log2 of
-    /// the step (twice the error bound for frames), squared error of views caused by this step alone, and bits at this
-    /// step (for frames: in some blocks of Gaussians).
+    /// Measurements from which the quantization steps were derived. Each entry has the name of an attribute or tensor,
+    /// log2 of its step (of twice the error bound for frames), the squared error of renders caused by this step alone,
+    /// and the number of bits at this step (for frames: in some blocks of Gaussians).
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
-/// Description of the input.
+/// Description of the input of a run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
-    /// Path of the input: only the last component in files, the path as given on standard output.
+    /// Path of the input. In files only the last component; on standard output the path as given by the user.
     pub path: String,
     /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
-    /// Digest of the bytes read.
+    /// Digest of the bytes that were read.
     pub digest: String,
     /// Number of Gaussians, N.
     pub gaussians: usize,
     /// Number of frames, T; `None` for a model whose frames have not been chosen yet.
     pub frames: Option<usize>,
-    /// SH degree.
+    /// SH degree of the input.
     pub sh_degree: usize,
-    /// Names of the attributes that differ between frames.
+    /// Names of the attributes that vary in time.
     pub varying: Vec<String>,
-    /// Bytes of all files that a renderer opens, or bytes that arrived of a stream.
+    /// Number of bytes of all files that a renderer opens; for a stream, of the bytes that arrived.
     pub bytes: u64,
-    /// Bytes by part.
+    /// Number of bytes of each part of the input.
     pub size: Size,
 }
 
@@ -100,7 +102,7 @@ impl InputSummary {
         InputSummary::new(&*scene.input, &scene.path, scene.digest()?)
     }
 
-    /// Returns the description of an open input with the given path and digest.
+    /// Returns the description of the open input `input`, with the path `path` and the digest `digest`.
     ///
     /// # Errors
     /// Fails if a file cannot be read.
@@ -121,25 +123,25 @@ impl InputSummary {
 }
 
 impl InputSummary {
-    /// Returns the description with only the last component of the input's path, for a file that may be published.
+    /// Returns the description with the path reduced to its last component, for a file that may be published.
     pub fn without_folders(self) -> InputSummary {
         InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
 }
 
-/// Description of the cameras.
+/// Description of the cameras whose views are used for scoring.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CameraSummary {
     /// File of the cameras, or the description of a virtual rig.
     pub origin: String,
-    /// Number of distinct cameras.
+    /// Number of different cameras.
     pub cameras: usize,
-    /// Number of scored (time, view) pairs, M.
+    /// Number M of views used for scoring, each a camera at a frame.
     pub pairs: usize,
 }
 
 impl CameraSummary {
-    /// Returns the description of the views of `scene` that are scored.
+    /// Returns the description of the cameras by whose views the Gaussians of `scene` are scored.
     pub fn from_scene(scene: &Scene) -> CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),
@@ -149,12 +151,12 @@ impl CameraSummary {
     }
 }
 
-/// Counts of the merge stage.
+/// Counts of the merge stage, which replaces clusters of Gaussians by one proxy each.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MergeSummary {
-    /// Frame at which Gaussians were compared and merged.
+    /// Reference frame, at which Gaussians were compared and merged.
     pub reference_frame: usize,
-    /// Number of proxies in the output.
+    /// Number of proxies in the output (Gaussians that replace merged clusters).
     pub proxies: usize,
     /// Number of Gaussians that were merged into proxies.
     pub members: usize,
@@ -162,13 +164,13 @@ pub struct MergeSummary {
     pub opacity: ProxyOpacity,
     /// Counts of every merge pass.
     pub passes: Vec<PassCounts>,
-    /// Largest distance between a proxy and its position among its members over sampled frames, scene units; `None`
-    /// without a deformation field.
+    /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units;
+    /// `None` without a deformation field.
     pub deviation: Option<f64>,
 }
 
 impl MergeSummary {
-    /// Sets the numbers of proxies and members from `clusters`.
+    /// Sets the numbers of proxies and members from the merged clusters `clusters`.
     pub(super) fn count(&mut self, clusters: &[Cluster]) {
         self.proxies = clusters.len();
         self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
@@ -178,59 +180,59 @@ impl MergeSummary {
 /// Amount of detail in the text of a summary.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Detail {
-    /// Kept Gaussians, size, quality, time, output and a few notes.
+    /// Number of Gaussians, size, quality, time, output and a few notes.
     Most,
-    /// Additionally every stage, omitted stages with reasons, and all notes.
+    /// In addition every stage, omitted stages with reasons, and all notes.
     All,
 }
 
-/// Version of the schema; grows when a field is removed or changes its meaning.
+/// Version of the format of `summary.json`; grows when a field is removed or changes its meaning.
 pub const SCHEMA: u32 = 3;
 
-/// Summary of a run from input to output.
+/// Summary of a run from input to output, the content of `summary.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
-    /// Version of the schema, [`SCHEMA`].
+    /// Version of the format, [`SCHEMA`].
     pub schema: u32,
     /// Name and version of the program.
     pub tool: String,
     /// Description of the input.
     pub input: InputSummary,
-    /// Cameras whose views were scored.
+    /// Cameras whose views were used for scoring.
     pub cameras: CameraSummary,
-    /// Path of the output: only the last component in files, the path as given on standard output.
+    /// Path of the output. In files only the last component; on standard output the path as given by the user.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Number of Gaussians in the output.
     pub gaussians: usize,
-    /// Bytes of all files of the output that a renderer opens.
+    /// Number of bytes of all output files that a renderer opens.
     pub output_bytes: u64,
-    /// Bytes of the output by part.
+    /// Number of bytes of each part of the output.
     pub output_size: Size,
-    /// Counts of scoring and selection (stages 1 and 2 of the paper).
+    /// Numbers of Gaussians kept and removed by scoring and selection (stages 1 and 2 of the paper).
     pub selection: Counts,
-    /// Maximum number of full reads of the input in the memory plan; `None` if there was no plan.
+    /// Maximum number of full reads of the input (every frame once) in the memory plan; `None` if there was no plan.
     pub planned_reads: Option<f64>,
-    /// Forecast that was made before the run, if there was one.
+    /// Forecast of time and memory that was made before the run, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub forecast: Option<Forecast>,
     /// Records of all stages in order.
     pub stages: Vec<StageRecord>,
-    /// Percentiles of every term of the score.
+    /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
-    /// Counts of unusual Gaussians.
+    /// Numbers of Gaussians with unusual values.
     pub flags: FlagSummary,
-    /// Counts of merging (stage 3 of the paper), unless it was omitted.
+    /// Counts of merging (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
-    /// Measured effect of half precision on the deformation field; `None` if half precision was not requested.
+    /// Measured effect of writing the deformation field in half precision; `None` if it was not requested.
     pub field: Option<FieldSummary>,
-    /// Measured effect of lower SH degrees; `None` if they were not requested or are impossible.
+    /// Measured effect of dropping SH degrees; `None` if it was not requested or is impossible.
     pub bands: Option<BandsSummary>,
-    /// Quality gained by refinement; `None` if nothing was refined.
+    /// PSNR before and after refinement; `None` if nothing was refined.
     pub refined: Option<RefinedSummary>,
-    /// Quality of the result on test views, else on validation or training views, and render times.
+    /// Quality of the result on test views, or on validation or training views if there are none, and render times.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quality: Option<QualitySummary>,
     /// Quality and contents of the archive, if one was written.
@@ -240,14 +242,14 @@ pub struct Summary {
     pub left_out: Vec<LeftOut>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Files of the result, relative to the folder of the summary; overwriting the result replaces them. Filled in once
-    /// all files are written.
+    /// Paths of the files of the result, relative to the folder of the summary. Overwriting the result replaces these
+    /// files. Set once all files are written.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub files: Vec<String>,
 }
 
 impl Summary {
-    /// Returns the number of full reads of the input, summed over all stages.
+    /// Returns the amount read from the input by all stages together, in full reads (every frame once).
     pub fn full_reads(&self) -> f64 {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }

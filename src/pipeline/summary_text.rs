@@ -1,4 +1,4 @@
-//! Text of a summary for a person: a table of Gaussians, size, render time and quality before and after.
+//! Text of a summary for people: a table of Gaussians, size, render time and quality before and after.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -13,14 +13,15 @@ use crate::models::Size;
 use crate::outputs::kind::OutputKind;
 use crate::progress::duration;
 
-/// Maximum number of notes that are shown unless all are asked for.
+/// Maximum number of notes that are shown unless all details are asked for.
 const NOTES: usize = 2;
 
-/// Width of the line with the title, in columns.
+/// Minimum width, in characters, of the title of the table (input and output).
 const TITLE_WIDTH: usize = 52;
 
 impl Summary {
-    /// Returns the text for a person: the table of the result, and with [`Detail::All`] the stages and all notes before it.
+    /// Returns the summary as text for people: the table of the result, and with [`Detail::All`] the stages before it
+    /// and all notes.
     pub fn text(&self, detail: Detail) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
@@ -34,7 +35,7 @@ impl Summary {
         out
     }
 
-    /// Writes input, cameras, stages and what was left out.
+    /// Writes the input, the cameras, the stages and the omitted stages.
     fn write_stages(&self, out: &mut String) -> std::fmt::Result {
         let input = &self.input;
         writeln!(
@@ -80,7 +81,7 @@ impl Summary {
         writeln!(out)
     }
 
-    /// Writes the title and the table before/after.
+    /// Writes the title and the table, which compares the result with the original.
     fn write_table(&self, out: &mut String) -> std::fmt::Result {
         let (seconds, peak) = self.taken();
         let memory = peak.map_or(String::new(), |bytes| format!(", {} MiB peak", bytes >> 20));
@@ -121,7 +122,8 @@ impl Summary {
         Ok(())
     }
 
-    /// Writes the parts of the size, where there are several, and marks the largest part of the output.
+    /// Writes how the bytes of the input and of the result divide into parts, if the result has several parts. Marks
+    /// the part that takes most bytes of the result.
     fn write_size_parts(&self, out: &mut String) -> std::fmt::Result {
         let named = |size: &Size| {
             [
@@ -146,7 +148,7 @@ impl Summary {
         Ok(())
     }
 
-    /// Returns how close renders of the result are to those of the original.
+    /// Returns the quality of the result as text: how close its renders are to those of the original.
     fn quality_text(&self) -> String {
         let Some(QualitySummary { kind, views, psnr, ssim, .. }) = self.quality else {
             return "not measured; `splatsieve evaluate` measures it".to_owned();
@@ -164,7 +166,7 @@ impl Summary {
         format!("{} PSNR{ssim} vs. original ({views})", decibels_text(psnr, 2))
     }
 
-    /// Writes notes, the first ones unless all are asked for.
+    /// Writes the notes: with [`Detail::Most`] only the first [`NOTES`] of them.
     fn write_notes(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
         let shown = match detail {
             Detail::All => self.notes.len(),
@@ -179,7 +181,7 @@ impl Summary {
         }
     }
 
-    /// Writes commands that a user may want next.
+    /// Writes commands that the user may want to run next.
     fn write_next_steps(&self, out: &mut String) -> std::fmt::Result {
         let output = Path::new(&self.output);
         if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {
@@ -195,20 +197,21 @@ impl Summary {
         Ok(())
     }
 
-    /// Returns the wall-clock seconds of all stages of this run, and the largest resident memory in bytes.
+    /// Returns the wall-clock seconds of all stages that this run computed, and the largest resident memory in bytes.
     fn taken(&self) -> (f64, Option<u64>) {
         let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
         (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
     }
 }
 
-/// Writes a row of the table.
+/// Writes a row of the table: name, value before, value after, and a comment.
 fn row(out: &mut String, name: &str, before: &str, after: &str, comment: &str) -> std::fmt::Result {
     let line = format!("{name:<14}{before:>12}{after:>12}    {comment}");
     writeln!(out, "{}", line.trim_end())
 }
 
-/// Returns "10.0× fewer" where `after` is less than `before`.
+/// Returns the ratio of `before` and `after` as text: "10.0× fewer", with `word` for "fewer", or "2.0× larger" if
+/// `after` is larger. Empty if they are equal or `after` is 0.
 fn times(before: u64, after: u64, word: &str) -> String {
     match after {
         0 => String::new(),
@@ -218,12 +221,12 @@ fn times(before: u64, after: u64, word: &str) -> String {
     }
 }
 
-/// Returns a size with a decimal unit.
+/// Formats a number of bytes with a decimal unit, such as "1.5 MB".
 fn bytes(bytes: u64) -> String {
     ByteSize(bytes).display().si().to_string()
 }
 
-/// Returns a number with a comma between groups of three digits.
+/// Formats a number with a comma between groups of three digits.
 fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let groups: Vec<&str> =
@@ -231,7 +234,7 @@ fn grouped(number: u64) -> String {
     groups.join(",")
 }
 
-/// Returns "1 view" or "60 views".
+/// Formats a count with its noun: "1 view" or "60 views".
 fn counted(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }

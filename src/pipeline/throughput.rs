@@ -1,8 +1,8 @@
-//! Calibration of time estimates before a run: reads some frame states and renders some views on all threads to find
-//! out how fast this machine handles this scene.
+//! Calibration of time estimates before a run: reads some frame states and renders some views on all threads to measure
+//! how fast this machine processes the scene.
 //!
-//! Memory: the state of all Gaussians and the memory of one rendered view, less than any stage that renders views
-//! takes.
+//! Memory: the state of all Gaussians at one frame, and the memory of one rendered view. Every stage that renders views
+//! takes more.
 
 use std::num::NonZeroU32;
 use std::sync::{Mutex, PoisonError};
@@ -22,24 +22,24 @@ use crate::render::{Contribution, RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Ids, ReadPlan};
 
-/// Maximum time of a calibration as a fraction of the expected time of the run.
+/// Maximum duration of the calibration, as a fraction of the expected duration of the run.
 const MAX_TIME_FRACTION: f64 = 0.04;
-/// Maximum time of a calibration on all threads, seconds.
+/// Maximum duration of the calibration with all threads busy, seconds.
 const MAX_SECONDS: f64 = 1.0;
-/// Number of frames that are read of each block of Gaussians; more if blocks store more frames together.
+/// Number of frames that the calibration reads of each block of Gaussians; more if more frames are stored together.
 const FRAMES_PER_BLOCK: u64 = 16;
-/// Number of views that each thread renders in each way (contribution, removal error, image).
+/// Number of views that each thread renders for each of three purposes: contribution, removal error and image.
 const VIEWS_PER_THREAD: usize = 2;
-/// PSNR, dB, above which the loss by pruning alone may leave nothing to refine
+/// PSNR against the original, dB, above which pruning alone is so close that refinement may have nothing to do
 /// ([`crate::refinement::MAX_USEFUL_PSNR`]).
 const CLOSE_PSNR: f64 = 60.0;
 
-/// Minimum expected time of a run that is calibrated, seconds.
+/// Minimum expected duration, seconds, of a run that is preceded by a calibration.
 const MIN_RUN_SECONDS: f64 = 2.0;
 
-/// Returns the expected time and memory of `stages` with the memory plan `plan`, without statistics that are `measured`
-/// already. Calibrates first unless the run is short. The scene must follow the plan already; its throughput is set to
-/// the result.
+/// Returns the forecast (expected time and memory) of a run of `stages` with the memory plan `plan`. Statistics that
+/// are `measured` already are not counted. Calibrates first unless the run is short, and stores the measured speed in
+/// `scene`, whose limits must already be those of `plan`.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -59,21 +59,21 @@ pub(super) fn forecast(
     Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak()))
 }
 
-/// Result of a calibration.
+/// Result of a calibration of time estimates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Calibration {
-    /// Measured throughput.
+    /// Factors by which work takes longer on this machine than estimated, as measured.
     pace: Throughput,
-    /// Fraction of the Gaussians whose removal hardly changes views; 0 if no view was rendered.
+    /// Fraction of the Gaussians whose removal hardly changes renders; 0 if no view was rendered.
     hardly_seen: f64,
 }
 
 impl Calibration {
-    /// Result without any measurement.
+    /// Result if nothing was measured.
     const NONE: Calibration = Calibration { pace: Throughput::UNKNOWN, hardly_seen: 0.0 };
 
-    /// Calibrates on `scene` for a run that is expected to take `expected` seconds on all threads. For a short run only
-    /// states of some Gaussians are read; no view is rendered.
+    /// Calibrates on `scene` for a run that is expected to take `expected` seconds on all threads. Before a short run
+    /// only states of some Gaussians are read, and no view is rendered.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -100,8 +100,9 @@ impl Calibration {
         Ok(found)
     }
 
-    /// Renders views of one frame and updates throughput and `hardly_seen`. `expected` holds the core-seconds that the
-    /// contribution, the removal error and the images are expected to take.
+    /// Renders views of one frame, and updates the time factors `pace` and `hardly_seen` (fraction of the Gaussians
+    /// whose removal hardly changes renders). `expected` holds the estimated core-seconds for contribution, removal
+    /// error and images.
     fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;
@@ -119,7 +120,7 @@ impl Calibration {
                 (0..VIEWS_PER_THREAD).for_each(|k| visit(&mut renderer, thread, camera(thread * VIEWS_PER_THREAD + k)));
             });
         };
-        // The first views also allocate the buffers of the renderers, so they are not timed.
+        // The first views also allocate the buffers of the renderers, so their time is not measured.
         on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
         let [look, remove, render] = expected;
         let pace = &mut self.pace;
@@ -151,8 +152,9 @@ impl Calibration {
     }
 }
 
-/// Returns the fraction of the Gaussians with the smallest `errors` whose sum keeps views within [`CLOSE_PSNR`].
-/// `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of color values that were rendered.
+/// Returns which fraction of the Gaussians can be removed, beginning with the smallest removal errors, before the PSNR
+/// of renders falls below [`CLOSE_PSNR`]. `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of
+/// color values that were rendered.
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
     let most = values * 10f64.powf(-CLOSE_PSNR / 10.0) / RemovalError::UNIT;
@@ -164,17 +166,17 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     few.count() as f64 / errors.len().max(1) as f64
 }
 
-/// Measures the reading of frame states. Returns the measured core-seconds divided by the expected ones, from 0.05 to
-/// 20; 1 where the system does not report processor time. `budget` is the time that the calibration may take,
-/// core-seconds.
+/// Measures the time of reading frame states. Returns the measured core-seconds divided by the estimated ones, from
+/// 0.05 to 20; 1 if the system does not report processor time. `budget` is the time that the whole calibration may
+/// take, core-seconds.
 fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
     let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
     let block_seconds = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
     let all = source.info().count.div_ceil(BLOCK);
     let blocks = ((0.3 * budget / block_seconds) as usize).clamp(1, 4 * work.threads as usize).min(all);
-    // Most stages read every attribute but SH. Readers are opened before the clock starts because stages open them once
-    // for many frames.
+    // Most stages read every attribute but SH. Readers are opened before the time is taken, because stages open them
+    // once for many frames.
     let columns = Attributes::all().difference(Attributes::SH);
     let open = |k: usize| -> Result<_> {
         let start = k * all / blocks * BLOCK;
@@ -196,7 +198,7 @@ fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut Measu
     Ok(took.map_or(1.0, |took| took / expected).clamp(0.05, 20.0))
 }
 
-/// Time that measuring took: seconds of all processors, and wall-clock seconds.
+/// Time that measurements took: seconds summed over all processors, and wall-clock seconds.
 #[derive(Debug, Default)]
 struct MeasuredTime {
     processors: f64,
@@ -204,7 +206,7 @@ struct MeasuredTime {
 }
 
 impl MeasuredTime {
-    /// Runs `work` and returns its processor time in seconds; `None` where the system does not report it.
+    /// Runs `work` and returns its processor time in seconds; `None` if the system does not report it.
     fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Clock::start();
         work();
@@ -214,7 +216,7 @@ impl MeasuredTime {
         Some(processors)
     }
 
-    /// Returns the average number of busy processors; `None` if measuring took almost no time.
+    /// Returns the average number of busy processors during the measurements; `None` if these took almost no time.
     fn processors(&self, threads: u64) -> Option<f64> {
         (self.wall > 0.01).then(|| (self.processors / self.wall).clamp(0.1, threads as f64))
     }
@@ -240,7 +242,7 @@ mod tests {
 
     #[test]
     fn hardly_seen_counts_smallest_errors_within_60_db() {
-        // 1000 values at 60 dB allow a squared error of 0.001 in total.
+        // At 60 dB, 1000 color values allow a squared error of 0.001 in total.
         let units = |error: f64| (error / RemovalError::UNIT) as u64;
         let errors = vec![0, units(0.05), units(0.0004), units(0.0005), 0, units(0.0002), units(0.1), 0];
         assert_eq!(hardly_seen(errors, 1000.0), 5.0 / 8.0);

@@ -1,4 +1,4 @@
-//! Forecast of a run: expected time with a range, and memory, before the run begins.
+//! Forecast of a run before it begins: expected time with its range, and memory.
 
 use std::fmt::Write as _;
 
@@ -6,21 +6,23 @@ use crate::journal::records::{Forecast, Range, StageForecast};
 use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, size};
 use crate::progress::duration;
 
-/// Range of measured core-seconds relative to expected ones after a calibration: lowest and highest ratio on three
-/// trained models at several sizes (`scripts/estimate.py`), slightly widened.
+/// Lowest and highest ratio of measured to estimated core-seconds of runs after a calibration, found on three trained
+/// models at several sizes (`scripts/estimate.py`) and slightly widened.
 const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
-/// Range of the same ratio without a calibration.
+/// Lowest and highest ratio of measured to estimated core-seconds of runs without a calibration.
 const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
-/// Range of the same ratio for a search, whose number of refinements is not known in advance.
+/// Lowest and highest ratio of measured to estimated core-seconds of a search for a quality, in which the number of
+/// refinements is not known in advance.
 const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
 /// Minimum fraction of the processors that stages keep busy; some work is not divided among threads.
 const MIN_UTILIZATION: f64 = 0.6;
-/// Time for starting, opening and writing in every run, seconds.
+/// Duration of starting, opening and writing in every run, seconds.
 const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
-    /// Returns the forecast of stages with the estimates `needs`. `least` is the number of core-seconds if all stages
-    /// are skipped that may be. `searches` tells whether the amount of work depends on results of stages.
+    /// Returns the forecast of a run. `needs`: estimates of its stages. `least`: estimated core-seconds if all stages
+    /// that may find nothing to do are left out. `searches`: whether the amount of work depends on results of stages.
+    /// `memory_bytes`: maximum memory.
     pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
@@ -53,8 +55,8 @@ impl Forecast {
         }
     }
 
-    /// Returns the forecast as text for display: time and memory, one line each; with [`Verbosity::Plan`] also the
-    /// core-seconds of every stage.
+    /// Returns the forecast as text for display: a line for the time and one for the memory; with [`Verbosity::Plan`]
+    /// also the core-seconds of every stage.
     pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
         let mut out = String::new();
@@ -80,7 +82,7 @@ impl Forecast {
     }
 }
 
-/// Returns the expected core-seconds of all stages together.
+/// Returns the estimated core-seconds of all stages together.
 pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
     needs.iter().map(|need| need.seconds).sum()
 }

@@ -32,7 +32,7 @@ pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits:
     let camera = smaller(&rig.cameras[shot.camera as usize]);
     let picture = FrameView { frame, view: shot.view, camera: 0 };
     let mut uri = None;
-    show([RenderedSource::all(source)], &[camera], &[picture], Batch::of_frame(limits), |views| {
+    show([RenderedSource::all(source)], &[camera], &[picture], Batch::one_frame(limits), |views| {
         for view in views {
             let bytes = jpeg_bytes(&view.render(0, background), QUALITY)
                 .map_err(|error: io::Error| Error::internal(format!("the poster cannot be written: {error}")))?;

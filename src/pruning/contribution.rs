@@ -1,8 +1,8 @@
-//! Visible contribution: what every Gaussian adds to the scored views, occlusion included.
+//! Visible contribution: how much every Gaussian adds to the views by which Gaussians are scored, occlusion included.
 //!
-//! Input: a source, its cameras frame by frame, and the views to render. Output: C `visible` and W (method.md, section
-//! 1). The results are sums of integers and maxima, so the order of the views, the threads and the batches do not
-//! change a bit.
+//! Input: a source, its cameras frame by frame, and the views to render. Output: the contribution C `visible` (mean Σ
+//! alpha · transmittance) and its largest value W in one pixel (method.md, section 1). The results are sums of integers
+//! and maxima, so the order of views, threads and batches does not change a bit.
 
 use std::num::NonZeroU32;
 
@@ -16,20 +16,22 @@ use crate::progress::Events;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Attributes that contributions depend on: all but color.
+/// Attributes that the contribution depends on: all except color.
 const GEOMETRY: Attributes = Attributes::all().difference(Attributes::SH);
 
-/// Contributions of N Gaussians to the scored views.
+/// Contributions of all N Gaussians to the views by which they are scored.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VisibleContribution {
-    /// `[N]`, C: mean over views of Σ alpha · transmittance, in pixels; a sampled pixel counts for stride² pixels.
+    /// `[N]`, contribution C: Σ alpha · transmittance over the pixels of a view, averaged over views, in pixels. A
+    /// sampled pixel stands for stride² pixels.
     pub coverage: Vec<f64>,
-    /// `[N]`, W: maximum alpha · transmittance over all sampled pixels, in [0, 0.99].
+    /// `[N]`, peak W: maximum alpha · transmittance in any sampled pixel of any view, in [0, 0.99].
     pub peak: Vec<f64>,
 }
 
 impl VisibleContribution {
-    /// Converts the sums and maxima `found` in `pictures` views to C and W.
+    /// Converts `found`, the sums and maxima over `pictures` views, to contributions C and peaks W. Only every
+    /// `pixel_stride`-th pixel in each direction was sampled.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
@@ -37,13 +39,14 @@ impl VisibleContribution {
     }
 }
 
-/// Accumulates contributions over every `pixel_stride`-th pixel in each direction of the views `pictures`;
-/// [`VisibleContribution::new`] converts them to C and W.
+/// Renders the views `pictures` and sums the contribution of every Gaussian to every `pixel_stride`-th pixel in each
+/// direction. [`VisibleContribution::new`] converts the result to C and W.
 ///
-/// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a view without pixels. Without views all
-/// results are zero.
+/// A Gaussian with NaN or infinity in a frame adds nothing in this frame, and a view without pixels adds nothing.
+/// Without views all results are zero.
 ///
-/// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with frames or views.
+/// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with the number of frames or
+/// views.
 pub fn visible_contribution(
     source: &dyn FrameSource,
     (cameras, pictures): (&[Camera], &[FrameView]),
@@ -57,10 +60,11 @@ pub fn visible_contribution(
     Ok(running.sum())
 }
 
-/// Accumulator of the contributions to the views rendered so far.
+/// Sums of the contributions to all views rendered so far.
 ///
-/// Memory per Gaussian: 44 bytes for each frame of a batch (of 4 × threads views, within `limits`) and for a block's
-/// state; for each view rendered at the same time 12 bytes of sums and the view's buffers ([`crate::render`]).
+/// Memory per Gaussian: 44 bytes for its state in each frame of a batch (of 4 × threads views, within `limits`), and 44
+/// for the state of a block; for each view rendered at the same time 12 bytes of sums and the view's buffers
+/// ([`crate::render`]).
 pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
@@ -69,12 +73,14 @@ pub struct RunningContribution {
 }
 
 impl RunningContribution {
-    /// Creates an accumulator for `count` Gaussians, without views.
+    /// Creates sums of 0 for `count` Gaussians, of which every `pixel_stride`-th pixel in each direction will be
+    /// sampled.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
         RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Adds the views `pictures` of `source`, in the order of frames. All sources added must have the same Gaussians.
+    /// Renders the views `pictures` of `source`, in the order of frames, and adds their contributions. Calls `advance`
+    /// after each view. All sources added must have the same Gaussians.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
@@ -96,7 +102,7 @@ impl RunningContribution {
         )
     }
 
-    /// Returns the contributions C and peaks W over all views added.
+    /// Returns the contributions C and the peaks W over all views added.
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
         VisibleContribution::new(&self.sum(), pictures, pixel_stride)
@@ -197,7 +203,7 @@ mod tests {
     fn strides_rotate_views_and_keep_at_least_one() {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
-        // The first frame has no view in this split.
+        // The first frame has no view among the training views.
         let mut schedule = ViewSchedule::new((0..3).map(|_| camera.clone()).collect());
         for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
             schedule.push(count, &seen);
@@ -211,7 +217,7 @@ mod tests {
         assert_eq!(taken(100, 100), [(1, 0)]);
     }
 
-    /// A source whose frames are all the same.
+    /// Source in which all frames are the same.
     struct Static(Gaussians, SequenceInfo);
 
     impl FrameSource for Static {

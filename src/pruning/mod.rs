@@ -1,8 +1,9 @@
-//! Sampling and pruning (method.md, section 4): selects the Gaussians that stay.
+//! Sampling and pruning (method.md, section 4): selects the Gaussians that stay, by their scores.
 //!
-//! Input: scores. Output: a mask, and a ranking of all Gaussians of which the mask is a prefix, so that any other
-//! number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and [`WORKING_BYTES_PER_GAUSSIAN`]
-//! while selecting. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
+//! Input: scores. Output: for every Gaussian whether it stays, and a ranking of all Gaussians in which those that stay
+//! come first, so that any other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and
+//! [`WORKING_BYTES_PER_GAUSSIAN`] while selecting. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
+//! Models", section 3.3.
 
 pub mod contribution;
 mod ranking;
@@ -18,61 +19,63 @@ use crate::error::{Error, Result};
 use crate::recipe::{LowPriority, SelectParams};
 use crate::statistics::score::Scores;
 
-/// Ids that the user keeps or drops whatever their scores, in any order.
+/// Ids of Gaussians that the user keeps or drops whatever their scores, in any order.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Overrides {
-    /// Ids that are always kept.
+    /// Ids of Gaussians that are always kept.
     pub keep_ids: Vec<u32>,
-    /// Ids that are always dropped.
+    /// Ids of Gaussians that are always dropped.
     pub drop_ids: Vec<u32>,
 }
 
-/// Result of stages 1 and 2.
+/// Result of stage 1 (best fraction by score) and stage 2 (thresholds of the static and dynamic score).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// Whether each Gaussian stays.
+    /// For each Gaussian, whether it stays.
     pub keep: Vec<bool>,
-    /// Ranking of the Gaussians not dropped by the user, best first; the first `counts.kept` are those of `keep`.
+    /// Ranking of the Gaussians that the user does not drop, best first. Its first `counts.kept` Gaussians are those
+    /// that stay.
     pub ranking: Ranking,
     /// Numbers of Gaussians kept and pruned by each stage.
     pub counts: Counts,
 }
 
-/// Numbers of Gaussians at each stage. Before overrides: total = candidates + outside, and kept = candidates − pruned
-/// by stage 2 + rescued, where "outside" are the Gaussians that stage 1 does not take.
+/// Numbers of Gaussians at each stage of selection. Without the user's overrides, total = candidates + outside, and
+/// kept = candidates − pruned by stage 2 + rescued. "Outside" are the Gaussians that stage 1 does not make candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
-    /// N, the number of all Gaussians.
+    /// Number N of all Gaussians.
     pub total: usize,
-    /// Number of Gaussians in stage 1's top fraction by S.
+    /// Number of candidates: the top fraction by score S, which stage 1 takes.
     pub candidates: usize,
-    /// Number of Gaussians outside stage 1 that the OR rule keeps; 0 under [`LowPriority::Drop`].
+    /// Number of Gaussians outside the candidates that stage 2 keeps nevertheless; 0 under [`LowPriority::Drop`].
     pub rescued: usize,
-    /// Number of Gaussians outside stage 1 that are pruned.
+    /// Number of Gaussians outside the candidates that are pruned.
     pub pruned_by_stage_1: usize,
-    /// Number of candidates that fail the OR rule.
+    /// Number of candidates that are pruned because they reach neither threshold of stage 2.
     pub pruned_by_stage_2: usize,
-    /// Number of Gaussians that the user keeps against the rule.
+    /// Number of Gaussians that are kept only because the user keeps them.
     pub forced_keep: usize,
-    /// Number of Gaussians that the user drops against the rule.
+    /// Number of Gaussians that are dropped only because the user drops them.
     pub forced_drop: usize,
-    /// Number of Gaussians in the output.
+    /// Number of Gaussians that stay in the end.
     pub kept: usize,
 }
 
-/// Memory of a selection and of one further ranking, in bytes per Gaussian.
+/// Bytes of memory per Gaussian for a selection and one further ranking.
 pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
-/// Additional memory while selecting, in bytes per Gaussian: overrides, positions in two orders, one order being
-/// sorted, and the sort keys.
+/// Bytes of memory per Gaussian that are needed only while selecting: overrides, positions in two orders, the order
+/// being sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
 
-/// Applies both stages to N scored Gaussians, then the overrides.
+/// Applies stages 1 and 2 to N scored Gaussians, then the user's overrides.
 ///
-/// Stage 1 takes the round(`keep_fraction`·N) best (halves up) by S, ties by hashed id. Stage 2 keeps those with
-/// norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D: of the candidates, or under [`LowPriority::Rescue`] of all Gaussians.
-/// If both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
-/// them and stage 2 prunes none.
+/// Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; ties by hashed
+/// id). Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D, where norm is the normalized score
+/// and τ a threshold of the recipe. It applies to the candidates, or under [`LowPriority::Rescue`] to all Gaussians. If
+/// both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
+/// them, and stage 2 prunes none.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] for an id beyond N, and for an id that is to be both kept and dropped.
@@ -117,7 +120,7 @@ pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> 
     Ok(Selection { keep, ranking: ordered.ranking(&forced), counts })
 }
 
-/// Returns whether each Gaussian passes stage 2.
+/// Returns for each Gaussian whether its static or its dynamic score reaches the threshold of stage 2.
 fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let Scores { static_norm, dynamic_norm, .. } = scores;
     let norms = || static_norm.iter().zip(dynamic_norm);
@@ -129,7 +132,7 @@ fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
         .collect()
 }
 
-/// Returns the user's decision for every Gaussian: keep (`true`), drop (`false`) or `None`.
+/// Returns the user's decision for each of the `n` Gaussians: keep (`true`), drop (`false`) or none (`None`).
 fn user_decisions(n: usize, overrides: &Overrides) -> Result<Vec<Option<bool>>> {
     let mut decisions = vec![None; n];
     for (ids, keep) in [(&overrides.keep_ids, true), (&overrides.drop_ids, false)] {

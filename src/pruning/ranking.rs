@@ -1,5 +1,5 @@
-//! A ranking of all Gaussians whose first entries are the selection. It meets any target count exactly: it corresponds to
-//! the same two stages with both thresholds moved together.
+//! A ranking of all Gaussians in which the selected ones come first. Any target count is met exactly by taking the
+//! first Gaussians of the ranking. This equals the two stages of selection with both of their limits moved together.
 
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
@@ -8,24 +8,24 @@ use crate::model::hash_id;
 use crate::recipe::{LowPriority, SelectParams};
 use crate::statistics::score::Scores;
 
-/// Gaussians in the order in which they are kept, best first.
+/// Ids of the Gaussians in the order in which they are kept, best first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ranking {
     order: Vec<u32>,
 }
 
 impl Ranking {
-    /// Creates a ranking from ids, each once, best first.
+    /// Creates a ranking from the ids in `order`, best first; each id occurs once.
     pub fn new(order: Vec<u32>) -> Self {
         Ranking { order }
     }
 
-    /// Returns the ids, best first.
+    /// Returns the ids of the Gaussians, best first.
     pub fn order(&self) -> &[u32] {
         &self.order
     }
 
-    /// Returns the first `m` ids (all, if there are fewer) in increasing order.
+    /// Returns the first `m` ids of the ranking, or all if there are fewer, sorted by id.
     pub fn take(&self, m: usize) -> Vec<u32> {
         let mut ids = self.order[..m.min(self.order.len())].to_vec();
         ids.sort_unstable();
@@ -33,24 +33,26 @@ impl Ranking {
     }
 }
 
-/// The two orders that determine a ranking, as the 0-based position of every Gaussian in each.
+/// The two orders that determine a ranking. Each gives for every Gaussian its position, from 0.
 pub(super) struct Orders {
-    /// Position by S, ties by hashed id.
+    /// Position of every Gaussian by descending score S, ties by hashed id.
     pub(super) by_score: Vec<u32>,
-    /// Position by max(norm(S_static)/τ_S, norm(S_dynamic)/τ_D), ties by S.
+    /// Position of every Gaussian by the descending maximum of norm(S_static)/τ_S and norm(S_dynamic)/τ_D (normalized
+    /// scores divided by the thresholds of stage 2), ties by score S.
     by_rule: Vec<u32>,
-    /// Number of Gaussians of `by_score` that stage 1 keeps; `None` under [`LowPriority::Rescue`], where stage 1
+    /// Number of first Gaussians in `by_score` that stage 1 keeps; `None` under [`LowPriority::Rescue`], where stage 1
     /// excludes none.
     stage_1: Option<usize>,
-    /// Number of Gaussians that pass stage 2.
+    /// Number of Gaussians that pass stage 2, the thresholds of the static and dynamic score.
     stage_2: usize,
 }
 
-/// Ranks all Gaussians in both orders; `passes` says whether each passes stage 2.
+/// Ranks all Gaussians in both orders. `candidates`: number of Gaussians that stage 1 keeps. `passes`: whether each
+/// Gaussian passes stage 2.
 pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();
-    // Adding 0 makes −0 equal to 0 under a total order.
+    // Adding 0 turns −0 into 0, which a total order would distinguish.
     let score = |id: u32| scores.score[id as usize] + 0.0;
     by_score.par_sort_unstable_by(|&a, &b| {
         score(b).total_cmp(&score(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
@@ -77,11 +79,12 @@ pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, 
 }
 
 impl Orders {
-    /// Returns the ranking by the fraction of its quota that each stage must admit for a Gaussian to stay, the larger
-    /// of the two. Gaussians that the user keeps come first; those that the user drops are left out.
+    /// Returns the ranking. Its key is, for each order, the position of a Gaussian divided by the number of Gaussians
+    /// that the stage keeps; the larger quotient counts. Gaussians that the user keeps (`forced`) come first; those
+    /// that the user drops are left out.
     ///
-    /// A key is at most 1 exactly for the Gaussians that the recipe keeps. Ties, which occur because the keys are ranks
-    /// in two orders, go by S.
+    /// The key is at most 1 exactly for the Gaussians that the recipe keeps. Ties are possible, because keys combine
+    /// positions in two orders; they are broken by score S.
     pub(super) fn ranking(&self, forced: &[Option<bool>]) -> Ranking {
         let key = |i: usize| {
             let stage_2_ratio = rank_over(self.by_rule[i], self.stage_2);
@@ -100,14 +103,14 @@ impl Orders {
     }
 }
 
-/// Returns the rank divided by the number kept. A number of zero counts as half a Gaussian: then every key exceeds 1
-/// and the order is unchanged.
+/// Returns the position `place`, counted from 1, divided by `kept`, the number of Gaussians that the stage keeps. If
+/// the stage keeps none, divides by one half: every quotient then exceeds 1, and the order is unchanged.
 fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// Returns x/τ, which is at least 1 exactly if x ≥ τ. With τ ≤ 0 the ratio is undefined: all values that reach τ tie at
-/// infinity.
+/// Returns `x`/`tau`, which is at least 1 exactly if x ≥ τ. With τ ≤ 0 the ratio is undefined: then it is infinite for
+/// all values that reach τ, so that these tie.
 fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {
         x / tau
@@ -118,7 +121,7 @@ fn ratio(x: f64, tau: f64) -> f64 {
     }
 }
 
-/// Returns the position of every id in `order`.
+/// Returns for each id its position in `order`, from 0.
 fn positions(order: &[u32]) -> Vec<u32> {
     let mut positions = vec![0; order.len()];
     for (place, &id) in order.iter().enumerate() {

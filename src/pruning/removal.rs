@@ -1,4 +1,5 @@
-//! Removal error: the squared error of the scored views caused by removing each Gaussian of a subset of the input.
+//! Removal error: the squared error of the scored views that removing one Gaussian would cause, for each Gaussian of a
+//! subset of the input.
 
 use crate::error::Result;
 use crate::limits::Limits;
@@ -7,12 +8,13 @@ use crate::passes::pictures::{RenderedSource, Workers};
 use crate::render::{RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Returns the [`RemovalError`] of the Gaussians `ids` in renders of these Gaussians alone, `[ids]`, summed over the
-/// views `pictures`. The thread count does not change a bit.
+/// Renders the Gaussians `ids` alone and returns for each of them the [`RemovalError`], the squared error that removing
+/// it would cause, summed over the views `pictures`. The thread count does not change a bit.
 ///
-/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with 4 × threads
-/// views between them, within `limits`) and for a block's state; for each view rendered at the same time 8 bytes of
-/// sums and the view's buffers. Nothing grows with frames or views.
+/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes, where d is the SH degree, for its state in each
+/// frame of a batch (frames with 4 × threads views between them, within `limits`) and once more for the state of a
+/// block; for each view rendered at the same time 8 bytes of sums and the view's buffers. Nothing grows with the number
+/// of frames or views.
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],

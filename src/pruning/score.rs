@@ -1,4 +1,5 @@
-//! Stage `score`: turns statistics into scores, and scores into a ranking and a selection.
+//! Stage `score`: turns the statistics of the Gaussians into scores, and the scores into a ranking and a selection of
+//! the Gaussians to keep.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -25,77 +26,83 @@ use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
 use crate::statistics::{fill_anisotropy, snap, ulp};
 
-/// Name of the stage.
+/// Name of the stage in messages and in the cache.
 pub(crate) const NAME: &str = "score";
 
-/// Memory of statistics, scores and a selection while scoring, in bytes per Gaussian.
+/// Bytes of memory per Gaussian while scoring, for its statistics, its scores and the selection.
 pub const SCORED_BYTES: u64 =
     (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
-/// Returns the memory kept after scoring: the selection, and the statistics unless they are written to a scratch file.
+/// Returns the bytes of memory per Gaussian that stay in use after scoring: those of the selection, and of the
+/// statistics unless these are in a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.rows_aside { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
-/// Parameters of the stage.
+/// Stage that scores the Gaussians and selects those to keep, with its parameters.
 #[derive(Debug, Clone)]
 pub struct ScoreStage {
-    /// Whether motion within rounding noise is set to zero.
+    /// Whether motion that could be rounding noise of the positions is set to zero.
     pub snap_noise: bool,
-    /// Policy for Gaussians with NaN or infinity.
+    /// Policy for Gaussians with NaN or infinity in an attribute: stop, drop or keep unchanged.
     pub non_finite: NonFinite,
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
-    /// Parameters of stages 1 and 2 of the selection.
+    /// Parameters of the selection: fraction kept by score, thresholds of the static and dynamic score.
     pub select: recipe::SelectParams,
-    /// Gaussians that the user keeps or drops.
+    /// Gaussians that the user keeps or drops whatever their scores.
     pub user: UserOverrides,
 }
 
-/// Divisor of the number of frames: a median life span of at most 1/4 of the frames is short, and the user is told
-/// about linking.
+/// Ratio of the number of frames to the median life span (frames in which a Gaussian is visible by opacity) from which
+/// life spans are short. The user is then told that linking frames may help.
 const SHORT_LIFE: usize = 4;
 
-/// Statistics and a selection of every Gaussian of a scene.
+/// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
-    /// Statistics, with rounding noise set to zero if the recipe says so.
+    /// Statistics of every Gaussian. Motion within rounding noise is 0 if the recipe says so.
     statistics: StatisticsRows,
-    /// T, the number of frames.
+    /// Number of frames of the scene.
     frames: usize,
-    /// Number of frames to render so that Gaussians with short life spans are seen; see [`frames_to_see`].
+    /// Number of frames that must be rendered so that Gaussians with short life spans are seen too; see
+    /// [`frames_to_see`].
     pub frames_to_see: usize,
-    /// Normalization of every term of the scores.
+    /// Normalization of every term of the scores: percentiles and weight.
     pub terms: Vec<Term>,
-    /// Counts of Gaussians with unusual values.
+    /// Numbers of Gaussians with unusual values, such as NaN.
     pub flags: FlagSummary,
-    /// Result of stages 1 and 2, with the user's overrides.
+    /// Selected Gaussians and ranking, with the user's overrides applied.
     pub selection: Selection,
-    /// Ids that are kept unchanged and unmerged, increasing.
+    /// Ids of protected Gaussians, which are kept, not changed and not merged; increasing.
     pub protected: Vec<u32>,
-    /// Ids that were dropped because their values are not finite, increasing; the scene is read without them.
+    /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
+    /// Gaussians.
     pub absent: Vec<u32>,
-    /// Reference frame, at which Gaussians are compared with one another, and scene extent.
+    /// Reference frame (in which most Gaussians are alive and at which they are compared with one another), and scene
+    /// extent.
     pub reference: Reference,
-    /// Distance between neighboring f32 values at the scene's largest coordinate, in scene units: the noise level of a
-    /// position.
+    /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
+    /// coordinate.
     pub position_ulp: f64,
 }
 
-/// Gaussians that the user keeps or drops, before the box is resolved to ids.
+/// Gaussians that the user keeps or drops, given by ids and by a box.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct UserOverrides {
-    /// Ids to keep.
+    /// Ids of Gaussians to keep, unchanged.
     pub keep: Vec<u32>,
-    /// Ids to drop.
+    /// Ids of Gaussians to drop.
     pub drop: Vec<u32>,
-    /// Box (low corner, high corner) in scene units; Gaussians inside it at the reference frame are kept.
+    /// Box in scene units, given as low corner, then high corner. Gaussians that are inside it at the reference frame
+    /// are kept.
     pub keep_box: Option<[f64; 6]>,
 }
 
 impl ScoreStage {
-    /// Estimates the memory and time of the stage: statistics, scores, a selection, and the states at one frame.
+    /// Estimates the memory and time that this stage needs for the input `work`: statistics, scores, a selection, and
+    /// the states at one frame.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         ResourceEstimate {
             stage: NAME,
@@ -110,16 +117,18 @@ impl ScoreStage {
         }
     }
 
-    /// Returns the ids of the Gaussians that are dropped because their values are not finite, increasing.
+    /// Returns the increasing ids of the Gaussians that are dropped because a value is not finite; none if the recipe
+    /// does not drop them.
     pub fn absent(&self, rows: &Rows) -> Vec<u32> {
         if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
-    /// Computes scores and a selection from the measured statistics.
+    /// Computes scores and a selection from the statistics `scanned` and, if measured, the visible contributions
+    /// `seen`.
     ///
     /// # Errors
-    /// Fails for values that are not finite, unless the recipe says what to do with them; for cameras that see no
-    /// Gaussian; and for ids that are to be both kept and dropped.
+    /// Fails if values are not finite (unless the recipe drops or keeps such Gaussians), if no Gaussian is in any view
+    /// of the cameras, and if an id is to be both kept and dropped.
     pub fn run(
         &self,
         scene: &Scene,
@@ -222,7 +231,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
-/// Counts Gaussians with unusual values.
+/// Counts the Gaussians with unusual values.
 fn flags(rows: &Rows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
@@ -235,7 +244,7 @@ fn flags(rows: &Rows) -> FlagSummary {
     }
 }
 
-/// Fails if no Gaussian is in any view, which happens with the cameras of another scene.
+/// Fails if no Gaussian is in any view. This happens if the cameras belong to another scene.
 fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
     let seen = rows.vis.iter().filter(|&&vis| vis > 0.0).count();
@@ -252,8 +261,7 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
-    /// Returns the same result within `limits`: the statistics are moved to a scratch file in `folder` if the limits
-    /// require it.
+    /// Returns the same result, with its statistics moved to a scratch file in `folder` if `limits` requires this.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -266,17 +274,18 @@ impl Scored {
         })
     }
 
-    /// Returns whether Gaussian `id` is kept unchanged.
+    /// Returns whether Gaussian `id` is protected: kept, not changed and not merged.
     pub fn is_protected(&self, id: u32) -> bool {
         self.protected.binary_search(&id).is_ok()
     }
 
-    /// Returns the ids of all Gaussians that are not [absent](Scored::absent), increasing.
+    /// Returns the ids of all Gaussians except those dropped because a value is not finite ([`Scored::absent`]),
+    /// increasing.
     pub fn present(&self) -> Vec<u32> {
         (0..self.count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
     }
 
-    /// Returns the statistics of every Gaussian.
+    /// Returns the statistics of every Gaussian, read back from the scratch file if they are there.
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -284,7 +293,8 @@ impl Scored {
         self.statistics.rows()
     }
 
-    /// Returns C and Vis of every Gaussian.
+    /// Returns the contribution C and the visibility Vis (share of the views in which it is on screen) of every
+    /// Gaussian.
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -292,26 +302,26 @@ impl Scored {
         self.statistics.importance()
     }
 
-    /// Returns the ranking of the selection.
+    /// Returns the ranking of the Gaussians, best first.
     pub fn ranked(&self) -> Ranking {
         self.selection.ranking.clone()
     }
 
-    /// Returns N, the number of all Gaussians.
+    /// Returns the number of all Gaussians of the scene.
     pub fn count(&self) -> usize {
         self.statistics.len()
     }
 
-    /// Recomputes the scores that the selection is based on.
+    /// Computes the scores, on which the selection is based, again from the statistics.
     ///
     /// # Errors
-    /// Fails if the statistics cannot be read back, as [`Scored::rows`].
+    /// Fails if the statistics are in a scratch file that cannot be read back.
     pub fn scores(&self, recipe: &recipe::ScoreParams) -> Result<Scores> {
         let rows = self.rows()?;
         Ok(score(&rows, self.frames, recipe))
     }
 
-    /// Returns the percentiles of every term.
+    /// Returns the percentiles between which each term of the scores is normalized.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
         let summarize = |term: &Term| TermSummary {
             name: term.of.name().to_owned(),
@@ -322,8 +332,8 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes to the journal which work of scan and score the scene did not need, how many Gaussians have unusual
-    /// values, and what can be done about short life spans.
+    /// Writes to the journal which parts of scanning and scoring the scene did not need, how many Gaussians have
+    /// unusual values, and what can be done about short life spans.
     fn record(&self, scene: &Scene, median_life: u32, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {
@@ -365,7 +375,8 @@ impl Scored {
     }
 }
 
-/// Returns the median number of frames in which Gaussians are alive, over those that ever are; 0 if none is.
+/// Returns the median number of frames in which a Gaussian is alive. Gaussians that are never alive are ignored; if all
+/// are, returns 0.
 fn median_life(life: &[u32]) -> u32 {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&frames| frames > 0).collect();
     let middle = lives.len() / 2;

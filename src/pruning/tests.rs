@@ -1,4 +1,4 @@
-//! Tests of the selection against its literal definition.
+//! Tests of the selection. Expected values follow the definition to the letter.
 
 use proptest::prelude::*;
 
@@ -6,7 +6,7 @@ use super::*;
 use crate::model::hash_id;
 use crate::recipe::Recipe;
 
-/// Returns scores in which S is the sum of the normalized parts.
+/// Creates scores from pairs of normalized static and dynamic scores; the score S is their sum.
 fn scores(parts: &[(f64, f64)]) -> Scores {
     let (static_norm, dynamic_norm): (Vec<f64>, Vec<f64>) = parts.iter().copied().unzip();
     let score = parts.iter().map(|(s, d)| s + d).collect();
@@ -29,7 +29,8 @@ fn without_overrides(scores: &Scores, recipe: &SelectParams) -> Selection {
     select(scores, recipe, &Overrides::default()).unwrap()
 }
 
-/// Computes the kept set by the definition: full sort, then the OR rule, unless all norms are 0.
+/// Computes by the definition which Gaussians stay: sorts all, then applies the thresholds of stage 2, unless all
+/// normalized scores are 0.
 fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
@@ -47,12 +48,12 @@ fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
         .collect()
 }
 
-/// Generates coarse values, so that ties are frequent; includes −0 and unclipped values.
+/// Generates scores in coarse steps, so that ties are frequent. Includes −0 and values outside [0, 1].
 fn any_norm() -> impl Strategy<Value = f64> {
     prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
 }
 
-// The claim also holds for the order by rule, and for Gaussians that no stage keeps.
+// The sign of zero must not matter for the order of stage 2 either, nor among Gaussians that no stage keeps.
 #[test]
 fn sign_of_zero_changes_no_ranking() {
     let parts = |zero: f64| -> Vec<(f64, f64)> {
@@ -77,7 +78,7 @@ proptest! {
     #[test]
     fn kept_set_meets_the_definition_and_leads_the_ranking(
         parts in prop::collection::vec((any_norm(), any_norm()), 0..80),
-        // Independent scores S: weights may rank a Gaussian first that fails the OR rule.
+        // Scores S that do not follow from the two parts: a Gaussian that fails stage 2 may then have the best score.
         independent_scores in prop::collection::vec(any_norm(), 80),
         recipe in any_rule(),
     ) {
@@ -137,7 +138,8 @@ fn presets_follow_their_low_priority() {
     let scores = scores(&parts);
     let paper = without_overrides(&scores, &Recipe::preset("paper").unwrap().select);
     assert_eq!((paper.counts.candidates, paper.counts.rescued, paper.counts.kept), (800, 0, 800));
-    // All but the last fifty have norm ≥ 0.05; stage 1 had excluded 150 of them.
+    // All Gaussians except the last fifty have a normalized score of at least 0.05; stage 1 alone would exclude 150 of
+    // them.
     let default = without_overrides(&scores, &Recipe::preset("default").unwrap().select);
     assert_eq!((default.counts.candidates, default.counts.rescued, default.counts.kept), (800, 150, 950));
 }

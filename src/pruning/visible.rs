@@ -1,4 +1,4 @@
-//! Stage `visible`: measures the visible contribution of every Gaussian to the scored views, occlusion included.
+//! Stage `visible`: measures how much every Gaussian contributes to the scored views, occlusion included.
 
 use std::ops::Range;
 
@@ -13,19 +13,20 @@ use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of the stage in messages and in the cache.
 pub(crate) const NAME: &str = "visible";
 
-/// The stage that measures the contribution C and its peak W from rendered views.
+/// Stage that renders views to measure the contribution C of every Gaussian (mean Σ alpha · transmittance) and its peak
+/// W (maximum in one pixel).
 #[derive(Debug, Clone)]
 pub struct Visible {
-    /// Parameters of the scan, which include the strides and the maximum number of views.
+    /// Parameters of the scan. Used are the strides of pixels, views and frames, and the maximum number of views.
     pub recipe: recipe::ScanParams,
 }
 
 impl Visible {
-    /// Returns the stage if `recipe` measures C from rendered views. `has_cameras` says that the scene has its own
-    /// cameras, not a virtual rig.
+    /// Returns the stage, or `None` if `recipe` does not measure C by renders. `has_cameras`: whether the scene has
+    /// cameras of its own, rather than a virtual rig.
     pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<Visible> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,
@@ -35,8 +36,8 @@ impl Visible {
         looks.then(|| Visible { recipe: recipe.clone() })
     }
 
-    /// Estimates the memory and time of the stage: the statistics scanned so far, C and W, and the views being
-    /// rendered.
+    /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan,
+    /// contribution C and peak W of every Gaussian, and the views being rendered.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (mut per_gaussian, mut fixed) = work.looking(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
@@ -51,7 +52,7 @@ impl Visible {
         per_gaussian.insert(0, ("rows", rows as u64));
         fixed.push(Workload::listed(strided.min(max_views)));
         if every > 1.0 {
-            // Applying the strides to a schedule produces another list for each frame.
+            // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
         let seconds =
@@ -59,13 +60,14 @@ impl Visible {
         ResourceEstimate { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
-    /// Returns whether the views of a frame can be chosen when the frame arrives. With a maximum number of views they
-    /// can only be chosen after the last frame.
+    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. If the number of views is
+    /// limited, they can be chosen only after the last frame.
     pub fn can_render_on_arrival(&self) -> bool {
         self.recipe.look_pictures == 0
     }
 
-    /// Measures C and W of every Gaussian of `scene`; `life` is the number of frames in which each is alive.
+    /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of
+    /// frames in which each Gaussian is alive.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -98,11 +100,14 @@ impl Visible {
     }
 }
 
-/// Minimum fraction of the Gaussians ever alive that cameras of the same scene see. Cameras of trained models see two
-/// thirds; those inside a scene that fills a room see a third.
+/// Fraction of the Gaussians (of those alive in any frame) that the cameras must see; if they see fewer, they probably
+/// belong to another scene. Cameras of trained models see two thirds; those inside a scene that fills a room see a
+/// third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
 
-/// Returns a warning if very few of the Gaussians that are ever alive contribute to a view.
+/// Returns a warning if very few of the Gaussians that are ever alive contribute to any view, so that the cameras may
+/// belong to another scene. `peak`: largest contribution W of each Gaussian. `life`: number of frames in which it is
+/// alive. `origin`: origin of the cameras.
 fn wrong_scene_warning(peak: &[f64], life: &[u32], origin: &str) -> Option<String> {
     let alive = life.iter().filter(|&&frames| frames > 0).count();
     let seen = peak.iter().zip(life).filter(|&(&peak, &frames)| frames > 0 && peak > 0.0).count();

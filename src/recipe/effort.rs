@@ -1,33 +1,34 @@
-//! Effort of a run, one knob for time against quality: points on the curves that `splatsieve precision` draws.
+//! Effort of a run: one option that trades time for quality, with values from the curves that `splatsieve precision`
+//! draws.
 
 use super::{MOST_STEPS, Recipe};
 
-/// Point on the curve of quality against run time.
+/// Effort of a run: time against quality.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effort {
-    /// A third of the optimization steps, and fewer views and larger pruning rounds.
+    /// A third of the recipe's optimization steps, fewer scored views, and more Gaussians removed per pruning round.
     Fast,
-    /// Settings of the recipe.
+    /// The recipe's own values.
     Default,
-    /// Three times the optimization steps, and more views and smaller pruning rounds.
+    /// Three times the recipe's optimization steps, more scored views, and fewer Gaussians removed per pruning round.
     Best,
 }
 
-/// Settings of an effort.
+/// Values of recipe parameters for an effort other than the default; the fields are named like the parameters.
 struct EffortSettings {
     look_pictures: usize,
     round_pictures: usize,
     round_turns: usize,
     round_fraction: f64,
-    /// Factor on the optimization steps of the recipe.
+    /// Factor by which the recipe's number of optimization steps is multiplied.
     steps: f64,
 }
 
 impl Effort {
-    /// Efforts in order, the fastest first.
+    /// All efforts, the fastest first.
     pub const ALL: [Effort; 3] = [Effort::Fast, Effort::Default, Effort::Best];
 
-    /// Returns the name on the command line.
+    /// Returns the name of the effort on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Effort::Fast => "fast",
@@ -58,13 +59,13 @@ impl Effort {
 }
 
 impl Recipe {
-    /// Returns this recipe at `effort`: with more or fewer scored views, rounds and optimization steps. Parts that the
-    /// recipe does not use stay unused. A recipe that scores all views keeps scoring all.
+    /// Returns this recipe at `effort`: with more or fewer scored views, pruning rounds and optimization steps. Turns
+    /// on nothing that the recipe has turned off. A recipe that scores all views still scores all.
     pub fn with_effort(&self, effort: Effort) -> Recipe {
         let Some(settings) = effort.settings() else { return self.clone() };
         let steps = settings.steps * f64::from(self.refine.refine_steps);
         let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
-        // Never cross the recipe's own value in the wrong direction.
+        // Effort `fast` never raises a value of the recipe, and effort `best` never lowers one.
         let less = settings.steps < 1.0;
         let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.look_pictures > 0 {

@@ -20,10 +20,10 @@ pub use sections::{
     ShDegreeRule, ShHigh, StaticTerm, Trajectory,
 };
 
-/// Text of preset `paper`, with a comment on every parameter.
+/// Text of the preset `paper`, with a comment on every parameter.
 const PAPER: &str = include_str!("paper.toml");
 
-/// Name and text of every preset. A preset may start from another one, which it names by the key `preset`.
+/// Name and TOML text of every preset. A preset may start from another one, which it names by the key `preset`.
 pub const PRESETS: [(&str, &str); 4] = [
     ("default", include_str!("default.toml")),
     ("paper", PAPER),
@@ -31,36 +31,36 @@ pub const PRESETS: [(&str, &str); 4] = [
     ("strong", include_str!("strong.toml")),
 ];
 
-/// Maximum fraction of the Gaussians that a pruning round may leave. With it, 10 million Gaussians take 1300 rounds
-/// down to a few.
+/// Maximum fraction of the Gaussians that one pruning round may leave. At this fraction, pruning 10 million Gaussians
+/// down to a few takes about 1300 rounds.
 pub const MAX_ROUND_FRACTION: f64 = 0.99;
-/// Maximum number of optimization steps of refinement; a run of one day.
+/// Maximum number of optimization steps of refinement; these take about one day.
 const MOST_STEPS: u32 = 1_000_000;
-/// Maximum number of merge passes. Every pass reads all frames.
+/// Maximum number of merge passes. Every pass reads all frames, so more passes would make a run endless.
 const MOST_PASSES: usize = 16;
 
 /// Parameters of the method; `paper.toml` documents each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// Parameters of the scan over all frames.
+    /// Parameters of the scan, which reads all frames once and gathers statistics.
     pub scan: ScanParams,
-    /// Parameters of the scores: normalization and weights.
+    /// Parameters of the scores by which Gaussians are ranked: normalization and weights of the statistics.
     pub score: ScoreParams,
-    /// Parameters of selection (stages 1 and 2 of the paper).
+    /// Parameters of the selection of the Gaussians that stay (stages 1 and 2 of the paper).
     pub select: SelectParams,
-    /// Parameters of merging (stage 3 of the paper).
+    /// Parameters of merging, which replaces clusters of Gaussians by one each (stage 3 of the paper).
     pub merge: MergeParams,
-    /// Parameters of refinement, which fits the stored values of the survivors.
+    /// Parameters of refinement, which fits the stored values of the survivors (Gaussians not removed) to renders.
     pub refine: RefineParams,
-    /// Parameters of the deformation field of the result.
+    /// Parameters of how precisely the deformation field is written.
     pub field: FieldParams,
-    /// Parameters of the SH degree of the result.
+    /// Parameters by which the SH degree of the result is chosen.
     pub bands: ShDegreeParams,
 }
 
 impl Recipe {
-    /// Returns the preset `name`.
+    /// Returns the recipe of the preset `name`.
     ///
     /// # Errors
     /// Fails if there is no preset of that name.
@@ -69,9 +69,9 @@ impl Recipe {
         Ok(Recipe::from_toml("", name).expect("presets parse: tested"))
     }
 
-    /// Parses the text of a recipe file: any subset of the parameters. The others come from the preset that its key
-    /// `preset` names, or from the preset `fallback`. Ignores the tables `[provenance]` and `[run]` that files beside
-    /// results have.
+    /// Parses the text of a recipe file, which sets any subset of the parameters. The others come from the preset that
+    /// its key `preset` names, or from the preset `fallback` if it names none. Ignores the tables `[provenance]` and
+    /// `[run]`, which recipe files written beside results have.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
         let recipe: Recipe =
@@ -80,7 +80,8 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// Returns this recipe with one parameter set from text: a TOML value, or a bare word for a name.
+    /// Returns this recipe with the parameter `key` of the table `section` set from the text `value`: a TOML value, or
+    /// a name without quotes.
     pub fn with(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
         let number = value.parse::<f64>().map(toml::Value::Float);
         let whole = value.parse::<i64>().map(toml::Value::Integer);
@@ -97,14 +98,15 @@ impl Recipe {
         table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
-    /// Returns this recipe without refinement.
+    /// Returns this recipe with refinement turned off.
     pub fn unrefined(&self) -> Recipe {
         let mut recipe = self.clone();
         recipe.refine.refine = AttributeGroups(Attributes::empty());
         recipe
     }
 
-    /// Returns this recipe with `steps` optimization steps, and proportionally as many before each prune step.
+    /// Returns this recipe with `steps` optimization steps. The steps before each prune step (removal of the
+    /// lowest-ranked Gaussians) change in proportion.
     pub fn refining_by(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
@@ -120,12 +122,12 @@ impl Recipe {
         toml::to_string(self).expect("a recipe is plain data")
     }
 
-    /// Checks the ranges of all parameters. The error message names the parameter.
+    /// Checks that every parameter is within its range. The error message names the first parameter that is not.
     pub fn validate(&self) -> std::result::Result<(), String> {
         let in_unit = |x: f64| (0.0..=1.0).contains(&x);
         let nonnegative = |x: f64| x >= 0.0;
         let finite = |x: f64| x.is_finite() && x >= 0.0;
-        // The limit keeps sums of weighted norms finite, and 0 times a weight is 0.
+        // The limit 1e6 keeps weighted sums finite, so that a weight of 0 gives 0 and not NaN.
         let weight = |x: f64| (0.0..=1e6).contains(&x);
         let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
             self.merge;
@@ -210,7 +212,7 @@ impl Recipe {
     }
 }
 
-/// Returns the text of the preset `name`.
+/// Returns the TOML text of the preset `name`.
 pub fn preset_text(name: &str) -> Result<&'static str> {
     match PRESETS.iter().find(|(known, _)| *known == name) {
         Some((_, text)) => Ok(text),
@@ -222,8 +224,8 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
     }
 }
 
-/// Returns all parameters: those of `over`, and the others from the preset that it names or from `fallback`. A preset
-/// may name one more preset.
+/// Returns the values of all parameters: from `over` where it has them, otherwise from the preset that `over` names, or
+/// from the preset `fallback`. A named preset may itself name another preset.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
     over.remove("run");
@@ -240,7 +242,8 @@ fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Re
     Ok(table)
 }
 
-/// Replaces the values in `base` by those of `over`. Adds keys that `base` lacks; the typed parser refuses them later.
+/// Replaces the values in `base` by those of `over`, table by table. Adds keys that `base` lacks; the typed parser
+/// refuses them later.
 fn overlay(base: &mut toml::Table, over: toml::Table) {
     for (key, value) in over {
         match (base.get_mut(&key), value) {

@@ -1,10 +1,11 @@
-//! List of all parameters with their documentation, parsed from the preset `paper`. Flags and help texts are made from
-//! it.
+//! List of all parameters with their documentation, parsed from the preset `paper`. Command-line flags and help texts
+//! are made from this list.
 
-/// Parameter of the recipe.
+/// Parameter of the recipe, with its documentation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
-    /// Table of the parameter: `scan`, `score`, `select`, `merge`, `refine`, `field` or `bands`.
+    /// Name of the recipe table that contains the parameter: `scan`, `score`, `select`, `merge`, `refine`, `field` or
+    /// `bands`.
     pub section: String,
     /// Key of the parameter, unique over all tables.
     pub key: String,
@@ -12,7 +13,7 @@ pub struct Parameter {
     pub doc: String,
 }
 
-/// Returns every parameter of `paper.toml` in file order, except merge passes.
+/// Returns every parameter of `paper.toml` in file order, except the parameters of single merge passes.
 pub fn parameters() -> Vec<Parameter> {
     let (mut section, mut doc, mut found) = (String::new(), Vec::new(), Vec::new());
     for line in super::PAPER.lines() {

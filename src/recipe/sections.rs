@@ -1,4 +1,4 @@
-//! Tables of a recipe and the types of their values.
+//! Tables of a recipe and the types of their values. `paper.toml` documents every parameter.
 
 use std::num::NonZeroU32;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::quoted;
 use crate::model::{Attributes, MAX_SH_DEGREE};
 
-/// Parameters of the scan over all frames.
+/// Parameters of the scan, which reads all frames once and gathers statistics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -23,42 +23,42 @@ pub struct ScanParams {
     pub non_finite: NonFinite,
 }
 
-/// Steps between frames that count as motion, and their normalization.
+/// Which steps from one frame to the next count as motion of a Gaussian, and by what their sum is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
-    /// The paper's divisors. Steps across gaps of the life span count.
+    /// The paper's divisors. Steps across gaps of the life span (frames with opacity of at least `alpha_min`) count.
     Literal,
-    /// Only steps inside one run of life frames, divided by their number.
+    /// Only steps between consecutive frames of the life span count; the sum is divided by their number.
     Runs,
 }
 
-/// Quantity that the contribution C measures.
+/// Quantity that is measured as the contribution C of a Gaussian to renders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Coverage {
-    /// [`Coverage::Visible`] if the scene has cameras of its own, otherwise [`Coverage::Projected`]: cameras of a
-    /// virtual rig may be behind walls that no real view shows.
+    /// [`Coverage::Visible`] if the scene has cameras of its own, otherwise [`Coverage::Projected`]: the cameras of a
+    /// virtual rig (placed by the program) may be behind walls that no real view shows.
     Auto,
-    /// Σ alpha · transmittance over pixels.
+    /// Sum over pixels of alpha · transmittance, so that hidden Gaussians contribute nothing.
     Visible,
-    /// Area of the projected 3σ ellipse inside the image × opacity.
+    /// Opacity times the area, inside the image, of the projected ellipse at 3 standard deviations.
     Projected,
 }
 
-/// Treatment of a Gaussian that has NaN or infinity.
+/// Treatment of a Gaussian that has NaN or infinity in some frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NonFinite {
-    /// Stop and name the Gaussians.
+    /// Stop the run with an error that names the Gaussians.
     Error,
-    /// Prune it.
+    /// Remove the Gaussian.
     Drop,
-    /// Keep it as it is.
+    /// Keep the Gaussian in the output as it is.
     Keep,
 }
 
-/// Parameters of the scores.
+/// Parameters of the scores by which Gaussians are ranked and pruned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -76,29 +76,29 @@ pub struct ScoreParams {
     pub clip_norm: bool,
 }
 
-/// First term of S_static.
+/// First term of the static score S_static (importance of a Gaussian without regard to its motion).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StaticTerm {
-    /// C.
+    /// Mean contribution C of the Gaussian per view.
     Mean,
-    /// W.
+    /// Peak contribution W: the largest alpha · transmittance in any pixel.
     Peak,
-    /// √(C·W).
+    /// Geometric mean √(C·W) of the mean contribution C and the peak contribution W.
     Geometric,
 }
 
-/// Measure of the anisotropy E.
+/// Formula of the anisotropy E, from the largest, middle and smallest scale s_max, s_mid and s_min of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Anisotropy {
-    /// s_max / s_min.
+    /// s_max / s_min, the largest scale divided by the smallest.
     Ratio,
-    /// ln(s_max / s_mid).
+    /// ln(s_max / s_mid), the logarithm of the largest scale divided by the middle one.
     Log,
 }
 
-/// Parameters of selection (stages 1 and 2 of the paper).
+/// Parameters of the selection of the Gaussians that stay (stages 1 and 2 of the paper).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -114,17 +114,17 @@ pub struct SelectParams {
     pub choose_by_views: bool,
 }
 
-/// Treatment of Gaussians that stage 1 does not keep.
+/// Treatment of Gaussians that stage 1 of the paper (choice of candidates by score) does not keep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LowPriority {
-    /// Pruned.
+    /// They are removed.
     Drop,
-    /// Judged by stage 2 like the candidates.
+    /// Stage 2 decides on them in the same way as on the candidates.
     Rescue,
 }
 
-/// Parameters of merging (stage 3 of the paper).
+/// Parameters of merging, which replaces clusters of Gaussians by one each (stage 3 of the paper).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -143,7 +143,7 @@ pub struct MergeParams {
     pub passes: Vec<MergePass>,
 }
 
-/// Parameters of refinement, which fits the stored values of the survivors.
+/// Parameters of refinement, which fits the stored values of the survivors (Gaussians not removed) to renders.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -156,7 +156,7 @@ pub struct RefineParams {
     pub refine_knots: usize,
 }
 
-/// Parameters of the deformation field of the result.
+/// Parameters of how precisely the deformation field is written.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -165,7 +165,7 @@ pub struct FieldParams {
     pub field_margin: f64,
 }
 
-/// Parameters of the SH degree of the result.
+/// Parameters by which the SH degree of the result is chosen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -174,15 +174,15 @@ pub struct ShDegreeParams {
     pub bands_margin: f64,
 }
 
-/// Rule for the SH degree of the result.
+/// Rule by which the SH degree of the result is chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum ShDegreeRule {
-    /// SH degree of the input, unchanged.
+    /// SH degree of the input.
     All,
-    /// Lowest degree at which renders hardly change.
+    /// Lowest SH degree with which renders of the result hardly change.
     Needed,
-    /// Degrees up to this one. Refinement compensates for the dropped degrees.
+    /// At most this SH degree. Refinement compensates for the dropped coefficients.
     UpTo(usize),
 }
 
@@ -211,14 +211,14 @@ impl From<ShDegreeRule> for String {
     }
 }
 
-/// Precision in which a deformation field is written.
+/// Number format in which the deformation field (network or polynomial that moves the Gaussians) is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// Unchanged, byte for byte.
+    /// Unchanged from the input, byte for byte.
     #[default]
     Exact,
-    /// Half precision (IEEE 754 binary16).
+    /// Half precision (IEEE 754 binary16, 2 bytes per value).
     Half,
 }
 
@@ -227,7 +227,7 @@ pub enum Precision {
 #[serde(try_from = "String", into = "String")]
 pub struct AttributeGroups(pub Attributes);
 
-/// Name and attribute of every group.
+/// Name, as used in a recipe, and attribute of every group that can be refined.
 const GROUPS: [(&str, Attributes); 5] = [
     ("color", Attributes::SH),
     ("opacity", Attributes::OPACITY),
@@ -259,7 +259,7 @@ impl From<AttributeGroups> for String {
     }
 }
 
-/// Thresholds of one merge pass.
+/// Thresholds of one merge pass (one round of finding and replacing clusters).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
@@ -270,18 +270,18 @@ pub struct MergePass {
     pub tau_m: f64,
 }
 
-/// Unit of lengths in merging.
+/// Unit in which the lengths among the merge parameters are given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LengthUnit {
-    /// Scene units.
+    /// Scene units, the unit of the positions in the input.
     Scene,
-    /// Extent of the scene.
+    /// Extent of the scene: longest side of the box between the 1st and the 99th percentile of the positions.
     Extent,
 }
 
 impl LengthUnit {
-    /// Returns the length of one unit, scene units, in a scene of the given extent.
+    /// Returns the length of one unit in scene units, for a scene with the extent `extent` (scene units).
     pub fn in_scene_units(self, extent: f64) -> f64 {
         match self {
             LengthUnit::Scene => 1.0,
@@ -290,44 +290,46 @@ impl LengthUnit {
     }
 }
 
-/// Measure by which trajectories are compared.
+/// Formula that tells how alike the motions of two Gaussians are (1: equal). a and b are their steps from one frame to
+/// the next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Trajectory {
-    /// The paper's mean cosine of velocities.
+    /// Mean over the steps of the cosine of the angle between a and b, as in the paper.
     Cosine,
-    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²).
+    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps; σ is the parameter `motion_noise`.
     Alignment,
 }
 
-/// Position of a proxy.
+/// Position of a proxy (Gaussian that replaces a merged cluster).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Placement {
-    /// Weighted mean of its members.
+    /// Weighted mean of the positions of the cluster's members.
     Mean,
-    /// At the leader, with second moments about it.
+    /// Position of the leader, the member to which the others were joined. Second moments are then taken about this
+    /// position.
     Leader,
 }
 
-/// Rule for the opacity of a proxy.
+/// Rule for the opacity of a proxy (Gaussian that replaces a merged cluster), from the opacities α of its members.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProxyOpacity {
-    /// Clamped sum.
+    /// Sum of the opacities α, limited to the valid range.
     Sum,
-    /// 1 − Π(1 − α).
+    /// 1 − Π(1 − α), the opacity of all members one behind the other.
     Union,
-    /// Σ α·area / area of the proxy, clamped.
+    /// Σ α·area / (area of the proxy), limited to the valid range.
     Area,
 }
 
-/// Source of a proxy's SH coefficients above degree 0.
+/// Source of the SH coefficients above degree 0 of a proxy (Gaussian that replaces a merged cluster).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShHigh {
-    /// Weighted average of the members.
+    /// Weighted average of the coefficients of the cluster's members.
     Average,
-    /// The heaviest member.
+    /// Coefficients of the member with the largest weight.
     Heaviest,
 }

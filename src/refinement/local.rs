@@ -1,5 +1,6 @@
-//! Scratch file of the states at the frames of the target views, and of their derivatives with respect to the stored
-//! parameters. A frame in which most Gaussians are invisible is stored sparsely.
+//! Scratch file of the frame states (attributes of all Gaussians at one frame) of the target views, and of their
+//! derivatives with respect to the stored parameters. A frame in which most Gaussians are invisible is stored sparsely:
+//! only its visible Gaussians are written.
 
 use std::path::Path;
 
@@ -7,27 +8,28 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Opacity logit below which no delta makes a Gaussian visible: an opacity below 10⁻¹³.
+/// Opacity logit below which a Gaussian counts as invisible in a frame, whatever refinement adds: its opacity is below
+/// 10⁻¹³.
 const ABSENT_LOGIT: f32 = -30.0;
-/// A frame is stored sparsely if at most 1/N of the Gaussians are present in it.
+/// A frame is stored sparsely if at most 1/[`SPARSE_DIVISOR`] of the Gaussians are visible in it.
 const SPARSE_DIVISOR: usize = 2;
 
-/// State of one frame, and its derivative with respect to the stored parameters.
+/// Attributes of the Gaussians at one frame, and their derivative with respect to the stored parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LinearizedState {
-    /// Indices of the Gaussians it holds, increasing, if the others are not present; `None`: all Gaussians.
+    /// Increasing indices of the Gaussians in `state` if `state` leaves out invisible Gaussians; `None` if it has all.
     pub(super) present: Option<Vec<u32>>,
     pub(super) state: Gaussians,
     pub(super) jacobian: Jacobian,
 }
 
 impl LinearizedState {
-    /// Creates a state of no Gaussians, with SH coefficients up to `sh_degree`.
+    /// Creates a state without Gaussians, whose SH coefficients have degrees up to `sh_degree`.
     pub(super) fn none(sh_degree: usize) -> LinearizedState {
         LinearizedState { present: None, state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
     }
 
-    /// Returns the state of the Gaussians at `places`, increasing.
+    /// Returns the state of the Gaussians with the increasing indices `places` only.
     pub(super) fn pick(&self, places: &[u32]) -> LinearizedState {
         let Some(present) = &self.present else { return self.rows(places, None) };
         let stays = |(to, place): (u32, &u32)| Some((present.binary_search(place).ok()? as u32, to));
@@ -35,7 +37,7 @@ impl LinearizedState {
         self.rows(&rows, Some(present))
     }
 
-    /// Returns the state of the present Gaussians only, if they are few enough to be stored sparsely.
+    /// Returns the state of the visible Gaussians only, or `None` if they are too many for sparse storage.
     fn to_sparse(&self) -> Option<LinearizedState> {
         let logits = self.state.opacity_logit.plane(0);
         let is_present = |&(_, &logit): &(u32, &f32)| logit >= ABSENT_LOGIT;
@@ -44,35 +46,38 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns the state of the rows `rows`, which are the Gaussians `present`.
+    /// Returns the rows `rows` of this state. `present`: index of the Gaussian in each of these rows, if it is a sparse
+    /// state.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {
         LinearizedState { present, state: self.state.pick(rows), jacobian: self.jacobian.pick(rows) }
     }
 
-    /// Returns the columns stored for every frame: the attributes `varying` of the state, and the Jacobian.
+    /// Returns the columns that are stored for every frame: the attributes `varying`, and the Jacobian.
     fn stored_columns(&mut self, varying: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
         self.state.columns_mut(varying).chain(self.jacobian.columns_mut())
     }
 }
 
-/// Reader of the states of all frames. Memory: one state, and 24 bytes per frame.
+/// Reader of the states of all frames. Keeps one state and 24 bytes per frame in memory.
 #[derive(Debug)]
 pub(super) struct LinearizedFrames {
     file: Spill,
     varying: Attributes,
-    /// State of all Gaussians at the first frame: attributes that do not vary, and the shape of those that do.
+    /// State of all Gaussians at the first frame. Gives the values of attributes that do not vary with time, and the
+    /// number of columns and rows of attributes that do.
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
 }
 
-/// Position of a frame in the file, and its number of Gaussians if it is stored sparsely; the indices come first.
+/// Byte offset of a frame in the scratch file. For a sparse frame also its number of Gaussians, whose indices precede
+/// their values in the file.
 #[derive(Debug, Clone, Copy)]
 struct StoredFrame {
     at: u64,
     present: Option<usize>,
 }
 
-/// Writer of the states of all frames.
+/// Writer of the scratch file with the states of all frames.
 pub(super) struct LinearizedFramesWriter {
     file: SpillWriter,
     varying: Attributes,
@@ -82,7 +87,8 @@ pub(super) struct LinearizedFramesWriter {
 }
 
 impl LinearizedFramesWriter {
-    /// Creates a writer without frames; the attributes `varying` of states differ between frames.
+    /// Creates a writer to which no frame has been written yet. The attributes `varying` are stored for every frame,
+    /// all others for the first frame only.
     ///
     /// # Errors
     /// Fails if no scratch file can be created in `scratch`.
@@ -101,7 +107,7 @@ impl LinearizedFramesWriter {
         self.first.is_none()
     }
 
-    /// Returns the state at the first frame, if there is one.
+    /// Returns the state of the first frame written, or `None` before that.
     pub(super) fn first(&self) -> Option<&LinearizedState> {
         self.first.as_ref()
     }
@@ -111,7 +117,7 @@ impl LinearizedFramesWriter {
         self.file.write(bytes)
     }
 
-    /// Writes the state of the next frame.
+    /// Appends the state `next` of the next frame to the scratch file.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -124,7 +130,7 @@ impl LinearizedFramesWriter {
         next.stored_columns(self.varying).try_for_each(|column| self.write(bytemuck::cast_slice(column.planes())))
     }
 
-    /// Finishes writing and returns the reader.
+    /// Finishes the scratch file and returns its reader.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -139,12 +145,12 @@ impl LinearizedFramesWriter {
 }
 
 impl LinearizedFrames {
-    /// Returns the state at the first frame, if there is one.
+    /// Returns the state of all Gaussians at the first frame, or `None` if no frame was written.
     pub(super) fn first(&self) -> Option<&LinearizedState> {
         self.first.as_ref()
     }
 
-    /// Reads the state of frame `k`, in the order of writing, into `to`.
+    /// Reads the state of the `k`-th frame written into `to`.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
@@ -185,7 +191,7 @@ impl LinearizedFrames {
 mod tests {
     use super::*;
 
-    /// Creates a state whose positions count up and in which the Gaussians `present` are present.
+    /// Creates a test state of `len` Gaussians with positions 0, 1, 2, …. Only the Gaussians `present` are visible.
     fn linearized_state(len: usize, present: &[usize]) -> LinearizedState {
         let mut linearized_state = LinearizedState { state: Gaussians::zeros(len, 0), ..LinearizedState::default() };
         linearized_state.state.position.planes_mut().iter_mut().zip(0..).for_each(|(x, k)| *x = k as f32);
@@ -220,7 +226,7 @@ mod tests {
             assert_eq!(read.state.position, expected.state.position.pick(&rows));
             assert_eq!(read.state.opacity_logit, expected.state.opacity_logit.pick(&rows));
             assert_eq!(read.jacobian, expected.jacobian.pick(&rows));
-            // Attributes that do not vary come from the first frame.
+            // Attributes that do not vary with time come from the first frame.
             assert_eq!(read.state.log_scale, pushed[0].state.log_scale.pick(&rows));
         }
         let stored_columns = [6, 2, 0, 6, 1].into_iter().map(|rows| 4 * rows * (3 + 1 + 1)).sum::<u64>() + 4 * (2 + 1);

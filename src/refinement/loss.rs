@@ -1,4 +1,4 @@
-//! Loss of refinement: the difference between renders and target views.
+//! Loss that refinement minimizes: the difference between renders and target views (renders of the original model).
 
 use serde::{Deserialize, Serialize};
 
@@ -6,30 +6,32 @@ use super::targets::{mean_square, wide};
 use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim, ssim_gradient};
 use crate::render::Image;
 
-/// Weight of the squared error relative to 1 − SSIM: with equal fractions, both contribute about equally at 35 dB.
+/// Factor of the mean square error in the loss. With it, the squared error and 1 − SSIM contribute about equally at 35
+/// dB if both have the weight 0.5.
 const SQUARED_WEIGHT: f64 = 20.0;
 
-/// Loss: a fraction `ssim` of 1 − SSIM, the rest [`SQUARED_WEIGHT`] times the mean square error.
+/// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Loss {
-    /// Weight of 1 − SSIM, from 0 to 1.
+    /// Weight of 1 − SSIM in the loss, from 0 to 1.
     pub(super) ssim: f64,
 }
 
-/// Quality of renders against their target views.
+/// Quality of renders, compared with their target views and averaged over the views.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct RenderQuality {
-    /// Mean PSNR in dB.
+    /// Mean PSNR over the views, in dB.
     pub(super) psnr: f64,
-    /// Root of the mean square error over all views.
+    /// Root mean square error of all values of all views; values are from 0 to 1.
     pub(super) error: f64,
     /// Mean of 1 − SSIM; 0 if SSIM is not part of the loss.
     dissimilarity: f64,
 }
 
 impl Loss {
-    /// Returns the derivative of a view's loss with respect to each of its values, times the number of values, up to a
-    /// factor common to all views. Values outside [0, 1] have no derivative, because a screen clamps them.
+    /// Returns the derivative of the loss with respect to each value of the render `picture`, multiplied by the number
+    /// of values and by a factor that is the same for all views. Values outside [0, 1] have the derivative 0, because a
+    /// screen clamps them.
     pub(super) fn slope(&self, picture: &Image, target: &[u16]) -> Image {
         let mut slope = picture.clone();
         for (value, &wanted) in slope.data.iter_mut().zip(target) {
@@ -45,19 +47,21 @@ impl Loss {
         slope
     }
 
-    /// Returns the mean square error of a view, and 1 − SSIM if it is part of the loss (else 0).
+    /// Returns the mean square error of the render `picture`, and its 1 − SSIM, or 0 if SSIM is not part of the loss.
     pub(super) fn errors(&self, picture: &Image, target: &[u16]) -> [f64; 2] {
         let dissimilarity = if self.ssim > 0.0 { 1.0 - ssim(picture, &image(picture, target)) } else { 0.0 };
         [mean_square(picture, target), dissimilarity]
     }
 
-    /// Returns the memory per pixel of comparing `threads` views at once, beside the views and their targets, in bytes.
+    /// Returns the bytes of memory per pixel needed to compare `threads` views at once, in addition to the views and
+    /// their targets.
     pub(super) fn bytes_per_pixel(&self, threads: u64) -> u64 {
         let compared = threads * (12 + BYTES_PER_PIXEL) as u64;
         if self.ssim > 0.0 { compared.max((12 + SSIM_SLOPE_BYTES_PER_PIXEL) as u64) } else { 0 }
     }
 
-    /// Returns whether `now` is better than `best`: by mean PSNR, or by the loss if SSIM is part of it.
+    /// Returns whether `now` is better than `best`: has a higher mean PSNR or, if SSIM is part of the loss, a lower
+    /// loss.
     pub(super) fn is_closer(&self, now: &RenderQuality, best: &RenderQuality) -> bool {
         let loss =
             |of: &RenderQuality| (1.0 - self.ssim) * SQUARED_WEIGHT * of.error.powi(2) + self.ssim * of.dissimilarity;
@@ -66,7 +70,7 @@ impl Loss {
 }
 
 impl RenderQuality {
-    /// Averages the [`Loss::errors`] of several views.
+    /// Averages the results of [`Loss::errors`] for several views.
     pub(super) fn from_errors(pictures: &[[f64; 2]]) -> RenderQuality {
         let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
         RenderQuality {
@@ -77,7 +81,7 @@ impl RenderQuality {
     }
 }
 
-/// Returns the target of `picture` as an image.
+/// Returns the target view `target`, given as 16-bit values, as an image of the size of `picture`.
 fn image(picture: &Image, target: &[u16]) -> Image {
     Image { data: target.iter().copied().map(wide).collect(), ..*picture }
 }
@@ -108,7 +112,8 @@ mod tests {
                 let [square, dissimilarity] = loss.errors(&moved, &target);
                 count * (squared * square + ssim * dissimilarity)
             };
-            // Skips values near the ends of [0, 1], where a finite difference is the derivative on neither side.
+            // Skips values near 0 and 1, where the loss has a kink, so that a finite difference is the derivative on
+            // neither side.
             let clear = |k: &usize| [0.0, 1.0].iter().all(|end| (picture.data[*k] - end).abs() > 2e-3);
             for k in (0..picture.data.len()).step_by(7).filter(clear) {
                 let expected =

@@ -1,14 +1,16 @@
-//! Stage `refine`: fits the stored parameters of the survivors to renders of the original.
+//! Stage `refine`: fits the stored parameters of the survivors (the Gaussians that pruning left) to renders of the
+//! original model.
 //!
 //! Pruning leaves holes that only the survivors can fill, by growing their footprints over them. Gradient descent
-//! reduces the squared error (and, if set, 1 − SSIM) of one target view after another. Target views come from the
-//! cameras that the scene is scored by and from cameras in between, so that the result does not overfit to some views.
-//! A strong compression is reached in prune steps: optimization steps, a new ranking, removal, repeat. Some views are
-//! kept for validation; of the states during the last phase, the start included, the one with the best validation
-//! quality is written. A deformation field is not changed.
+//! reduces the squared error (and, if set, 1 − SSIM) of one target view after another. Target views are renders of the
+//! original from the cameras by which Gaussians are scored and from cameras in between, so that the result is not
+//! overfitted to a few views. If many Gaussians have to go, this happens in prune steps: optimize, rank the Gaussians
+//! again, remove the lowest, repeat. Some views are used for validation only. Of the parameters at the start of the
+//! last phase and at its validations, those with the best validation quality are written. A deformation field is not
+//! changed.
 //!
-//! Memory: an [`optimizer::Adam`] and one view with its gradient, three states, and the best delta so far. The
-//! target views, and the states at their frames, are in scratch files.
+//! Memory: an [`optimizer::Adam`], one view with its gradient, three frame states, and the best parameter delta so far.
+//! The target views and the states at their frames are in scratch files.
 
 mod local;
 mod loss;
@@ -32,25 +34,26 @@ use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use loss::Loss;
 
-/// Name of the stage.
+/// Name of the stage in messages and in the cache.
 const NAME: &str = "refine";
 
-/// Time of an optimization step, as a multiple of the time to render its view.
+/// Time of one optimization step, divided by the time to render its view.
 const STEP_RENDERS: f64 = 3.0;
 
-/// PSNR in dB above which refinement has nothing to gain: the rms error is about a quarter of an 8-bit
-/// step.
+/// Validation PSNR in dB from which refinement is skipped as useless: the root mean square error is then about a
+/// quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
-/// Fraction of the Gaussians that ranking alone leaves before the first optimization steps of a stronger compression.
+/// Minimum fraction of all Gaussians with which refinement begins, chosen by ranking alone. Fewer are reached by prune
+/// steps between optimization steps.
 const MIN_START_FRACTION: f64 = 0.4;
-/// Minimum fraction of the Gaussians that a prune step leaves.
+/// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
-/// Number of views that a prune step is ranked on; every prune step uses other views.
+/// Number of views by which the Gaussians are ranked for one prune step. Every prune step uses other views.
 const RANKING_VIEWS: usize = 48;
-/// Maximum number of views whose error sets the learning rates before a prune step.
+/// Maximum number of validation views by whose error the learning rates before a prune step are set.
 const RATE_VIEWS: usize = 16;
 
-/// Parameters of refinement.
+/// Stage that refines the Gaussians left by pruning, with its parameters.
 #[derive(Debug, Clone)]
 pub struct RefineStage {
     /// Attributes that are optimized.
@@ -59,26 +62,29 @@ pub struct RefineStage {
     pub sh_degree: usize,
     /// Loss to be minimized.
     loss: Loss,
-    /// Number of optimization steps at the final size, one view each.
+    /// Number of optimization steps after the last prune step; each uses one view.
     pub steps: usize,
-    /// Number of optimization steps before each prune step; see [`RefineStage::steps_before`].
+    /// Number of optimization steps before each prune step, reduced by [`RefineStage::steps_before`] while many
+    /// Gaussians are left.
     pub cut_steps: usize,
-    /// Maximum number of target views.
+    /// Maximum number of target views (renders of the original that the Gaussians are fitted to).
     pub pictures: usize,
-    /// Whether a strong compression is reached in prune steps.
+    /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub cuts: bool,
-    /// Minimum contrast between a Gaussian and what it hides, assumed when ranking for a prune step.
+    /// Minimum contrast, assumed when ranking for a prune step, between the color of a Gaussian and the colors that it
+    /// hides.
     pub contrast_floor: f64,
-    /// Maximum number of keyframes of the time-varying delta, for inputs with explicit frames; 0: no time-varying
-    /// delta.
+    /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. 0:
+    /// the delta is constant in time.
     pub knots: usize,
-    /// Target fraction of the Gaussians; `None`: no target was given.
+    /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
 }
 
 impl RefineStage {
-    /// Returns the stage, or `None` if `recipe` optimizes no attribute. `target` is the target fraction of the
-    /// Gaussians; `cuts` says that the run ranks by rendered views, so prune steps are possible.
+    /// Returns the stage, or `None` if `recipe` optimizes no attribute or has no steps. `target`: fraction of the
+    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, because the run ranks Gaussians
+    /// by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
@@ -97,24 +103,25 @@ impl RefineStage {
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
     }
 
-    /// Returns the stage with SH coefficients above degree 0 left unchanged.
+    /// Returns a copy of this stage that leaves SH coefficients above degree 0 unchanged.
     pub fn with_fixed_higher_sh(self) -> RefineStage {
         RefineStage { sh_degree: 0, ..self }
     }
 
-    /// Returns the stage with deltas that are constant in time.
+    /// Returns a copy of this stage whose parameter deltas do not vary with time.
     pub fn with_constant_deltas(self) -> RefineStage {
         RefineStage { knots: 0, ..self }
     }
 
-    /// Returns the stage with a fraction `part` of the steps, and deltas that are constant in time.
+    /// Returns a copy of this stage with the numbers of steps multiplied by `part`, and with deltas that do not vary
+    /// with time.
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
         RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
             .with_constant_deltas()
     }
 
-    /// Returns the cache key of these parameters; the input is not included.
+    /// Returns the cache key of these parameters. The input is not part of it.
     pub(crate) fn key(&self) -> CacheKey {
         let step_settings = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
         CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, step_settings))
@@ -124,41 +131,44 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the number of final optimization steps if a fraction `kept` of the Gaussians stays. The number is
-    /// proportional to the fraction pruned, up to `steps`.
+    /// Returns the number of optimization steps after the last prune step if a fraction `kept` of all Gaussians stays.
+    /// The number grows in proportion to the fraction pruned, up to `steps`.
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - MIN_START_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
     }
 
-    /// Returns the number of keyframes of the time-varying delta for an input like `work`.
+    /// Returns the number of keyframes of the time-varying parameter delta for the input described by `work`; 0 if the
+    /// delta is constant in time.
     fn keyframes_for(&self, work: &Workload) -> usize {
         match (work.input.jacobian, work.frames) {
-            // The number of frames of a stream is not known in advance.
+            // The number of frames of a stream is not known in advance, so the maximum number of keyframes is assumed.
             (0, 0) => self.knots,
             (0, frames) => keyframe_count(self.knots, frames as usize),
             _ => 0,
         }
     }
 
-    /// Returns the number of steps before a prune step of `left` Gaussians on the way to `wanted`. A larger `left` gets
-    /// fewer steps, because a step takes longer and more of its effect is removed later.
+    /// Returns the number of optimization steps before a prune step, if `left` Gaussians are left and `wanted` are to
+    /// remain in the end. With more Gaussians left there are fewer steps, because a step takes longer and more of its
+    /// effect is removed later.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
         (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
 
-    /// Returns the fraction of all Gaussians with which refinement begins at least, if it removes the rest in prune
-    /// steps.
+    /// Returns the smallest fraction of all Gaussians with which refinement begins before it prunes further in prune
+    /// steps; `None` if there are no prune steps.
     pub fn starts_at(&self) -> Option<f64> {
         self.cuts.then_some(MIN_START_FRACTION)
     }
 
-    /// Returns the number of Gaussians of `all` to begin with if `wanted` are to stay.
+    /// Returns how many of the `all` Gaussians of the model refinement begins with if it is to end with `wanted`.
     pub fn first(&self, wanted: usize, all: usize) -> usize {
         start_count(self.starts_at(), wanted, all)
     }
 
-    /// Estimates the memory and time of the stage: states, the optimizer, and a view with its gradient.
+    /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
+    /// view with its gradient.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
         let read = [("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
@@ -171,14 +181,14 @@ impl RefineStage {
             ("result", work.input.reduced),
             ("views", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
-        // Peak memory is the maximum of three phases: rendering the original, optimizing the survivors, and optimizing
-        // along time.
+        // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
+        // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.
         let phase = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
             let parts = read.into_iter().chain(left).chain(more);
             parts.map(|(name, bytes)| (name, bytes_of_survivors(part, bytes))).collect()
         };
         let (wanted, keyframe_count) = (self.target.unwrap_or(1.0).min(1.0), self.keyframes_for(work));
-        // Includes the best time-varying delta so far.
+        // The last two terms hold a copy of the best time-varying delta so far.
         let keyframe_bytes = optimizer::bytes_per_gaussian(self.columns, 0) as u64
             + work.state(self.columns.difference(Attributes::SH))
             + 12;
@@ -199,7 +209,8 @@ impl RefineStage {
                 true => (steps, validation_renders, 0.0),
                 false => (self.steps_before(size, left), RATE_VIEWS as f64, RANKING_VIEWS as f64),
             };
-            // Evaluating states and their Jacobians takes three times as long as evaluating states.
+            // Evaluating states and their Jacobians under a deformation field takes three times as long as evaluating
+            // states.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
             work.reading(count, frames as f64 * found)
                 + work.render_seconds(renders + STEP_RENDERS * steps as f64, count, RENDER)
@@ -222,18 +233,20 @@ impl RefineStage {
     }
 }
 
-/// Returns the number of Gaussians of `all` that refinement begins with if `wanted` are to stay: at least the fraction
-/// `starts_at`, the rest of which is removed in prune steps. With `starts_at` = `None` it is `wanted`.
+/// Returns how many of the `all` Gaussians of a model refinement begins with if it is to end with `wanted`. It begins
+/// with at least the fraction `starts_at` and removes the surplus in prune steps. If `starts_at` is `None`, it begins
+/// with `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
-/// Returns the number of optimization steps along time that follow `steps` steps of a delta constant in time.
+/// Returns the number of optimization steps of the time-varying delta that follow `steps` steps of the constant delta.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }
 
-/// Returns the numbers of Gaussians before and after every prune step, from `first` to `last`.
+/// Returns the numbers of Gaussians before, between and after the prune steps that lead from `first` to `last`
+/// Gaussians.
 fn prune_counts(first: usize, last: usize) -> Vec<usize> {
     let ratio = last.max(1) as f64 / first.max(1) as f64;
     let cuts = (ratio.ln() / MIN_PRUNE_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;

@@ -1,8 +1,9 @@
-//! Gradient descent on the stored parameters of Gaussians.
+//! Adam optimizer of the stored parameters of Gaussians.
 //!
-//! Input: derivatives of the loss of one view after another ([`Gradients`]). Output: a [`ParamDelta`] of the stored
-//! parameters. The method is Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a learning
-//! rate for each group of values, and no correction but Adam's own bias correction. Memory: [`bytes_per_gaussian`].
+//! Input: derivatives of the loss of one view after another ([`Gradients`]). Output: a [`ParamDelta`], which is added
+//! to the stored parameters. The method is Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015)
+//! with one learning rate for each kind of parameter and without corrections other than Adam's own bias correction.
+//! Memory: [`bytes_per_gaussian`].
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -10,17 +11,18 @@ use serde::{Deserialize, Serialize};
 use crate::compressed_model::ParamDelta;
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficients};
 
-/// Decay rates of the running means of the derivative and of its square.
+/// Adam's decay rates β₁, of the running mean of the derivative, and β₂, of the running mean of its square.
 const BETAS: [f32; 2] = [0.9, 0.999];
-/// Term that keeps Adam's division finite.
+/// Small term in the denominator of Adam's update, against division by 0.
 const EPSILON: f32 = 1e-15;
-/// Number of steps over which learning rates grow to their full size, because the first means are unreliable.
+/// Number of first steps during which learning rates grow to full size, because Adam's running means are still
+/// unreliable.
 const WARM_UP: usize = 10;
-/// Root mean square error of the views from which learning rates have full size; nearly correct parameters get smaller
-/// steps.
+/// Root mean square error of the renders at the start (values from 0 to 1) from which learning rates have full size.
+/// With a smaller error they are reduced in proportion, so that nearly correct parameters are not disturbed.
 const FULL_ERROR: f64 = 0.045;
 
-/// Learning rates by optimization step.
+/// Factor on all learning rates as a function of the optimization step.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct RateSchedule {
     steps: usize,
@@ -29,18 +31,18 @@ pub struct RateSchedule {
 }
 
 impl RateSchedule {
-    /// Creates the schedule of `steps` steps; the last step has a fraction `last` of the first step's rates. `error` is
-    /// the root mean square error of the views at the start.
+    /// Creates the schedule of `steps` steps, at the end of which the rates have fallen to the fraction `last` of those
+    /// at the beginning. `error`: root mean square error of the renders at the start.
     pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
         RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
 
-    /// Returns the schedule with all rates multiplied by `part`.
+    /// Returns a copy of this schedule with all rates multiplied by `part`.
     pub fn times(self, part: f32) -> RateSchedule {
         RateSchedule { factor: part * self.factor, ..self }
     }
 
-    /// Returns the factor on the rates after `done` steps.
+    /// Returns the factor on all learning rates for the step that follows `done` steps.
     fn at(&self, done: usize) -> f32 {
         let [warm, late] = [(done + 1) as f32 / WARM_UP as f32, done as f32 / self.steps.max(1) as f32];
         self.factor * warm.min(1.0) * self.last.powf(late)
@@ -51,24 +53,24 @@ impl RateSchedule {
 #[derive(Debug)]
 pub struct Adam {
     change: ParamDelta,
-    /// Running means of the derivatives, and of their squares.
+    /// Running means of the derivatives, and of the squared derivatives.
     means: [Gaussians; 2],
-    /// `[N]`, factors on the learning rate: for positions 0.04 times the geometric mean of the scales, for
-    /// other attributes 1; 0 for fixed Gaussians.
+    /// Factors on the learning rates, one per Gaussian: first for positions (0.04 times the geometric mean of the
+    /// scales, scene units), then for all other attributes (1). Both are 0 for Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,
 }
 
-/// Returns the memory of a [`Adam`] and of the derivatives it uses, in bytes per Gaussian, for the attributes
-/// `columns` with SH coefficients up to `sh_degree`.
+/// Returns the bytes of memory per Gaussian of an [`Adam`] and of the derivatives it uses, if it optimizes the
+/// attributes `columns` with SH coefficients up to `sh_degree`.
 pub fn bytes_per_gaussian(columns: Attributes, sh_degree: usize) -> usize {
     4 * 4 * columns.width(sh_degree) + 2 * size_of::<f32>()
 }
 
 impl Adam {
-    /// Creates the optimizer at `start`. The attributes `columns` are optimized, SH coefficients up to `sh_degree`,
-    /// except for the Gaussians `fixed`.
+    /// Creates an optimizer whose parameters start at `start`. It changes the attributes `columns`, with SH
+    /// coefficients up to `sh_degree`, of all Gaussians for which `fixed` is false.
     pub fn new(start: &Gaussians, columns: Attributes, sh_degree: usize, fixed: &[bool]) -> Adam {
         let mut change = Gaussians::default();
         for column in columns.iter() {
@@ -81,24 +83,25 @@ impl Adam {
         Adam { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
-    /// Returns the delta to be added to the start.
+    /// Returns the delta: present parameters minus start parameters.
     pub fn change(&self) -> &ParamDelta {
         &self.change
     }
 
-    /// Returns whether the delta is not 0.
+    /// Returns whether the delta (present parameters minus start parameters) has any value other than 0.
     pub fn has_moved(&self) -> bool {
         self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
     }
 
-    /// Returns the delta to be added to the start and resets it to 0; the caller adds it to the start.
+    /// Returns the delta and resets it to 0. The caller has to add the delta to the start parameters.
     pub fn take(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
     }
 
-    /// Restarts with `change` as the delta; attributes that `change` does not have get a delta of 0.
+    /// Restarts the optimizer with the delta `change` and with running means of 0. Attributes that `change` does not
+    /// have get a delta of 0.
     pub fn restart(&mut self, change: &ParamDelta) {
         self.take();
         for column in (self.columns & change.columns()).iter() {
@@ -110,24 +113,25 @@ impl Adam {
         self.done = 0;
     }
 
-    /// Returns the contents of a checkpoint: delta, means, and number of steps. [`Adam::resume`] resumes from it.
+    /// Returns the values that a checkpoint stores and [`Adam::resume`] takes: delta, running means, and number of
+    /// steps.
     pub fn checkpoint(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
 
-    /// Resumes from the checkpoint of another optimizer with the same start.
+    /// Sets the values that [`Adam::checkpoint`] of another optimizer with the same start parameters returned.
     pub fn resume(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }
 
-    /// Makes one step against `weight` times `gradients`, with the learning rates of `schedule`.
+    /// Makes one step with the derivatives `weight` · `gradients` and the learning rates of `schedule`.
     ///
     /// # Panics
-    /// Panics if `gradients` has other Gaussians or fewer attributes.
+    /// Panics if `gradients` has another number of Gaussians or lacks an optimized attribute.
     pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &RateSchedule) {
         let factor = schedule.at(self.done);
         self.done += 1;
-        // Corrects the bias of means that started at 0.
+        // Adam's correction of the bias that running means have because they started at 0.
         let unbiased = BETAS.map(|beta| 1.0 / (1.0 - beta.powi(self.done as i32)));
         let [position_reach, other_reach] = &self.reach;
         let count = other_reach.len().max(1);
@@ -156,7 +160,7 @@ impl Adam {
     }
 }
 
-/// Returns the learning rate of component `c` of `column`; positions are in units of their `reach`.
+/// Returns the learning rate of component `c` of the attribute `column`. For positions it is in units of `Adam::reach`.
 fn rate(column: Attributes, c: usize) -> f32 {
     match column {
         Attributes::POSITION => 1.0,
@@ -172,7 +176,7 @@ fn rate(column: Attributes, c: usize) -> f32 {
 mod tests {
     use super::*;
 
-    /// Returns the derivatives of Σ (value − aim)² / 2 in every attribute.
+    /// Returns the derivatives of Σ (value − aim)² / 2 with respect to every attribute value.
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
         let mut gradients = Gradients::new(state.len(), Attributes::all(), 0);
         for column in Attributes::all().iter() {

@@ -1,4 +1,5 @@
-//! State of the optimization: the states of the survivors at the frames of the target views.
+//! Optimizer with the frame states that it needs: the attributes of the survivors (Gaussians left by pruning) at the
+//! frames of the target views.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -15,7 +16,7 @@ use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
-/// Attributes and loss of the optimization.
+/// Loss, and which attributes are optimized.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StepParams {
     /// Attributes that are optimized.
@@ -26,70 +27,75 @@ pub(super) struct StepParams {
     pub(super) loss: Loss,
 }
 
-/// Minimum number of frames per keyframe of a [`TrajectoryDelta`].
+/// Minimum number of frames per keyframe of a delta that varies with time ([`TrajectoryDelta`]).
 const FRAMES_PER_KEYFRAME: usize = 4;
 
-/// Returns the number of keyframes of the time-varying delta of a sequence of `frames` frames, at most `most`; 0
-/// instead of 1.
+/// Returns the number of keyframes, at most `max_keyframes`, of the time-varying delta for a sequence of `frames`
+/// frames. Returns 0 instead of 1, because one keyframe does not vary with time.
 pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     let keyframe_count = max_keyframes.min(frames / FRAMES_PER_KEYFRAME);
     if keyframe_count > 1 { keyframe_count } else { 0 }
 }
 
-/// Number of steps after which states are reevaluated, if they depend on the stored parameters by more than a sum.
+/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only
+/// with a deformation field; otherwise a state is always its first value plus the delta.
 pub(super) const REEVALUATE_EVERY: usize = 200;
 
-/// The survivors, their states at the frames of the target views, and the delta so far.
+/// Optimizer, the Gaussians left by pruning with their states at the frames of the target views, and the delta so far.
 ///
-/// States that depend on the stored parameters by more than a sum, as with a deformation field, are reevaluated every
-/// [`REEVALUATE_EVERY`] steps and extrapolated along their Jacobians in between. Evaluating a field and its derivative
-/// at every step would take three times as long and gain nothing (method.md, section 6.2).
+/// With a deformation field, a frame state is not simply the stored parameters plus a delta. It is then evaluated anew
+/// every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the field and its
+/// derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
-/// Memory: six states, [`Adam`], and a view with its gradient; in a scratch file one state per frame, of the
-/// Gaussians present if they are few.
+/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame; a frame
+/// with few visible Gaussians has only these in the file.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
     deformation: Option<&'a dyn Deformation>,
-    /// Frames of the target views, increasing.
+    /// Indices of the frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Attributes,
-    /// State of each of these frames before `descent` changed anything.
+    /// State of each frame in `frames`, without the delta of the optimizer `descent`.
     linearized: LinearizedFrames,
-    /// Stored parameters before `descent` changed anything, if states depend on them by more than a sum.
+    /// Stored parameters without the delta of the optimizer `descent`. Used only with a deformation field.
     stored: StoredParams,
-    /// Delta that was added to the stored parameters before that.
+    /// Delta of earlier optimization steps, which `stored` and `linearized` already include.
     before: ParamDelta,
     fixed: Vec<bool>,
-    /// Attributes and loss, limited to what the states have.
+    /// Loss and optimized attributes, restricted to the attributes and SH degree that the model has.
     step_params: StepParams,
     descent: Adam,
-    /// One optimizer per keyframe of the time-varying delta; empty if there is none.
+    /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.
     course: Vec<Adam>,
-    /// Attributes of each Gaussian that vary between frames; empty with a deformation field.
+    /// For each Gaussian, the attributes that vary between frames; none with a deformation field.
     changing: Vec<Attributes>,
     gradients: Gradients,
-    /// Buffer for the state of the view being rendered.
+    /// Buffer for the frame state of the view being rendered.
     now: LinearizedState,
     renderer: Renderer,
-    /// Number of steps since states were evaluated.
+    /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
-    /// Whether states were reevaluated since the last prune step, or since the beginning.
+    /// Whether the frame states were evaluated again since the last prune step (or since the beginning, before the
+    /// first).
     reevaluated: bool,
 }
 
-/// Contents of a checkpoint: the stored parameters at the last reevaluation with the delta added by then (`None` if
-/// there was no reevaluation since the phase began); the optimizer's delta, means and steps; the number of steps since
-/// states were evaluated; and the same three values of the optimizer of each keyframe.
+/// Contents of a checkpoint, in this order:
+/// - the stored parameters at the last evaluation of the frame states and the delta included in them; `None` if states
+///   were not evaluated again since the phase began,
+/// - delta, running means and step number of the optimizer,
+/// - number of steps since the frame states were evaluated,
+/// - delta, running means and step number of the optimizer of each keyframe.
 type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
-/// An [`OptimizerCheckpoint`] read back from the cache.
+/// Contents of a checkpoint ([`OptimizerCheckpoint`]), read back from the cache.
 pub(super) type KeptCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {
-    /// Creates the state for the survivors in `result`, to be optimized with these parameters except for the Gaussians
-    /// `fixed`.
+    /// Creates the optimizer state of the model `result`. All Gaussians are optimized, except those for which `fixed`
+    /// is true.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -154,7 +160,7 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Starts the optimizer anew at the current states.
+    /// Creates a new optimizer with a delta of 0, which starts at the present frame states.
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -163,9 +169,9 @@ impl<'a> OptimizerState<'a> {
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
-    /// Starts optimizing a time-varying delta of 0 with `keyframe_count` keyframes. A Gaussian's delta varies only in
-    /// attributes that vary in the input (others are stored once), and only in SH coefficients of degree 0. Returns
-    /// whether there is anything to optimize.
+    /// Adds a time-varying delta with `keyframe_count` keyframes, which starts at 0. It changes only attributes that
+    /// vary with time in the input (others are stored once for all frames), and only SH coefficients of degree 0.
+    /// Returns false if there is no such attribute.
     pub(super) fn enable_keyframes(&mut self, keyframe_count: usize) -> bool {
         let columns = self.step_params.columns & self.changing.iter().copied().collect();
         let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {
@@ -175,28 +181,29 @@ impl<'a> OptimizerState<'a> {
         true
     }
 
-    /// Returns the time-varying delta.
+    /// Returns the delta that varies with time, as its values at the keyframes.
     pub(super) fn course(&self) -> TrajectoryDelta {
         TrajectoryDelta(self.course.iter().map(|knot| knot.change().clone()).collect())
     }
 
-    /// Returns the keyframes around frame index `k`, with their weights.
+    /// Returns the two keyframes around frame `frames[k]` with their interpolation weights.
     fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
         TrajectoryDelta::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
-    /// Returns which Gaussians are not optimized.
+    /// Returns for each Gaussian whether it is excluded from optimization.
     pub(super) fn fixed(&self) -> &[bool] {
         &self.fixed
     }
 
-    /// Returns the delta of the stored parameters that is constant in time.
+    /// Returns the total delta of the stored parameters that is constant in time.
     pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
         if self.descent.has_moved() { before.and(self.descent.change().clone()) } else { before }
     }
 
-    /// Reevaluates the states if they depend on the stored parameters by more than a sum.
+    /// Evaluates the frame states anew from the stored parameters. Does nothing without a deformation field, because
+    /// states are then exact.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -216,7 +223,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the state that a checkpoint stores and [`OptimizerState::resume`] resumes from.
+    /// Returns the contents of a checkpoint, from which [`OptimizerState::resume`] continues.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
         let reevaluated = self.reevaluated.then_some((&self.stored, &self.before));
         let course = self.course.iter().map(Adam::checkpoint).collect();
@@ -225,7 +232,7 @@ impl<'a> OptimizerState<'a> {
         checkpoint
     }
 
-    /// Resumes from the checkpoint of another optimization that started equally and removed the same Gaussians.
+    /// Continues from the checkpoint of an earlier run that started with the same model and removed the same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -244,7 +251,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Restarts the optimizer from `change`, a [`OptimizerState::change`] since the last prune step.
+    /// Restarts the optimizer from the total delta `change`, an earlier result of [`OptimizerState::change`] with the
+    /// same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -253,7 +261,8 @@ impl<'a> OptimizerState<'a> {
         self.reevaluate_states()
     }
 
-    /// Adds the optimizer's delta to the stored parameters, and resets it to 0.
+    /// Adds the optimizer's delta to the stored parameters (with a deformation field) and to `before`, and resets it to
+    /// 0.
     fn bake_delta(&mut self) {
         if !self.descent.has_moved() {
             return;
@@ -265,7 +274,7 @@ impl<'a> OptimizerState<'a> {
         self.before = std::mem::take(&mut self.before).and(moved);
     }
 
-    /// Keeps only the Gaussians at `places`, with their current states.
+    /// Removes all Gaussians except those with the indices `places`. The others keep their present states.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
@@ -288,7 +297,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Computes the current state at frame index `k` into `now`.
+    /// Computes the present state of frame `frames[k]`, deltas included, into `now`.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.descent.change();
@@ -308,12 +317,13 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the frame index of view `k`.
+    /// Returns the index in `frames` of the frame of target view `k`.
     fn frame_index(&self, k: usize) -> usize {
         self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
     }
 
-    /// Makes one optimization step on view `k`, with the learning rates of `schedule`.
+    /// Makes one optimization step of the delta that is constant in time, on target view `k` with the learning rates of
+    /// `schedule`.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
@@ -327,13 +337,13 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Makes one optimization step of the time-varying delta on view `k`, with the learning rates of `schedule`.
+    /// Makes one optimization step of the time-varying delta, on target view `k` with the learning rates of `schedule`.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn step_along(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         self.differentiate(k)?;
-        // Attributes that do not vary in the input get no delta.
+        // Attributes that do not vary with time in the input get no time-varying delta.
         for column in self.step_params.columns.iter() {
             let slopes = self.gradients.column_mut(column);
             for c in 0..slopes.width() {
@@ -348,7 +358,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Computes the gradients of view `k`.
+    /// Renders target view `k` and computes the derivatives of its loss into `gradients`.
     fn differentiate(&mut self, k: usize) -> Result<()> {
         let target = self.targets.values(k)?;
         let mut now = std::mem::take(&mut self.now);
@@ -367,7 +377,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the quality of the views `views` against their targets.
+    /// Renders the target views with the indices `views` and returns their mean quality.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
@@ -381,7 +391,8 @@ impl<'a> OptimizerState<'a> {
         Ok(RenderQuality::from_errors(&losses))
     }
 
-    /// Returns the removal error of each Gaussian, summed over the views `views`.
+    /// Returns the squared error that removing each Gaussian would cause, summed over the target views with the indices
+    /// `views`.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
@@ -407,7 +418,7 @@ impl<'a> OptimizerState<'a> {
         .unwrap_or_else(|| Ok(zero().1))
     }
 
-    /// Creates the renderer and state buffer of one thread.
+    /// Creates the renderer and the frame state buffer of one thread.
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
     }

@@ -1,26 +1,27 @@
-//! Models of a search for a size: prune steps leave models from which smaller sizes are made.
+//! Models of a search for the smallest sufficient number of Gaussians. The models of earlier prune steps are kept, so
+//! that smaller models can be made from them.
 
 use super::{MIN_PRUNE_FRACTION, RefineRun};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 
-/// Models that a search has pruned and refined so far. A smaller size starts from the smallest one that is large
-/// enough.
+/// Models that a search for a size has pruned and refined so far. A new size is pruned from the smallest model that has
+/// at least as many Gaussians.
 pub struct PruneSteps<'a> {
     refinement: RefineRun<'a>,
-    /// Models so far, from large to small.
+    /// Models made so far, from large to small.
     models: Vec<CompressedModel>,
 }
 
 impl<'a> PruneSteps<'a> {
-    /// Returns an empty list of models, to be made by `refinement`.
+    /// Creates an empty list; `refinement` will make its models.
     pub(crate) fn new(refinement: RefineRun<'a>) -> PruneSteps<'a> {
         PruneSteps { refinement, models: Vec::new() }
     }
 
-    /// Returns the best model of `size` Gaussians. Starts from the smallest model so far that has at least `size`
-    /// Gaussians, else from `start`, the Gaussians that ranking alone leaves for that size.
+    /// Returns a refined model of `size` Gaussians. Prunes it from the smallest earlier model with at least `size`
+    /// Gaussians. Without one it begins with `start`, the Gaussians that ranking alone leaves.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -44,8 +45,8 @@ impl<'a> PruneSteps<'a> {
     }
 }
 
-/// Returns the number of Gaussians that the next prune step leaves of `count` on the way to a smaller number `wanted`:
-/// a fraction [`MIN_PRUNE_FRACTION`], and always at least one Gaussian less than before.
+/// Returns how many of `count` Gaussians the next prune step keeps if `wanted` are to remain in the end: a fraction
+/// [`MIN_PRUNE_FRACTION`] of them, but at least one less than `count` and at least `wanted`.
 fn next_size(count: usize, wanted: usize) -> usize {
     ((MIN_PRUNE_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }

@@ -21,23 +21,24 @@ use crate::scene::Scene;
 use crate::scene::between::SplitMix64;
 use crate::source::FrameSource;
 
-/// Limits of the number of steps between two evaluations of the validation views; a third of all steps lies within
-/// them.
+/// Minimum and maximum number of optimization steps between two renderings of the validation views. Within these limits
+/// it is a third of all steps.
 const VALIDATE_EVERY: [usize; 2] = [100, 500];
-/// Minimum interval between two checkpoints, as a multiple of the time that the last one took.
+/// Minimum time between two checkpoints, divided by the time that writing the last one took.
 const CHECKPOINT_COST_FACTOR: u32 = 40;
-/// Limits of the checkpoint interval: an interrupted run loses less than a minute.
+/// Minimum and maximum time between two checkpoints. With this maximum an interrupted run loses less than a minute.
 const CHECKPOINT_INTERVAL: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(30)];
-/// Minimum gain in dB of deltas that vary in time; with a smaller gain they are not worth their bytes.
+/// Minimum gain in dB for which deltas that vary with time are kept; a smaller gain is not worth their bytes.
 const MIN_KEYFRAME_GAIN: f64 = 0.01;
-/// Factor applied to the learning rates after steps that made the validation views worse.
+/// Factor applied to the learning rates when optimization steps have lowered the quality of the validation views.
 const RATE_REDUCTION: f32 = 0.3;
-/// Learning rate of the last step, as a fraction of the first step's: before a prune step, and at the end.
+/// Learning rates of the last step as a fraction of those of the first step: before a prune step, and in the final
+/// steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.05];
 
 impl RefineStage {
-    /// Refines the survivors and prunes them down to `wanted`. The result is the state with the best validation
-    /// quality. Protected Gaussians keep their stored parameters.
+    /// Prunes the model `reduction` down to `wanted` Gaussians and refines it. Returns the parameters with the best
+    /// quality on the validation views. Protected Gaussians (which the user keeps) are not changed.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -71,8 +72,8 @@ impl RefineStage {
         journal.kept(&scene.work, NAME, key, run)
     }
 
-    /// Returns the mean PSNR in dB of the validation views against the original after such a refinement, as a part of
-    /// the stage `stage`.
+    /// Refines like [`RefineStage::run`], as part of the stage `stage`, and returns only the mean PSNR in dB of the
+    /// validation views, compared with the original.
     ///
     /// # Errors
     /// Fails like [`RefineStage::run`].
@@ -93,12 +94,12 @@ impl RefineStage {
     }
 }
 
-/// Order of the target views: every epoch takes all of them in a new random order.
+/// Random order in which target views are used. Every epoch takes all views once, in a new order.
 struct EpochSampler {
     pictures: Vec<usize>,
     at: usize,
     random: SplitMix64,
-    /// Number of views taken so far.
+    /// Number of views taken since the beginning.
     taken: usize,
 }
 
@@ -117,7 +118,7 @@ impl EpochSampler {
         self.pictures[self.at - 1]
     }
 
-    /// Advances to the state after `taken` views.
+    /// Takes views until `taken` views have been taken in all, to continue an interrupted run.
     fn skip_to(&mut self, taken: usize) {
         while self.taken < taken {
             self.next();
@@ -125,34 +126,34 @@ impl EpochSampler {
     }
 }
 
-/// Data shared by all phases of a refinement.
+/// Refinement of a model, with the data that all its phases share.
 pub(crate) struct RefineRun<'a> {
     refine: &'a RefineStage,
     scene: &'a Scene,
     scored: &'a Scored,
     targets: &'a Targets,
     sampler: EpochSampler,
-    /// Indices of the validation views.
+    /// Indices of the validation views among the target views.
     validation: Vec<usize>,
     /// Name of the stage that runs the refinement.
     stage: &'static str,
     progress: Progress,
-    /// Cache key of the parameters and target views; the compressed model is not included.
+    /// Cache key of the parameters and target views. The model that is refined is not part of it.
     key: CacheKey,
 }
 
-/// Checkpoint bookkeeping of a refinement that can be resumed. A phase is a prune step with its optimization steps, or
-/// the final steps.
+/// Decides when the next checkpoint of a refinement is written. A phase is one prune step with the optimization steps
+/// before it, or the final steps.
 struct CheckpointTimer {
-    /// Cache key of the refinement.
+    /// Cache key of the refinement, under which its checkpoints are stored.
     key: CacheKey,
     phase: usize,
-    /// Time of the last checkpoint, and interval to the next one.
+    /// Time of the last checkpoint. `interval` is the minimum time until the next one.
     saved_at: Instant,
     interval: Duration,
 }
 
-/// Checkpoint within a phase.
+/// Contents of a checkpoint that is written in the middle of a phase.
 #[derive(Serialize, Deserialize)]
 struct ResumePoint<Checkpoint, Best> {
     phase: usize,
@@ -161,30 +162,31 @@ struct ResumePoint<Checkpoint, Best> {
     taken: usize,
     schedule: RateSchedule,
     checkpoint: Checkpoint,
-    /// Best state so far; only in the last phase.
+    /// Best parameters so far; only in the last phase, which validates.
     best_state: Option<Best>,
 }
 
-/// Best state of the last phase.
+/// Parameter deltas with the best validation quality in the last phase.
 #[derive(Clone, Serialize, Deserialize)]
 struct BestState<Delta, Trajectory> {
     before: RenderQuality,
     best: RenderQuality,
-    /// Validation quality of the best delta that is constant in time.
+    /// Validation quality of the best delta among those that are constant in time.
     constant: RenderQuality,
-    /// Delta of the best state.
+    /// Constant part of the best delta.
     delta: Delta,
-    /// Factor on the learning rates.
+    /// Factor on the learning rates, reduced whenever the validation quality became worse.
     rate_factor: f32,
-    /// Time-varying delta of the best state.
+    /// Time-varying part of the best delta.
     trajectory: Trajectory,
 }
 
-/// Progress of a resumed phase: steps done, learning rates, and the best state in the last phase.
+/// Progress of a resumed phase: number of optimization steps done, learning rates and, in the last phase, the best
+/// deltas so far.
 type Resumed = (usize, RateSchedule, Option<BestState<ParamDelta, TrajectoryDelta>>);
 
 impl<'a> RefineRun<'a> {
-    /// Creates a refinement of `stage` with the training and validation views of `parts`.
+    /// Creates a refinement for the stage `stage`, which uses the training and validation views of `parts`.
     pub(crate) fn new(
         stage: &'static str,
         refine: &'a RefineStage,
@@ -200,12 +202,12 @@ impl<'a> RefineRun<'a> {
         RefineRun { refine, scene, scored, targets, sampler, validation, stage, progress, key }
     }
 
-    /// Sets the total number of steps of the progress display.
+    /// Restarts the progress display with `steps` as the total number of optimization steps.
     fn set_total_steps(&mut self, steps: usize) {
         self.progress.restart(steps as u64);
     }
 
-    /// Creates the optimizer state for `reduction`, whose frames `result` yields.
+    /// Creates the optimizer for the model `reduction`, whose frames are read from `result`.
     fn start_optimizer<'b>(
         &self,
         reduction: &CompressedModel,
@@ -218,7 +220,8 @@ impl<'a> RefineRun<'a> {
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of a refinement of `reduction` down to `size`, on the way to `wanted`.
+    /// Returns the cache key of pruning and refining `reduction` to `size` Gaussians if `wanted` are to remain in the
+    /// end.
     fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
         self.key.and(&(reduction, size, wanted, self.sampler.taken))
     }
@@ -227,8 +230,8 @@ impl<'a> RefineRun<'a> {
         CheckpointTimer { key, phase: 0, saved_at: Instant::now(), interval: CHECKPOINT_INTERVAL[0] }
     }
 
-    /// Runs all phases: prunes `reduction` down to `wanted`, then runs `steps` final steps. Also returns the mean PSNR
-    /// in dB of the validation views against the original.
+    /// Prunes `reduction` to `wanted` Gaussians in prune steps and then runs `steps` final optimization steps. Returns
+    /// the refined model and the mean PSNR in dB of its validation views, compared with the original.
     fn run_all(
         &mut self,
         reduction: &CompressedModel,
@@ -253,7 +256,8 @@ impl<'a> RefineRun<'a> {
         Ok((left, best.psnr))
     }
 
-    /// Prunes `reduction` down to `size`, on the way to `wanted`, after the optimization steps of one prune step.
+    /// Makes one prune step: runs optimization steps, then prunes `reduction` to `size` Gaussians. `wanted` is the
+    /// number of Gaussians that remain after the last prune step.
     pub(crate) fn cut_down(
         &mut self,
         reduction: &CompressedModel,
@@ -275,7 +279,7 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on `reduction` and returns it in its best state.
+    /// Runs the final optimization steps on `reduction` and returns it with the best deltas found.
     pub(crate) fn refine_best(
         &mut self,
         mut reduction: CompressedModel,
@@ -304,7 +308,8 @@ impl<'a> RefineRun<'a> {
         }
     }
 
-    /// Returns the number of steps along time that follow `steps` steps.
+    /// Returns the number of steps of the time-varying delta that follow `steps` steps of the constant delta; 0 if
+    /// deltas do not vary with time.
     fn steps_along_time(&self, steps: usize) -> usize {
         if self.keyframe_count() > 0 { along_time(steps) } else { 0 }
     }
@@ -315,12 +320,12 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Returns the name of the checkpoint in the cache.
+    /// Returns the name of the cache entry of the checkpoint.
     fn checkpoint_name(&self) -> String {
         format!("{}-steps", self.stage)
     }
 
-    /// Resumes the phase from its last checkpoint, if there is one.
+    /// Continues the present phase from its last checkpoint. Returns `None` if there is no checkpoint of this phase.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
         let kept: Option<ResumePoint<KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
             self.scene.work.find(&self.checkpoint_name(), timer.key)?;
@@ -331,7 +336,7 @@ impl<'a> RefineRun<'a> {
         Ok(Some((kept.steps, kept.schedule, kept.best_state)))
     }
 
-    /// Writes a checkpoint after so many steps if the interval has passed.
+    /// Writes a checkpoint after `steps` steps of the phase, if enough time has passed since the last one.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,
@@ -352,8 +357,8 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Runs `steps` optimization steps, then removes all but the `size` Gaussians with the largest removal error.
-    /// Returns the indices of the Gaussians that stay.
+    /// Runs `steps` optimization steps, then keeps only the `size` Gaussians whose removal would cause the largest
+    /// squared error. Returns their indices.
     fn prune_step(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -395,8 +400,8 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs `steps` optimization steps, then steps along time. Returns the delta with the best validation quality, and
-    /// that quality.
+    /// Runs `steps` optimization steps of the constant delta, then the steps of the time-varying delta. Returns the
+    /// deltas with the best validation quality.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -460,9 +465,9 @@ impl<'a> RefineRun<'a> {
         Ok(best_state)
     }
 
-    /// Runs the optimization steps along time that follow `steps` steps, from the best delta that is constant in time
-    /// or from the checkpoint at `done` steps. Keeps the time-varying delta with the best validation quality. Returns
-    /// whether such steps were run.
+    /// Runs the steps of the time-varying delta that follow `steps` steps of the constant delta. Starts from the best
+    /// constant delta, or from the checkpoint after `done` steps. Stores the best deltas in `best_state`. Returns
+    /// whether any step was run.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -481,7 +486,7 @@ impl<'a> RefineRun<'a> {
             if !optimizer.enable_keyframes(keyframe_count) {
                 return Ok(false);
             }
-            // Each view is a step of two keyframes.
+            // Every view changes the two keyframes around its frame, so a keyframe makes this many steps on average.
             schedule = RateSchedule::new(2 * keyframe_steps / keyframe_count, LAST_RATES[1], best_state.constant.error);
         }
         let validate_every = keyframe_steps.div_ceil(3);
@@ -502,7 +507,7 @@ impl<'a> RefineRun<'a> {
 }
 
 impl BestState<ParamDelta, TrajectoryDelta> {
-    /// Creates the state without any gain.
+    /// Creates the best state before any optimization step, with the validation quality `before` and the delta `delta`.
     fn new(before: RenderQuality, delta: ParamDelta) -> Self {
         BestState {
             before,
@@ -514,7 +519,7 @@ impl BestState<ParamDelta, TrajectoryDelta> {
         }
     }
 
-    /// Returns a view of this state for a checkpoint.
+    /// Returns a copy for a checkpoint, which borrows the deltas.
     fn checkpoint(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
         let BestState { before, best, constant, ref delta, rate_factor, ref trajectory } = *self;
         BestState { before, best, constant, delta, rate_factor, trajectory }

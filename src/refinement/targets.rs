@@ -1,4 +1,4 @@
-//! Target views: renders of the original that refinement fits.
+//! Target views: renders of the original model that refinement fits Gaussians to.
 
 use std::ops::Range;
 
@@ -12,49 +12,52 @@ use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::scene::between::{SplitMix64, between};
 
-/// Name of the target views in the cache.
+/// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
-/// Fractions of the views that come from the scene's cameras and from cameras in between, in 26ths.
+/// Shares of the target views, in 26ths: views from the scene's cameras, and views from cameras between two of these.
 const VIEW_SHARES: [usize; 2] = [3, 23];
-/// Maximum size of the target views in the scratch file, in bytes, as long as there are at least [`MIN_VIEWS`] views.
+/// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
+/// exceed it.
 const MAX_BYTES: u64 = 1 << 30;
-/// Minimum number of target views, whatever their size; see [`MAX_BYTES`].
+/// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// One in so many views is a validation view.
+/// One in this many views is a validation view.
 pub(super) const VALIDATION_EVERY: usize = 8;
 
-/// In a run with a quality target, one in so many views is a test view, used only for the reported quality.
+/// One in this many views is a test view, used only for the reported quality. Applies to runs with a quality target.
 const TEST_EVERY: usize = 4;
 
-/// Indices of the target views by purpose.
+/// Indices of the target views, by the purpose they are used for.
 #[derive(Clone)]
 pub(crate) struct ViewSplit {
-    /// Training views, which optimization steps use.
+    /// Training views, to which optimization steps fit the parameters.
     pub(crate) stepped: Vec<usize>,
-    /// Validation views, which choose the best state.
+    /// Validation views, by which the best parameters are chosen.
     pub(crate) apart: Vec<usize>,
-    /// Test views, used only for the reported quality.
+    /// Test views, used only to report the quality, not for training or validation.
     pub(crate) held: Vec<usize>,
 }
 
-/// Returns the number of target views from the scene's cameras and from cameras in between, at most `max_views`
-/// together, if a view has `pixels` pixels.
+/// Returns the numbers of target views from the scene's cameras and from cameras between these. Together they are at
+/// most `max_views`; fewer if the `pixels` pixels of each view would need too many bytes.
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
     VIEW_SHARES.map(|part| part * count / 26)
 }
 
-/// Renders of the original from the cameras that the scene is scored by and from cameras in between, in a scratch file.
+/// Renders of the original model, in a scratch file. Their cameras are those by which Gaussians are scored, and cameras
+/// between these.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
-    /// Views, sorted by frame.
+    /// Camera and frame of each target view, sorted by frame.
     pub(crate) pictures: Vec<FrameView>,
-    /// Files with the values of consecutive views, from 0 to 1 as 16 bits, one view after the other.
+    /// Scratch files, each with a range of consecutive views. A file has the color values of one view after the other,
+    /// from 0 to 1 as 16-bit integers.
     values: Vec<(Range<usize>, Spill)>,
 }
 
 impl Targets {
-    /// Renders `max_views` views, or fewer if they are large.
+    /// Renders `max_views` views of the original; fewer if they would need too many bytes.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
@@ -73,7 +76,8 @@ impl Targets {
         Ok(Targets { cameras, pictures, values })
     }
 
-    /// Assigns each view to training, validation or test. With `held` every fourth view is a test view, else none is.
+    /// Divides the views into training, validation and test views. If `held`, every fourth view is a test view;
+    /// otherwise there are none.
     pub(crate) fn parted(&self, held: bool) -> ViewSplit {
         let (held, rest): (Vec<usize>, Vec<usize>) =
             (0..self.pictures.len()).partition(|k| held && k % TEST_EVERY == TEST_EVERY - 1);
@@ -82,18 +86,18 @@ impl Targets {
         ViewSplit { stepped, apart, held }
     }
 
-    /// Returns the camera of view `k`.
+    /// Returns the camera of target view `k`.
     pub(super) fn camera(&self, k: usize) -> &Camera {
         &self.cameras[self.pictures[k].camera as usize]
     }
 
-    /// Returns the number of values of view `k`.
+    /// Returns the number of color values of view `k`: three per pixel.
     fn len(&self, k: usize) -> usize {
         let camera = self.camera(k);
         3 * camera.width as usize * camera.height as usize
     }
 
-    /// Reads the values of view `k`.
+    /// Reads the color values of view `k`, from 0 to 1 as 16-bit integers.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
@@ -107,7 +111,8 @@ impl Targets {
     }
 }
 
-/// Chooses cameras and views, sorted by frame: those that the scene is scored by, and those in between.
+/// Chooses the cameras, and the views sorted by frame: views by which Gaussians are scored, and views from cameras in
+/// between.
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
     let mut pictures = spread(&scene.schedule, scene_views, VIEWS_PER_FRAME);
@@ -126,19 +131,19 @@ fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>
     (cameras, pictures)
 }
 
-/// Returns the mean square error of a view.
+/// Returns the mean square error of the render `picture` against the 16-bit values `target`.
 pub(crate) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
     picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
 }
 
-/// Converts values from 0 to 1 to 16 bits.
+/// Converts color values from 0 to 1 to 16-bit integers; values outside are clamped.
 pub(super) fn narrow(picture: &Image) -> Vec<u16> {
     // NaN becomes 0.
     picture.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()
 }
 
-/// Converts a value of 16 bits, as made by [`narrow`], back to 0 to 1.
+/// Converts a 16-bit value made by [`narrow`] back to a value from 0 to 1.
 pub(super) fn wide(value: u16) -> f32 {
     f32::from(value) / f32::from(u16::MAX)
 }

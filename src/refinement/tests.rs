@@ -1,4 +1,4 @@
-//! Tests of whole refinements.
+//! Tests of refinement from beginning to end.
 
 use std::time::Instant;
 
@@ -27,7 +27,8 @@ use crate::render::render;
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Refines the first `count` Gaussians of the ranking of `scene` in `steps` steps; those in `keep` are protected.
+/// Keeps the first `count` Gaussians of the ranking of `scene` and refines them in `steps` steps; the Gaussians `keep`
+/// are protected (not changed).
 fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
@@ -37,7 +38,7 @@ fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Compre
     (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
 }
 
-/// Returns the mean PSNR of `reduction` over the test views of `rig`.
+/// Returns the mean PSNR in dB of `reduction` over the test views of `rig`, compared with the original.
 fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
     let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
     let result = scene.input.reduced(reduction).unwrap();
@@ -99,7 +100,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     write_container(&demo, &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let short = folder.path().join("scene.gseq");
     drop(scene(folder.path()));
-    // States that are the stored parameters plus a delta, states from a deformation field, and time-varying deltas.
+    // The three models have explicit frames, a deformation field, and explicit frames with a time-varying delta.
     for (number, path, steps, pictures) in [(0, short, 120, 60), (1, model, 120, 60), (2, long, 300, 300)] {
         let open = |work: Option<CacheRequest>| {
             let cameras = (number == 1).then(|| path.clone());
@@ -160,7 +161,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     }
 }
 
-/// A demo scene of which each frame shows a third of the Gaussians; the others have the given opacity logit.
+/// Demo scene in which each frame shows a third of the Gaussians; all others have the opacity logit of the third field.
 struct ShortLives(demo_scene::Scene, SequenceInfo, f32);
 
 struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);
@@ -232,7 +233,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
             let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
             states.iter().all(|frame| values(frame) == values(&states[0]))
         };
-        // Of the Gaussians that are always present, keep half of the moving and an eighth of the static ones.
+        // Of the Gaussians that are visible in all frames, keeps half of the moving and an eighth of the static ones.
         let is_there = |id: usize| given.iter().all(|frame| frame.opacity_logit.plane(0)[id] > -30.0);
         let part = |&id: &u32| {
             let one_in = if is_still(&given, Attributes::POSITION, id as usize) { 8 } else { 2 };
@@ -250,10 +251,10 @@ fn explicit_frames_improve_along_time_in_every_output() {
         });
         assert_eq!((constant.course.0.len(), varying.course.0.len()), (0, 4));
         assert!(varying.change == constant.change, "{name}");
-        // Some tracks join two Gaussians of this scene, with different colors.
+        // Some tracks (Gaussians linked over frames) join two Gaussians of this scene that have different colors.
         assert!(link == Link::Apart || !varying.course.columns().contains(Attributes::SH), "{name}");
         let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
-        // Moving Gaussians cover a small part of these views, and static ones must stay static.
+        // Moving Gaussians cover a small part of these views, so the gain is small; static Gaussians must stay static.
         assert!(after > before + 0.02, "{name}: {before:.2} dB constant in time, {after:.2} varying in time");
         let expected = read(&*scene.input.reduced(&varying).unwrap());
         // Attributes that are constant in the input stay constant, for every Gaussian.

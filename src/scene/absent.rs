@@ -1,8 +1,9 @@
-//! Gaussians that are dropped because some of their values are NaN or infinite: they are absent from every state read.
+//! Absent Gaussians: Gaussians that are dropped because some of their values are NaN or infinite. They are invisible in
+//! every frame that is read.
 //!
-//! Ids do not change. An absent Gaussian keeps its row, with a state that is invisible ([`clear_row`]), so renders,
-//! contributions, removal errors, statistics and bounds are those of the other Gaussians. Memory: 4 bytes per absent
-//! Gaussian, and as many in every reader.
+//! Ids do not change. An absent Gaussian keeps its row in the arrays, but with invisible values ([`clear_row`]). So
+//! renders, contributions, removal errors, statistics and bounds are those of the other Gaussians. Memory: 4 bytes per
+//! absent Gaussian, and as many again in every reader.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -10,17 +11,17 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Ids of the absent Gaussians, increasing.
+/// Ids of the absent Gaussians, in increasing order.
 #[derive(Debug, Default)]
 pub(super) struct Absent(RwLock<Arc<[u32]>>);
 
 impl Absent {
-    /// Returns the ids.
+    /// Returns the ids of the absent Gaussians.
     fn ids(&self) -> Arc<[u32]> {
         self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Replaces the ids by `ids`, which must be in increasing order.
+    /// Replaces the absent Gaussians by those with the ids `ids`, which must be in increasing order.
     pub(super) fn set(&self, ids: &[u32]) {
         debug_assert!(ids.is_sorted(), "absent ids are sorted");
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = ids.into();
@@ -31,8 +32,8 @@ impl Absent {
         self.ids().is_empty()
     }
 
-    /// Wraps `reader`, which reads the Gaussians `ids`, so that absent Gaussians are invisible. Returns it unchanged if
-    /// none of them is absent.
+    /// Wraps `reader`, which reads the Gaussians `ids`, so that it returns invisible values for absent Gaussians.
+    /// Returns `reader` unchanged if none of its Gaussians is absent.
     pub(super) fn hiding<'a>(&self, reader: Box<dyn BlockReader + 'a>, ids: &Ids<'_>) -> Box<dyn BlockReader + 'a> {
         let absent = self.ids();
         let rows = ids.iter().enumerate().filter(|(_, id)| absent.binary_search(&(*id as u32)).is_ok());
@@ -41,10 +42,10 @@ impl Absent {
     }
 }
 
-/// Reader of a block in which some Gaussians are absent.
+/// Reader of Gaussians of which some are absent.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// Rows of the absent Gaussians in the block.
+    /// Rows of the absent Gaussians among those that are read.
     rows: Vec<usize>,
 }
 
@@ -64,8 +65,8 @@ impl BlockReader for HidingReader<'_> {
     }
 }
 
-/// Sets the columns `want` of row `row` to the state of an absent Gaussian: a position of NaN (which is in no box and
-/// is not rendered), an opacity of 0, the identity rotation, size 1 and no color.
+/// Makes the Gaussian in row `row` of `state` invisible by setting its attributes `want`: a position of NaN (which lies
+/// in no box and is not rendered), an opacity of 0, the identity rotation, size 1 and no color.
 fn clear_row(state: &mut Gaussians, want: Attributes, row: usize) {
     for column in want.iter() {
         let value = match column {

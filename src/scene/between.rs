@@ -1,21 +1,23 @@
-//! Cameras between those of a scene. An unpruned model can be rendered from any camera, so refinement can fit renders
-//! of more views than those of the scene's cameras.
+//! Cameras in between those of a scene. The original model can be rendered from any camera, so refinement can fit
+//! renders from more views than the scene's cameras give.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::model::Camera;
 
-/// Least distance of a new camera from either of its two cameras, as a fraction of the path between them.
+/// Smallest distance of a new camera from each of the two cameras that it lies between, as a fraction of the path
+/// between these two.
 const MIN_FRACTION: f64 = 0.15;
-/// Least cosine of the angle between two cameras, seen from the point where the optical axes meet, between which a new
-/// camera is placed: about 127°. Halfway between opposite cameras, the viewing direction would be undefined.
+/// Smallest cosine of the angle between two cameras, seen from the point where the optical axes meet, for a new camera
+/// to be placed between them: angles up to about 127° are allowed. Halfway between opposite cameras, the viewing
+/// direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
-/// Returns `count` cameras, each on the path between two of `cameras`, with evenly interpolated rotation and distance.
-/// The first is chosen at random, the second at random among those less than about 127° away as seen from the point
-/// where the optical axes meet, or else the nearest one at another position. (Paths between neighbors only would leave
-/// the middle of a rig empty.) Returns no camera if all cameras are at one position. The result depends on the
-/// arguments only.
+/// Returns `count` new cameras, each on the path between two of `cameras`, with evenly interpolated rotation and
+/// distance. One of the two is chosen at random. The other is chosen at random among the cameras less than about 127°
+/// away from it, seen from the point where the optical axes meet; if there are none, it is the nearest camera at
+/// another position. (Paths between neighbors only would leave the middle of a rig empty.) Returns no camera if all
+/// cameras are at one position. The random numbers are the same in every run.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);
@@ -35,9 +37,9 @@ pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     found
 }
 
-/// Returns the camera at the fraction `fraction` of the path from one camera to another. Its rotation is interpolated
-/// evenly, and so is its distance from `focus`, the point where the optical axes meet. It keeps `focus` at the
-/// interpolated direction in the image.
+/// Returns the camera at the fraction `fraction` (0 to 1) of the path from the camera `from` to the camera `to`. Its
+/// rotation and its distance from `focus`, the point where the optical axes meet, are interpolated evenly. So is the
+/// direction in which the camera sees `focus`.
 pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, focus: DVec3) -> Camera {
     let [a, b] = [from, to].map(|camera| DQuat::from_mat3(&camera.rotation));
     let rotated = DMat3::from_quat(a.slerp(b, fraction));
@@ -46,7 +48,7 @@ pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, foc
     let distance = start.length() * (1.0 - fraction) + end.length() * fraction;
     // If the path passes through the focus, the center is interpolated linearly.
     let center = focus + linear.try_normalize().map_or(linear, |direction| direction * distance);
-    // On a wide path, even rotation alone would lose sight of the focus, so the camera is turned back toward it.
+    // On a wide path, even rotation alone would turn the focus out of sight, so the camera is turned back toward it.
     let seen = |camera: &Camera| (camera.rotation * (focus - camera.center())).normalize_or_zero();
     let wanted = seen(from).lerp(seen(to), fraction).normalize_or_zero();
     let direction = (rotated * (focus - center)).normalize_or_zero();
@@ -56,8 +58,8 @@ pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, foc
     Camera { rotation, translation: -(rotation * center), ..from.clone() }
 }
 
-/// Returns the point nearest to all optical axes in the least-squares sense; for parallel axes, the mean of the camera
-/// positions.
+/// Returns the point nearest to the optical axes of all cameras in the least-squares sense; for parallel axes, the mean
+/// of the camera positions.
 pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     let (mut matrix, mut right, mut middle) = (DMat3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -72,7 +74,8 @@ pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     if matrix.determinant().abs() > 1e-6 * count.powi(3) && point.is_finite() { point } else { middle / count }
 }
 
-/// Pseudo-random number generator SplitMix64 (Steele, Lea and Flood, 2014). The numbers depend on the seed only.
+/// Pseudo-random number generator SplitMix64 (Steele, Lea and Flood, 2014; its mixer is Stafford's variant 13). The
+/// field is the state of the generator, at first the seed. The numbers depend on the seed only.
 #[derive(Debug, Clone)]
 pub struct SplitMix64(pub u64);
 
@@ -86,17 +89,17 @@ impl SplitMix64 {
         bits ^ (bits >> 31)
     }
 
-    /// Returns a uniform number in [0, 1).
+    /// Returns a uniformly distributed random number in [0, 1).
     pub fn unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// Returns a uniform integer below `end`; 0 if `end` is 0.
+    /// Returns a uniformly distributed random integer below `end`; 0 if `end` is 0.
     pub fn below(&mut self, end: usize) -> usize {
         ((u128::from(self.bits()) * end as u128) >> 64) as usize
     }
 
-    /// Shuffles `values`.
+    /// Shuffles `values` into a random order.
     pub fn shuffle<T>(&mut self, values: &mut [T]) {
         for k in (1..values.len()).rev() {
             values.swap(k, self.below(k + 1));
@@ -141,7 +144,7 @@ mod tests {
         let one = ring(1);
         assert!(between(&[], 5).is_empty() && between(&one, 5).is_empty());
         assert!(between(&[one[0].clone(), one[0].clone()], 5).is_empty());
-        // Parallel axes do not meet.
+        // Optical axes that are parallel do not meet.
         let aside =
             |x: f64| Camera { translation: DVec3::new(x, 0.0, 0.0), rotation: DMat3::IDENTITY, ..one[0].clone() };
         assert!(between(&[aside(0.0), aside(1.0)], 5).iter().all(|camera| camera.center().is_finite()));

@@ -1,4 +1,4 @@
-//! Opening a compressed model beside its original.
+//! Opens a compressed model for comparison with its original.
 
 use std::path::Path;
 
@@ -6,14 +6,15 @@ use super::{InputOptions, Scene};
 use crate::error::{Error, Result, ShowPath};
 use crate::models::{self, InputModel, OpenOptions, Timing};
 
-/// Maximum difference between the times of the same frame in two models, as a fraction of the time span: files round times.
+/// Maximum difference between the times of the same frame in two models, as a fraction of the time span. Files round
+/// times.
 const TIME_TOLERANCE: f64 = 1e-6;
 
-/// Opens the compressed model at `path` at the frames of the original. `options` are those of the original; its training
-/// iteration does not apply.
+/// Opens the compressed model at `path` at the times of the original's frames. `options` are those the original was
+/// opened with; their training iteration is ignored.
 ///
 /// # Errors
-/// Inputs that cannot be read; a model whose frames are not those of the original.
+/// Inputs that cannot be read; a model whose number or times of frames differ from the original's.
 pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;

@@ -1,4 +1,5 @@
-//! Scene as a source of frames: the frames of its input without the absent Gaussians.
+//! A scene as a source of frames: the frames of its input, with absent Gaussians (those with NaN or infinite values)
+//! made invisible.
 
 use super::Scene;
 use crate::error::Result;
@@ -6,14 +7,14 @@ use crate::model::SequenceInfo;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
 impl Scene {
-    /// Hides the Gaussians `ids` (in increasing order) from all later reads of the scene's frames, and shows those
-    /// hidden before. Cache keys of stage results depend on the ids.
+    /// Makes the Gaussians `ids` (in increasing order) invisible in all later reads of the scene's frames, and makes
+    /// visible all that were hidden before. The cache keys of stage results include these ids.
     pub fn set_absent(&self, ids: &[u32]) {
         self.work.set_absent(ids);
         self.absent.set(ids);
     }
 
-    /// Returns the scene's frames, without the absent Gaussians.
+    /// Returns the source of the scene's frames, in which absent Gaussians are invisible.
     pub fn source(&self) -> &dyn FrameSource {
         if self.absent.is_empty() { self.input.source() } else { self }
     }

@@ -1,4 +1,4 @@
-//! Options for opening an input with its cameras.
+//! Options for opening an input together with its cameras.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,49 +13,50 @@ use crate::models;
 use crate::models::{Conventions, InputModel, Link, OpenOptions};
 use crate::progress::Events;
 
-/// Options for opening an input with its cameras.
+/// Options for opening an input together with its cameras.
 #[derive(Debug, Clone, Default)]
 pub struct InputOptions {
     /// Model folder, folder of PLY files, .ply or .gseq file; `-`: a frame stream on standard input.
     pub path: PathBuf,
-    /// Training iteration of a model folder; `None`: the largest one found.
+    /// Training iteration to read from a model folder; `None`: the latest one found.
     pub iteration: Option<u32>,
-    /// Conventions that the files of a model do not state.
+    /// Training conventions that the files of a model do not state.
     pub conventions: Conventions,
-    /// Whether a folder of frames may have missing frames.
+    /// Whether a folder with one PLY file per frame may lack frames.
     pub allow_gaps: bool,
-    /// Whether the Gaussians of frames in a folder are linked into tracks.
+    /// Whether the Gaussians of successive frames are matched with each other and linked into tracks.
     pub link: Link,
-    /// Number of frames of a model that is continuous in time; `None`: the cameras' times.
+    /// Number of frames at which a model that is continuous in time is evaluated; `None`: the times of the cameras are
+    /// used.
     pub frames: Option<usize>,
-    /// Camera file or folder; `None`: searched for.
+    /// Camera file or folder; `None`: cameras are searched for near the input.
     pub cameras: Option<PathBuf>,
-    /// Image width and height for cameras that do not state them.
+    /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
-    /// Source of the times of views whose cameras state none.
+    /// Where the times of views come from if the camera file does not state them.
     pub times: Times,
-    /// Split whose views are used; `None`: all views.
+    /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,
-    /// Folder for scratch files during the run: the packed frames of a stream, and data that does not fit into
+    /// Folder for temporary files during the run: the packed frames of a stream, and data that does not fit into
     /// `memory`; `None`: the system's folder for temporary files.
     pub scratch: Option<PathBuf>,
-    /// Whether the user named `scratch`, as opposed to a folder derived from the output.
+    /// Whether the user named the folder `scratch`; otherwise it was derived from the path of the output.
     pub is_scratch_named: bool,
     /// Memory that the run may take.
     pub memory: Budget,
-    /// Cache of stage results; `None`: results are not cached.
+    /// Cache folder for the results of stages; `None`: results are not cached.
     pub work: Option<cache::CacheRequest>,
-    /// Receiver of the events of the run.
+    /// Receiver of progress, notes and warnings during the run.
     pub events: Events,
 }
 
 impl InputOptions {
-    /// Returns whether the input is the stream on standard input.
+    /// Returns whether the input is the frame stream on standard input.
     pub fn is_stream(&self) -> bool {
         self.path == Path::new("-")
     }
 
-    /// Returns the options for opening the input itself.
+    /// Returns those of the options that apply to the input without its cameras.
     pub fn opening(&self) -> OpenOptions {
         OpenOptions {
             iteration: self.iteration,
@@ -68,19 +69,19 @@ impl InputOptions {
         }
     }
 
-    /// Checks that neither the cache folder (`--cache`) nor the scratch folder is the input or lies inside it. Files
-    /// that appear in an input folder would change the input.
+    /// Checks that neither the cache folder (`--cache`) nor the folder for temporary files is the input or lies inside
+    /// it. Files that appear in an input folder would change the input.
     ///
     /// # Errors
-    /// Such a folder, as [`Error::Usage`].
+    /// [`Error::Usage`] if one of the folders is.
     pub(super) fn check_folders(&self) -> Result<()> {
         let Ok(input) = fs::canonicalize(&self.path) else { return Ok(()) };
         if !input.is_dir() {
             return Ok(());
         }
         let work = self.work.as_ref().map(|asked| asked.folder.as_path());
-        // A scratch folder derived from the output is not checked here: an output inside the input is refused on its
-        // own.
+        // A folder that was derived from the output is not checked here: an output inside the input is refused
+        // elsewhere.
         let scratch = self.scratch.as_deref().filter(|_| self.is_scratch_named);
         for (option, folder) in [("--cache", work), ("--scratch-dir", scratch)] {
             let Some(folder) = folder else { continue };
@@ -98,29 +99,29 @@ impl InputOptions {
         Ok(())
     }
 
-    /// Returns the folder for scratch files.
+    /// Returns the folder for temporary files.
     pub fn scratch_folder(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }
 }
 
-/// Opened input, with its cameras if there are any.
+/// Opened input, together with its cameras if it has any.
 pub struct OpenedInput {
-    /// The input.
+    /// Model or sequence that was opened.
     pub input: Box<dyn InputModel>,
     /// Cameras given by the user or found with the input.
     pub rig: Option<Rig>,
-    /// Notes for the user.
+    /// Notes about the input to show to the user.
     pub notes: Vec<String>,
 }
 
-/// Loads the cameras from `path`, with times from `times` and `clock`; returns `None` without a path. If the file does
-/// not give the number of frames, it is the number that `input` was trained on, else that of `options`. The background
-/// is that of the file. If the file has none and the input consists of frame states, which do not state it, it is the
-/// training background of the model in whose folder the cameras are.
+/// Loads the cameras from `path`; returns `None` without a path. `times` and `clock` say how views get their times. If
+/// the camera file does not state the number of frames, the number that `input` was trained on is used, else that of
+/// `options`. The background color is that of the camera file. If the file has none and the input is a sequence of
+/// frames, which states none either, it is the training background of the model in whose folder the cameras are.
 ///
 /// # Errors
-/// A file that does not exist, or that holds no cameras.
+/// A file that does not exist or that contains no cameras.
 pub fn load_cameras(
     options: &InputOptions,
     path: Option<&Path>,

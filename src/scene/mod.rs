@@ -1,4 +1,4 @@
-//! Scene: an input with its cameras. Every command that reads frames starts by opening one.
+//! A scene: an input together with its cameras. Every command that reads frames starts by opening one.
 
 mod absent;
 pub mod between;
@@ -31,44 +31,46 @@ pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, roo
 pub use work::kept_work;
 pub(crate) use work::stamps;
 
-/// Input with its cameras.
+/// Input together with its cameras, and what a run needs to read and cache it.
 pub struct Scene {
-    /// Path as given.
+    /// Path of the input as the user gave it.
     pub path: PathBuf,
-    /// The input.
+    /// Model or sequence that was opened.
     pub input: Box<dyn InputModel>,
-    /// Cameras of all splits.
+    /// Cameras and the views they took, of all splits (training, validation, test).
     pub rig: Rig,
-    /// Cameras of the chosen split, for each frame.
+    /// Views at each frame, from the cameras of the chosen split.
     pub schedule: ViewSchedule,
-    /// Whether the views show the whole scene: the cameras were given or found, or they surround a still scene.
-    /// Otherwise the cameras are a virtual rig, which may see only what is in front of it.
+    /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
+    /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside
+    /// of a wall.
     pub has_cameras: bool,
     /// Background color: red, green, blue in [0, 1]. Taken from the cameras, else from the input's training parameters,
     /// else from the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
-    /// Amounts that passes over the scene keep in memory at a time.
+    /// How much passes over the scene keep in memory at a time.
     pub limits: Limits,
-    /// Maximum number of full reads of the input in the plan that set the limits; `None` before a plan is made.
+    /// Maximum number of full reads of the input, from the memory plan that set `limits`; `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// Measured speed of this machine for this scene.
+    /// Measured speed of this machine for this scene, from which later stages estimate their time.
     pub pace: Throughput,
-    /// Folder for scratch files during the run.
+    /// Folder for temporary files during the run.
     pub scratch: PathBuf,
-    /// Cache of stage results; may keep nothing.
+    /// Cache of stage results; it may be off and store nothing.
     pub work: Cache,
-    /// Digest of the input, if it is known already.
+    /// Hash of the input's content, if it is known already.
     digest: Option<String>,
-    /// Notes for the user.
+    /// Notes about the input to show to the user.
     pub notes: Vec<String>,
-    /// Receiver of the events of the run.
+    /// Receiver of progress, notes and warnings during the run.
     pub events: Events,
-    /// Gaussians that are hidden from reads of frames.
+    /// Gaussians that are made invisible in all reads of frames, because some of their values are NaN or infinite.
     absent: Absent,
 }
 
 impl Scene {
-    /// Creates the scene of `input` seen by the cameras of `rig` in `split` (`None`: all splits), without limits.
+    /// Creates the scene of `input` seen by the cameras of `rig` in `split` (`None`: all splits), without memory
+    /// limits.
     ///
     /// # Errors
     /// A camera at a time that is not the time of any frame.
@@ -100,10 +102,10 @@ impl Scene {
         Workload { pace: self.pace, ..work }
     }
 
-    /// Makes the memory plan for the stages that `needs` describes, and takes its limits.
+    /// Plans the memory of the stages that `needs` describes, and makes this scene keep to the limits of the plan.
     ///
     /// # Errors
-    /// A budget that is too small for any limits.
+    /// A memory budget in which the stages do not fit under any limits.
     pub fn keep_to(
         &mut self,
         budget: Budget,
@@ -115,7 +117,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Takes the limits of a memory plan.
+    /// Makes this scene keep to the limits of the memory plan `plan`.
     pub fn follow(&mut self, plan: &Plan) {
         self.limits = plan.limits;
         self.planned_reads = Some(plan.reads());
@@ -124,7 +126,8 @@ impl Scene {
         }
     }
 
-    /// Returns the amounts that one full read of the input takes.
+    /// Returns how many bytes and how many Gaussian states (one Gaussian at one frame) one full read of the input
+    /// takes.
     ///
     /// # Errors
     /// A file that does not exist any more.

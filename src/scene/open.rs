@@ -1,4 +1,4 @@
-//! Opening of inputs of every kind, with their cameras.
+//! Opens inputs of every kind, together with their cameras.
 
 use std::path::{Path, PathBuf};
 
@@ -19,10 +19,11 @@ use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
 
-/// Opens an input. Its cameras are only used to find the times of its frames.
+/// Opens an input, and loads its cameras if it has any. The cameras determine the times of frames that the input does
+/// not state.
 ///
 /// # Errors
-/// Invalid input or cameras; cameras of a sequence with different frames; options that do not apply to the input.
+/// Invalid input or cameras; cameras of a sequence with other frames; options that do not apply to the input.
 pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     options.check_folders()?;
     if options.is_stream() {
@@ -37,7 +38,7 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
         Timing::Continuous => {
             let times = match options.frames {
                 None if !times.is_empty() => times,
-                // The given number equals the number of camera times, so these times are used.
+                // The given number of frames equals the number of the cameras' times, so these times are used.
                 Some(frames) if frames == times.len() => times,
                 given => evenly_spaced(given, input.span(), &mut notes)?,
             };
@@ -60,14 +61,14 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
         }
         Timing::Numbered | Timing::Stamped => input,
     };
-    // Some notes depend on the times.
+    // Some notes of the input depend on the times of its frames.
     let notes = [input.notes(), notes].concat();
     check_frames(OpenedInput { input, rig, notes }, path)
 }
 
-/// Loads the cameras that `options` give or that are found with `input`. Frames with time stamps may have cameras of a
-/// model whose camera file counts time differently: if the normalized times match no frames, the file's own times are
-/// tried.
+/// Loads the cameras that `options` name, or else those found with `input`. The camera file of a model may count time
+/// differently from frames with time stamps. If the normalized times match no frames, the times as the file gives them
+/// are tried.
 fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the image names of a still scene are not times.
@@ -86,11 +87,11 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
     }
 }
 
-/// Returns evenly spaced frame times in `span` for a model whose frames no camera names. Adds a note if the user gave
-/// no number.
+/// Returns evenly spaced frame times from 0 up to the time span `span`, for a model whose cameras give no times.
+/// `given` is the number of frames that the user gave; if there is none, a default is used and a note is added.
 ///
 /// # Errors
-/// A number of frames out of range.
+/// A number of frames outside 1 to 1,000,000.
 fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
     let frames = given.unwrap_or(DEFAULT_FRAMES);
     if !(1..=MAX_FRAMES).contains(&frames) {
@@ -113,7 +114,7 @@ fn check_frames(opened: OpenedInput, path: &Path) -> Result<OpenedInput> {
     Ok(opened)
 }
 
-/// Opens an input with its cameras.
+/// Opens an input together with its cameras.
 ///
 /// # Errors
 /// Errors of [`open_input`]; a split without views.
@@ -121,14 +122,15 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     from_input(open_input(options)?, options)
 }
 
-/// Creates the scene of an opened input, seen by the cameras of the split in `options`. Without cameras, a rig is
-/// placed around the Gaussians of the first frame.
+/// Creates the scene of an opened input, seen by the cameras of the split in `options`. If the input has no cameras,
+/// virtual ones are placed by the Gaussians of the first frame.
 ///
 /// # Errors
 /// Cameras of another scene; a split without views.
 pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> {
     let OpenedInput { input, rig, mut notes } = check_frames(opened, &options.path)?;
-    // The content of a stream is unknown when its run is planned, so it never counts as still.
+    // A stream's number of frames is unknown when its run is planned, so a stream never counts as a scene without
+    // motion.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;
     let has_cameras = rig.is_some() || is_still;
     let rig = match rig {
@@ -156,20 +158,20 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
     Ok(scene)
 }
 
-/// Warning about a scene without cameras, at the start and at the end of a run.
+/// Warning about a scene without cameras, shown at the start and at the end of a run.
 const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for invented views, which costs \
                           most of the quality; give the training cameras with --cameras";
 
-/// Default number of frames of a model for which neither the cameras nor the user give any.
+/// Number of frames at which a model is evaluated if neither its cameras nor the user give one.
 const DEFAULT_FRAMES: usize = 60;
-/// Maximum number of frames at which a model is evaluated; each costs 8 bytes before any work.
+/// Maximum number of frames at which a model is evaluated. Each takes 8 bytes of memory before any work starts.
 const MAX_FRAMES: usize = 1_000_000;
 
 fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| cameras::find(input.data_folder()?, &options.path))
 }
 
-/// Returns a rig around the surface of the only frame. Memory: 64 bytes per Gaussian.
+/// Returns virtual cameras all around the surface of a scene with only one frame. Memory: 64 bytes per Gaussian.
 fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     let state = gather_all(source, 0, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::OPACITY)?;
     let positions: Vec<DVec3> =
@@ -183,13 +185,15 @@ fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     Ok(cameras::surrounding_rig(&positions, &weights))
 }
 
-/// Returns a virtual rig around the center of the first frame's robust box.
+/// Returns a virtual camera rig around the first frame's robust box (which leaves out the outermost 1% of positions on
+/// each side).
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     let (middle, extent) = first_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.middle, found.extent()));
     Ok(cameras::virtual_rig(middle, extent))
 }
 
-/// Returns the robust box of the first frame; `None` without frames. Memory: 16 bytes per Gaussian.
+/// Returns the robust box of the first frame's positions, which leaves out the outermost 1% on each side; `None` if
+/// there are no frames. Memory: 16 bytes per Gaussian.
 pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
         return Ok(None);
@@ -197,8 +201,8 @@ pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Attributes::POSITION)?.position)))
 }
 
-/// Returns the folder for scratch files of a run that writes `output`: the folder of the output, since a disk with
-/// space for the result has space for its input. Returns `None` for a device or FIFO.
+/// Returns the folder for temporary files of a run that writes `output`: the folder that contains the output, since a
+/// disk with space for the result also has space for packed input. Returns `None` if `output` is a device or a FIFO.
 pub fn scratch_beside(output: &Path) -> Option<PathBuf> {
     if std::fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return None;

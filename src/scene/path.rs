@@ -1,16 +1,17 @@
-//! Camera path through given cameras.
+//! Path of cameras through given cameras.
 
 use super::between::{interpolated_camera, meeting_point};
 use crate::model::Camera;
 
 /// Returns `count` cameras on the path through all of `stops`, in order, from the first to the last. Between two stops,
 /// rotation, distance from the point where the optical axes meet, focal length and principal point are interpolated
-/// evenly. Steps have equal length if the stops are at different positions. Images have the size of the first stop's.
+/// evenly. Steps are equally long if the stops are at different positions. All images have the size of the first stop's
+/// image.
 pub fn along(stops: &[Camera], count: usize) -> Vec<Camera> {
     let (Some(first), Some(last)) = (stops.first(), stops.last()) else { return Vec::new() };
     let focus = meeting_point(stops);
     let mut lengths: Vec<f64> = stops.windows(2).map(|pair| pair[0].center().distance(pair[1].center())).collect();
-    // If all stops are at one position, each section of the path gets the same number of steps.
+    // If all stops are at one position, the path has equally many steps between each two successive stops.
     if lengths.iter().sum::<f64>() <= 0.0 {
         lengths.fill(1.0);
     }
@@ -53,8 +54,8 @@ mod tests {
 
     use super::*;
 
-    /// Returns cameras on a circle of radius 3, a sixth of a turn apart, that look at its center with growing angles of
-    /// view.
+    /// Returns cameras on a circle of radius 3, each a sixth of a turn from the previous one. They look at the center
+    /// of the circle with growing angles of view.
     fn arc() -> Vec<Camera> {
         let at = |k: u32| {
             let angle = f64::from(k) * std::f64::consts::TAU / 6.0;

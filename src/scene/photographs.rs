@@ -1,4 +1,4 @@
-//! Photographs (ground-truth images) of views, in a folder.
+//! Photographs (ground-truth images) of views, which are files in a folder.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,23 +11,23 @@ use crate::files::image::read_png;
 use crate::model::{Camera, FrameView, Rig};
 use crate::render::Image;
 
-/// Files of the photographs of some views.
+/// Paths of the photographs of some views.
 pub struct Photographs {
-    /// File of each photograph, by frame and view number.
+    /// Path of each photograph, by the frame and the view number of its view.
     files: HashMap<(usize, u32), PathBuf>,
 }
 
 impl Photographs {
-    /// Creates the list from views with the file of each, inside `folder`.
+    /// Creates the list from pairs of a view and the path of its photograph; all of them lie in `folder`.
     ///
     /// # Errors
-    /// Two views with the same file.
+    /// Two views with the same photograph.
     fn from_files(folder: &Path, found: impl Iterator<Item = Result<(FrameView, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
         let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();
         for found in found {
             let (picture, file) = found?;
-            // Cameras of a time-stamped rig may give all their views the same file names.
+            // Cameras with time stamps may give all their views the same file name.
             if let Some(other) = view_of_file.insert(file.clone(), picture) {
                 let found =
                     format!("{}, which also belongs to frame {}, view {}", file.shown(), other.frame, other.view);
@@ -39,11 +39,13 @@ impl Photographs {
         Ok(Photographs { files })
     }
 
-    /// Finds the photographs of `pictures` in `folder` and returns the pictures that have one, with their photographs.
+    /// Finds the photographs of the views `pictures` in `folder`. Returns the views that have a photograph, and the
+    /// paths of these photographs.
     ///
-    /// File paths that the cameras name come first: the longest end of such a path that leads to a file inside `folder`. Only if
-    /// this finds no photograph of any picture, files are taken by their names: `tNNN_vNN.png` (frame, view), else
-    /// `camNN/images/FFFF.png` as in DyNeRF (position of the view among the folders `cam…`, frame).
+    /// First, photographs are searched by the image paths in the camera file: the longest suffix of such a path for
+    /// which a file in `folder` exists. Only if this finds no photograph of any view, they are searched by names with
+    /// numbers: `tNNN_vNN.png` (frame, view), else `camNN/images/FFFF.png` as in DyNeRF (position of the view among the
+    /// folders `cam…`, frame).
     ///
     /// # Errors
     /// A folder that cannot be read; no photograph of any view; two views with the same photograph.
@@ -76,13 +78,13 @@ impl Photographs {
         Ok((pictures, Photographs::from_files(folder, found.into_iter().map(Ok))?))
     }
 
-    /// Returns whether there is a photograph of `picture`.
+    /// Returns whether the view `picture` has a photograph.
     pub fn has(&self, picture: FrameView) -> bool {
         self.files.contains_key(&(picture.frame, picture.view))
     }
 
-    /// Returns name, length and time of the last change (ns) of the photographs of `pictures`. They show without
-    /// reading the files whether the photographs have changed.
+    /// Returns path, length in bytes, and time of the last change (ns) of the photographs of the views `pictures`. They
+    /// show whether the photographs have changed, without reading them.
     ///
     /// # Errors
     /// A file that does not exist any more.
@@ -96,7 +98,7 @@ impl Photographs {
         Ok(files)
     }
 
-    /// Reads the photograph of `picture`, taken by `camera`. Transparent pixels are blended with `background`.
+    /// Reads the photograph of the view `picture`, taken by `camera`. Transparent pixels are blended with `background`.
     ///
     /// # Errors
     /// A view without a photograph; a file that is not an image of the camera's size.
@@ -107,12 +109,12 @@ impl Photographs {
     }
 }
 
-/// Returns the name of a view in messages.
+/// Returns the name of a view for messages, such as `frame 3, view 0`.
 fn view_name(picture: FrameView) -> String {
     format!("frame {}, view {}", picture.frame, picture.view)
 }
 
-/// Checks that `folder` is a folder.
+/// Checks that `folder` is an existing folder.
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
         return Err(Error::usage(format!("{}: --ground-truth expects a folder of photographs", folder.shown())));
@@ -120,14 +122,16 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Returns the photograph of `picture` by its frame and view: `tNNN_vNN.png`, or in the folder of its camera among `cameras`.
+/// Returns the photograph of the view `picture`, found by the numbers of its frame and view: `tNNN_vNN.png` in
+/// `folder`, or the frame's file in the view's folder among the camera folders `cameras`.
 fn numbered_file(folder: &Path, picture: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
     let in_camera = cameras.get(picture.view as usize).map(|camera| in_rig(camera, picture));
     let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];
     files.into_iter().flatten().find(|file| file.is_file())
 }
 
-/// Returns the subfolders of `folder` named `cam` and a number that contain `images`, in the order of their numbers.
+/// Returns the subfolders of `folder` whose name is `cam` and a number and that contain a folder `images`, in the order
+/// of their numbers.
 fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(folder).and_then(|entries| entries.collect::<std::io::Result<Vec<_>>>());
     let mut found: Vec<(u32, PathBuf)> = Vec::new();
@@ -140,12 +144,13 @@ fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// Returns the path of the photograph of `picture` in the folder of a DyNeRF camera.
+/// Returns the path of the photograph of the view `picture` in the DyNeRF camera folder `camera`.
 fn in_rig(camera: &Path, picture: FrameView) -> PathBuf {
     camera.join("images").join(format!("{:04}.png", picture.frame))
 }
 
-/// Returns the existing file inside `folder` whose path is the longest end of `image`.
+/// Returns the file in `folder` whose path relative to `folder` is the longest suffix of the path `image`; `None` if no
+/// such file exists.
 fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
     let parts: Vec<_> = image.components().collect();
     let ends = (0..parts.len()).map(|start| parts[start..].iter().collect::<PathBuf>());

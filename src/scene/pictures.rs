@@ -1,4 +1,4 @@
-//! Selection of the views of a rig to render: frame, camera and background; and the memory that rendering takes.
+//! Selection of views (frame and camera) to render, of their background, and an estimate of the memory for rendering.
 
 use super::Scene;
 use crate::error::{Error, Result};
@@ -7,19 +7,21 @@ use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIA
 use crate::model::{Attributes, FrameView, Rig, Split};
 use crate::render;
 
-/// Part of a rig's views.
+/// Selection among the views of a camera rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ViewSet {
-    /// Held-out views (test, else validation); all views if the cameras hold none out.
+    /// Held-out views, which were not used for training: the test views, else the validation views. All views if the
+    /// cameras hold out none.
     #[default]
     HeldOut,
-    /// One split, which must not be empty.
+    /// Views of one split (training, validation or test), of which there must be at least one.
     Split(Split),
     /// Every view of the rig.
     All,
 }
 
-/// Returns the views of `part`, in the order of frame, then view number.
+/// Returns the views of `rig` that `part` selects, in the order of frame, then view number. `frame_times` holds the
+/// times of the frames.
 ///
 /// # Errors
 /// A view at a time that is not the time of any frame; a split without views; two cameras with the same frame and view
@@ -29,7 +31,7 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<Fra
     for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
         let mut views = views.to_vec();
         views.sort_by_key(|&(view, _)| view);
-        // Train and test files may list the same view.
+        // The files of training and test cameras may both list the same view.
         views.dedup();
         found.extend(views.into_iter().map(|(view, camera)| FrameView { frame, view, camera }));
     }
@@ -45,7 +47,7 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<Fra
     Ok(found)
 }
 
-/// Returns the error for a split without views.
+/// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
 pub fn no_picture(rig: &Rig) -> Error {
     let has = |split: &Split| rig.shots.iter().any(|shot| shot.split == *split);
     let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
@@ -58,7 +60,7 @@ pub fn no_picture(rig: &Rig) -> Error {
     ))
 }
 
-/// Returns view number `view` at `frame`.
+/// Returns the view with the number `view` at frame `frame`, among the views that `part` selects.
 ///
 /// # Errors
 /// Errors of [`pictures`]; a frame that the sequence does not have; a view number that the frame does not have.
@@ -76,9 +78,9 @@ pub fn picture(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view
     })
 }
 
-/// Returns the views of at most `count` (at least one) of the frames in `pictures`, evenly spaced from first to last.
-/// Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K
-/// - 1, count))` does.
+/// Returns the views of at most `count` (at least one) different frames of `pictures`. The frames are evenly spaced and
+/// include the first and the last. Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even,
+/// as numpy's `round(linspace(0, K − 1, count))` does.
 pub fn thin(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
@@ -92,10 +94,11 @@ pub fn thin(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
 }
 
-/// Returns at most `most` of `pictures`, which are sorted by frame and view, spread evenly over frames and views.
+/// Returns at most `most` of the views `pictures`, spread evenly over frames and view numbers. `pictures` must be
+/// sorted by frame, then view.
 ///
-/// The views of frame number `f` are rotated by the fractional part of `f` times the golden ratio, so that an even step through
-/// the list does not return to the same views.
+/// The list of views of the n-th frame is rotated by the fractional part of n times the golden ratio, so that even
+/// steps through all lists do not meet the same view numbers again.
 pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (pictures.len(), most.max(1));
     if count <= most {
@@ -108,16 +111,16 @@ pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
         rotated.extend_from_slice(tail);
         rotated.extend_from_slice(head);
     }
-    // The middle of each of `most` equal parts of the list.
+    // Takes the middle view of each of `most` equal parts of the list.
     let mut spread: Vec<FrameView> = (0..most).map(|k| rotated[(2 * k + 1) * count / (2 * most)]).collect();
     spread.sort_by_key(|picture| (picture.frame, picture.view));
     spread
 }
 
-/// The golden ratio, whose multiples are spread evenly modulo 1.
+/// Golden ratio. Its multiples are spread evenly modulo 1.
 const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 
-/// Returns the background color: the color that the user gave, else that of the scene.
+/// Returns the background color for renders: `asked`, the color that the user gave, or else that of the scene.
 ///
 /// # Errors
 /// A color with a component outside 0 to 1.
@@ -130,7 +133,8 @@ pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     }
 }
 
-/// Estimates the resources of rendering all views of `models` models, with `pixel` bytes per pixel of each render.
+/// Estimates the memory and time of the stage `stage`, which renders all views of `models` models and holds `pixel`
+/// bytes per pixel of each render.
 pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> ResourceEstimate {
     let pictures = work.threads.min(limits.pictures_together as u64);
     ResourceEstimate {
@@ -154,7 +158,7 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
 }
 
 impl ViewSet {
-    /// Returns the split to use with the cameras of `rig`; `None`: all views.
+    /// Returns the split of `rig` whose views this selection uses; `None`: the views of all splits.
     pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
             ViewSet::HeldOut => rig.held_out(),
@@ -171,7 +175,7 @@ mod tests {
     use super::*;
     use crate::model::{Camera, Shot};
 
-    /// Returns a rig with the given shots of (view, camera, time, split).
+    /// Returns a rig with the given shots, each a tuple of view number, camera index, time and split.
     fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
         let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
         let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };

@@ -1,4 +1,5 @@
-//! Standard input as an input: a stream is packed into a scratch container, which is then read like any container.
+//! A frame stream on standard input as an input: it is packed into a temporary container file, which is then read like
+//! any container.
 
 use std::io::{IsTerminal, Stdin};
 use std::path::Path;
@@ -16,10 +17,10 @@ use crate::models::{InputModel, LinkedFrames};
 use crate::passes::BLOCK;
 use crate::statistics;
 
-/// Name of standard input in messages.
+/// Name of standard input in messages to the user.
 const STANDARD_INPUT: &str = "standard input";
 
-/// Opens standard input as a frame stream.
+/// Opens standard input as a stream of frames.
 ///
 /// # Errors
 /// A terminal; data that is not a frame stream; options that apply to models only, or that need an input which can be
@@ -41,10 +42,11 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Packs a stream into a scratch container and opens it with its cameras.
+/// Packs the stream on standard input into a temporary container, or links its frames, and opens the result with its
+/// cameras.
 ///
 /// # Errors
-/// An invalid stream; a budget that is too small for the frames that are packed together.
+/// An invalid stream; a memory budget too small for the frames of one block (the frames in a tile of the container).
 pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
     let stream = open_stream(options)?;
@@ -54,7 +56,7 @@ pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> 
     Ok(OpenedInput { input: Box::new(pack_stream(stream, options)?), rig, notes: Vec::new() })
 }
 
-/// Packs a stream into a scratch container.
+/// Packs a stream of frames into a temporary container file and opens this file.
 ///
 /// # Errors
 /// As [`link_stream`].
@@ -63,15 +65,16 @@ fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Rec
     ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
 }
 
-/// Returns whether the frames of a stream are linked: if they share no Gaussian ids, or if the user asks for it.
+/// Returns whether Gaussians of successive frames are linked into tracks: if the frames share no Gaussian ids, or if
+/// the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     header.is_unlinked || options.link.always_links()
 }
 
-/// Receives a stream whose frames [are linked](is_linked).
+/// Receives a stream of frames and links their Gaussians into tracks; for streams for which [`is_linked`] holds.
 ///
 /// # Errors
-/// An invalid stream; a budget that is too small for the frames that are packed together.
+/// An invalid stream; a memory budget too small for the frames of one block (the frames in a tile of the container).
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
@@ -87,10 +90,10 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     Ok(OpenedInput { input: Box::new(input), rig, notes })
 }
 
-/// Returns the number of frames of a stream that can be packed within the memory budget.
+/// Returns how many frames of a stream can be packed within the memory budget, as a quota that counts arriving frames.
 ///
 /// # Errors
-/// A budget that is too small for the frames that are packed together.
+/// A memory budget too small for the frames of one block (the frames in a tile of the container).
 pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frame_block(header);
     let held = (block + PREFETCH_FRAMES) as u64;
@@ -104,25 +107,25 @@ pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Fra
     }))
 }
 
-/// Maximum number of frames of a stream within the memory budget. How many frames will arrive is unknown at the
-/// beginning.
+/// Maximum number of frames of a stream within the memory budget, and the number that has arrived. How many frames a
+/// stream has is unknown until its end.
 #[derive(Debug)]
 pub struct FrameQuota {
-    /// Number of frames that have arrived.
+    /// Number of frames that have arrived so far.
     arrived: u64,
-    /// Maximum number of frames within the memory budget.
+    /// Maximum number of frames for which the memory budget suffices.
     pub most: u64,
-    /// Hint to the user for the case that more frames arrive.
+    /// Advice to the user if more frames arrive.
     hint: String,
     budget: Budget,
 }
 
 impl FrameQuota {
-    /// Finds the maximum number of frames for `budget`. `peak` returns the memory in bytes that a run takes, given its
-    /// budget in bytes and a number of frames.
+    /// Finds the maximum number of frames for `budget`. `peak(limit, frames)` returns the memory in bytes that a run
+    /// with a budget of `limit` bytes takes for a stream of `frames` frames.
     pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
-        // Binary search over bits; a stream has fewer than 2^32 frames.
+        // Finds the number bit by bit; a stream has fewer than 2^32 frames.
         let most = (0..32).rev().fold(0, |most, bit| {
             let more = most | 1 << bit;
             if peak(bytes, more) <= bytes { more } else { most }
@@ -133,10 +136,10 @@ impl FrameQuota {
         FrameQuota { arrived: 0, most, hint, budget }
     }
 
-    /// Counts `frames` more frames.
+    /// Counts `frames` frames that have arrived.
     ///
     /// # Errors
-    /// More frames than the maximum.
+    /// More frames than fit into the memory budget.
     pub fn admit(&mut self, frames: usize) -> Result<()> {
         self.arrived += frames as u64;
         if self.arrived <= self.most {
@@ -147,18 +150,19 @@ impl FrameQuota {
         Err(Error::input(Path::new(STANDARD_INPUT), format!("frame {}", self.most), expected, found).hint(&self.hint))
     }
 
-    /// Returns the number of frames that have arrived.
+    /// Returns the number of frames that have arrived so far.
     pub fn arrived(&self) -> u64 {
         self.arrived
     }
 }
 
-/// Resident bytes per frame while a stream is packed: its time stamp and, if it is scanned, the number of Gaussians
-/// alive in it, in lists that grow by being copied to twice their length.
+/// Bytes of memory per frame while a stream is packed: its time stamp and, if statistics are computed, the number of
+/// Gaussians alive in it. Both are in lists that grow by being copied to twice their length.
 const PER_FRAME: u64 = 2 * (8 + 4);
 
-/// Estimates the resources of packing a stream with `held` frames in memory together and `frames` frames in total.
-/// `measuring` states whether it is scanned on the way: `None`: not scanned; `Some(true)`: views are rendered too.
+/// Estimates the memory of packing a stream of `frames` frames, of which `held` are in memory at a time. `measuring`
+/// tells what else is done as frames arrive: nothing (`None`), statistics (`Some(false)`), or statistics and renders of
+/// views (`Some(true)`).
 pub fn receiving(
     work: &Workload,
     limits: &Limits,

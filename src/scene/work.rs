@@ -1,4 +1,5 @@
-//! Cache of a scene: the keys from which all cached stage results follow, and the digest of the input.
+//! Cache of a scene's stage results: the keys that all its entries depend on, and the digest (hash of the content) of
+//! the input.
 
 use std::fs;
 use std::path::Path;
@@ -12,11 +13,11 @@ use crate::error::{Error, Result, ShowPath};
 use crate::models::InputModel;
 use crate::render;
 
-/// Name of the cache entry with the digest of an input.
+/// Name of the cache entry that holds the digest (hash of the content) of an input.
 const DIGEST: &str = "input";
 
 impl Scene {
-    /// Opens the cache folder that `options` name.
+    /// Opens the cache folder that `options` name, and makes the keys of its entries depend on this scene.
     pub(super) fn open_cache(&mut self, options: &InputOptions) -> Result<()> {
         (self.work, self.digest) = kept_work(options, &*self.input)?;
         if self.work.keeps() {
@@ -25,12 +26,13 @@ impl Scene {
         Ok(())
     }
 
-    /// Returns the digest of the input.
+    /// Returns the digest (hash of the content) of the input.
     pub fn digest(&self) -> Result<String> {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)
     }
 
-    /// Returns the digest of another input, opened with `options`. The digest is cached too.
+    /// Returns the digest (hash of the content) of another input, which was opened with `options`. The cache stores it
+    /// too.
     ///
     /// # Errors
     /// A file that cannot be read; errors of the cache folder.
@@ -38,15 +40,15 @@ impl Scene {
         cached_digest(&self.work, options, input)
     }
 
-    /// Returns the cache key of the cameras, their schedule and the background.
+    /// Returns the cache key that stands for the cameras, their views at each frame, and the background.
     fn key(&self) -> CacheKey {
         let shots: Vec<_> = self.rig.shots.iter().map(|shot| (shot.view, shot.camera, shot.time, shot.split)).collect();
         CacheKey::new(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
     }
 }
 
-/// Opens the cache folder that `options` name and returns it with the digest of `input`, which is part of the key of
-/// every entry. Returns an empty cache and no digest without a folder.
+/// Opens the cache folder that `options` name. Returns it with the digest (hash of the content) of `input`, on which
+/// the keys of all entries depend. If `options` name no folder, returns a cache that stores nothing, and no digest.
 ///
 /// # Errors
 /// A file that cannot be read; errors of the cache folder.
@@ -55,8 +57,8 @@ pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cach
     let instructions = render::instructions();
     let mut work = Cache::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
     let digest = cached_digest(&work, options, input)?;
-    // The key consists of this program, the machine's instruction set, and the content of the input as it was opened;
-    // not of its path.
+    // The key stands for this program, the machine's instruction set, and the content of the input as it was opened;
+    // not for its path.
     let info = input.source().info();
     work.follow_from(CacheKey::new(&(TOOL, instructions, &digest)).and(&(
         info.count,
@@ -68,7 +70,8 @@ pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cach
     Ok((work, Some(digest)))
 }
 
-/// Returns the digest of `input`. The input is read only if it may have changed since the digest was cached.
+/// Returns the digest (hash of the content) of `input`. Reads the input only if its files may have changed since the
+/// digest was cached.
 fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
     match work.keeps() {
         true => work.known(DIGEST, input_stamp(options)?, || input.digest()),
@@ -76,8 +79,8 @@ fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -
     }
 }
 
-/// Returns a key that shows, without reading the input, whether it may have changed: its path, and name, length and
-/// time of the last change of each of its files.
+/// Returns a key that changes whenever the content of the input may have changed, without reading the input. It stands
+/// for the path of the input, and the name, length and time of the last change of each of its files.
 fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
@@ -85,10 +88,11 @@ fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
-/// Appends name, length and time of the last change (ns) of every file at `path` and below it, in order.
+/// Appends the path, length in bytes, and time of the last change (ns) of every file at `path` and below it, in the
+/// order of the paths.
 pub(crate) fn stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
     let name = path.to_string_lossy().into_owned();
-    // Broken links are not part of an input, so only their name counts.
+    // Broken links are not part of an input, so only their paths are recorded.
     let Ok(found) = fs::metadata(path) else {
         files.push((name, 0, 0));
         return Ok(());

@@ -1,24 +1,24 @@
-//! Anisotropy E of every Gaussian, computed from one set of scales: the canonical scales, or those of the reference
-//! frame.
+//! Anisotropy E of every Gaussian: how long it is compared with its other axes. Computed from one set of scales: the
+//! canonical scales of the model, or else those of the reference frame (the frame in which most Gaussians are alive).
 
 use crate::model::{AttributeValues, Flags, Rows};
 use crate::recipe::Anisotropy;
 
-/// Smallest scale in the logarithmic form, as a fraction of the scene extent; smaller scales are raised to it. Renders
-/// do not show how flat a disc is beyond that.
+/// Smallest scale for the logarithmic form of E, as a fraction of the scene extent; smaller scales are raised to it.
+/// How flat a disc is beyond this is not visible in renders.
 const SCALE_FLOOR: f64 = 1e-7;
 
-/// Largest logarithm of a ratio: e⁷⁰⁰ ≈ 1e304 is close to the largest f64.
+/// Largest logarithm of a ratio of scales: e⁷⁰⁰ ≈ 1e304 is close to the largest f64.
 const MAX_LOG_RATIO: f64 = 700.0;
 
-/// Fills `rows.e` from `log_scale` (`[3, N]`, natural log of scene units).
+/// Fills the anisotropy `rows.e` from `log_scale` (`[3, N]`, natural logs of the scales in scene units).
 ///
-/// [`Anisotropy::Ratio`]: s_max / s_min (the paper, section 3.2.1). [`Anisotropy::Log`]:
-/// ln(s_max / s_mid), both floored at 1e-7 of `extent` (scene units). A row whose scales are not
-/// finite is flagged; a flagged row gets 0.
+/// [`Anisotropy::Ratio`]: s_max / s_min (the paper, section 3.2.1). [`Anisotropy::Log`]: ln(s_max / s_mid), where both
+/// scales are raised to at least 1e-7 of `extent` (scene units). A row whose scales are not finite is flagged; every
+/// flagged row gets 0.
 ///
 /// # Panics
-/// If the number of rows differs.
+/// If `rows` and `log_scale` differ in the number of Gaussians.
 pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Anisotropy, extent: f64) {
     assert_eq!(rows.len(), log_scale.len(), "one row per Gaussian");
     let floor = (SCALE_FLOOR * extent).ln();
@@ -35,7 +35,7 @@ pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Aniso
             let [min, mid, max] = log.map(f64::from);
             match kind {
                 Anisotropy::Ratio => (max - min).min(MAX_LOG_RATIO).exp(),
-                // The floor of a scene without extent is −∞, so no scale is raised.
+                // In a scene of extent 0 the smallest log scale is −∞, so no scale is raised.
                 Anisotropy::Log => max.max(floor) - mid.max(floor),
             }
         })

@@ -1,7 +1,7 @@
-//! Rows of statistics, in memory or spilled to a scratch file while no stage needs them.
+//! Rows of statistics (one row per Gaussian), in memory or moved to a temporary file while no stage needs them.
 //!
-//! Content of the scratch file: the values of one statistic for all Gaussians, then those of the next one, and the
-//! flags last, all in the byte order of this machine. Spilled rows take no memory until they are read.
+//! The temporary file contains the values of one statistic for all Gaussians, then those of the next one, and the flags
+//! last, all in the byte order of this machine. Rows in the file take no memory until they are read.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -14,17 +14,18 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Flags, Rows, Statistic, StatisticAccess};
 
-/// Rows of N Gaussians, one per Gaussian.
+/// Statistics of N Gaussians, one row per Gaussian, in memory or in a temporary file.
 pub(crate) enum StatisticsRows {
     Memory(Rows),
     Spilled(SpilledRows),
 }
 
-/// Rows in an unnamed scratch file, which is deleted when this value is dropped.
+/// Rows in an unnamed temporary file, which is deleted when this value is dropped.
 pub(crate) struct SpilledRows {
     file: Spill,
     count: usize,
-    /// Statistics in the file, in their order. A statistic without values (such as an absent W) is not stored.
+    /// Statistics that the file contains, in their order. A statistic without values (such as W if it was not computed)
+    /// is not stored.
     columns: Vec<Statistic>,
 }
 
@@ -41,7 +42,7 @@ impl<'de> Deserialize<'de> for StatisticsRows {
 }
 
 impl StatisticsRows {
-    /// Writes `rows` to an unnamed scratch file in `folder`.
+    /// Writes `rows` to an unnamed temporary file in `folder`, and frees their memory.
     ///
     /// # Errors
     /// A file that cannot be created or written.
@@ -60,7 +61,7 @@ impl StatisticsRows {
         Ok(StatisticsRows::Spilled(SpilledRows { file, count: rows.len(), columns }))
     }
 
-    /// Returns all rows, read from the scratch file if they are spilled.
+    /// Returns all rows; reads them if they are in the temporary file.
     pub(crate) fn rows(&self) -> Result<Cow<'_, Rows>> {
         match self {
             StatisticsRows::Memory(rows) => Ok(Cow::Borrowed(rows)),
@@ -68,7 +69,7 @@ impl StatisticsRows {
         }
     }
 
-    /// Returns the statistics C and Vis of every Gaussian.
+    /// Returns the contribution C and the fraction of views Vis of every Gaussian.
     pub(crate) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
             StatisticsRows::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
@@ -78,7 +79,7 @@ impl StatisticsRows {
         })
     }
 
-    /// Returns the number of rows, N.
+    /// Returns the number of rows, N, which is the number of Gaussians.
     pub(crate) fn len(&self) -> usize {
         match self {
             StatisticsRows::Memory(rows) => rows.len(),
@@ -101,14 +102,14 @@ impl SpilledRows {
         Ok(rows)
     }
 
-    /// Reads the values of `statistic` for all Gaussians. Returns an empty list without reading if there are no
-    /// Gaussians; their file stores no statistic.
+    /// Reads the values of `statistic` for all Gaussians. Returns an empty list if there are no Gaussians, since the
+    /// file then contains no statistic.
     fn column<T: AnyBitPattern + NoUninit>(&self, statistic: Statistic) -> Result<Vec<T>> {
         let index = self.columns.iter().position(|&column| column == statistic).unwrap_or(self.columns.len());
         self.values(&self.columns[..index])
     }
 
-    /// Reads one value per Gaussian from the position behind the statistics `before`.
+    /// Reads one value per Gaussian; the values lie in the file behind those of the statistics `before`.
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
         let start = before.iter().map(|statistic| statistic.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];

@@ -1,20 +1,22 @@
-//! Life span and opacity variance V, which both follow from the time-dependent opacity alone.
+//! Life span (frames in which a Gaussian is alive) and opacity variance V. Both follow from the opacity at every frame
+//! alone.
 
 use std::mem::size_of;
 
-/// Running life spans and opacity moments of a block of Gaussians.
+/// Sums over the frames so far from which the life spans and opacity variances of a block of Gaussians follow.
 ///
-/// V = s₂/n − (s₁/n)², where n is the number of frames in which the Gaussian is alive, s₁ and s₂ are the sums of α − α₁
-/// and (α − α₁)² over these frames, and α₁ is the opacity in the first of them. The shift by α₁ makes a constant
-/// opacity give exactly 0 and keeps full precision for a nearly constant one, where the unshifted moments cancel.
+/// A Gaussian is alive in the frames in which its opacity α is at least a threshold. The variance of α over these n
+/// frames is V = s₂/n − (s₁/n)². Here s₁ and s₂ are the sums of α − α₁ and (α − α₁)² over these frames, and α₁ is the
+/// opacity in the first of them. Subtracting α₁ makes V of a constant opacity exactly 0, and keeps full precision for a
+/// nearly constant one.
 pub(super) struct LifeSpans {
     first: Vec<f64>,
     sum: Vec<f64>,
     sum_of_squares: Vec<f64>,
     frames: Vec<u32>,
-    /// Number of Gaussians alive in the last frame.
+    /// Number of Gaussians alive in the frame that was added last.
     alive: u32,
-    /// Frames after the first with the opacities of the first that are not counted in `frames` yet.
+    /// Number of frames that repeat the opacities of the first frame and are not counted in `frames` yet.
     repeats: u32,
 }
 
@@ -54,30 +56,30 @@ impl LifeSpans {
         all
     }
 
-    /// Adds a frame with the opacities of the first frame, and returns how many Gaussians are alive in it. All frames
-    /// since the first must have had its opacities, so every α − α₁ is 0.
+    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive in it. All
+    /// frames in between must also have had these opacities, so every α − α₁ is 0.
     #[inline(always)]
     pub(super) fn repeat_frame(&mut self) -> u32 {
         self.repeats += 1;
         self.alive
     }
 
-    /// Counts the repeated frames in `frames`; must be called before results are read.
+    /// Adds the repeated frames to the counts in `frames`; must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {
-            // So far `frames` is 1 for the Gaussians that are alive and 0 for the others.
+            // So far `frames` is 1 for every Gaussian that is alive, and 0 for the others.
             self.frames.iter_mut().for_each(|frames| *frames *= 1 + self.repeats);
             self.repeats = 0;
         }
     }
 
-    /// Returns the number of frames in which each Gaussian was alive so far.
+    /// Returns for each Gaussian the number of frames so far in which it was alive.
     pub(super) fn frames(&self) -> &[u32] {
         &self.frames
     }
 
-    /// Returns V of every Gaussian; 0 for a Gaussian that was never alive.
+    /// Returns the opacity variance V of every Gaussian; 0 if it was never alive.
     pub(super) fn variance(&self) -> Vec<f64> {
         (0..self.frames.len())
             .map(|i| {

@@ -1,11 +1,12 @@
 //! Statistics of every Gaussian, computed in one pass over the frames (method.md, section 1).
 //!
-//! Input: the attributes of a block of Gaussians, frame after frame, with the cameras of each frame. Output: one row of
-//! statistics per Gaussian. Memory: [`BYTES_PER_GAUSSIAN`] for every Gaussian of a block, independent of the number of
-//! frames. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 3.2.
+//! Input: the attributes of a block of Gaussians, frame after frame, and the cameras that see each frame. Output: one
+//! row of statistics per Gaussian. Memory: [`BYTES_PER_GAUSSIAN`] for every Gaussian of a block, independent of the
+//! number of frames. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 3.2.
 //!
-//! The accumulators know nothing of files or threads (only [`pass`] does), and a row depends on its own Gaussian only.
-//! Blocks may therefore be cut anywhere and processed in any order without changing a bit of the result.
+//! The code that accumulates statistics knows nothing of files or threads (only [`pass`] does), and a row depends on
+//! its own Gaussian only. Gaussians may therefore be divided into blocks anywhere, and blocks may be processed in any
+//! order, without changing a bit of the result.
 
 mod anisotropy;
 pub(crate) mod aside;

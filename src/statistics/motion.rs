@@ -1,4 +1,5 @@
-//! Trajectory magnitude D and curvature κ, accumulated frame by frame.
+//! Trajectory magnitude D (how far a Gaussian moves per frame) and curvature κ (how much its motion turns or
+//! accelerates), accumulated frame by frame from positions x(t) at frames t.
 //!
 //! [`recipe::MotionParams`] selects between two definitions:
 //!
@@ -9,38 +10,40 @@
 //! | the turn about frame t counts | t alive, neither the first nor the last frame alive | t − 1, t and t + 1 alive |
 //! | κ | Σ‖x(t+1) − 2x(t) + x(t−1)‖ / (life span − 2) | mean of the second divided difference |
 //!
-//! h is the time step in units of the mean step. The previous two positions are stored as received (f32) and all
-//! arithmetic is f64: velocities rounded to f32 would lose 1e-4 of κ.
+//! "t alive" means that the Gaussian is alive in frame t; the life span is the number of such frames. h is the time
+//! from frame t − 1 to frame t, divided by the mean of these times. The previous two positions are stored as received
+//! (f32), and all arithmetic is f64: velocities rounded to f32 would lose 1e-4 of κ.
 
 use std::mem::size_of;
 
 use crate::model::AttributeValues;
 use crate::recipe;
 
-/// History bit: alive in the previous frame.
+/// History bit: the Gaussian was alive in the previous frame.
 const ALIVE: u8 = 1;
-/// History bit: alive in the frame before the previous one.
+/// History bit: the Gaussian was alive in the frame before the previous one.
 const ALIVE_BEFORE: u8 = 2;
-/// History bit: alive in some frame before the previous one.
+/// History bit: the Gaussian was alive in some frame before the previous one.
 const BORN_BEFORE: u8 = 4;
 
-/// Running sums of D and κ over the frames, for a block of Gaussians.
+/// Sums over the frames so far from which the trajectory magnitude D and the curvature κ of a block of Gaussians
+/// follow.
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// `Runs` only: frames after the first with the opacities of the first, so that the same Gaussians are alive. They
-    /// are not counted in `steps`, `turns` and `history` yet.
+    /// `Runs` only: number of successive frames after the first that repeat the opacities of the first, so that the
+    /// same Gaussians are alive. They are not included in `steps`, `turns` and `history` yet.
     steady: u32,
-    /// Positions x(t−1); `before` holds x(t−2). Shape `[3, len]` each.
+    /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,
     before: AttributeValues,
     sum_step2: Vec<f64>,
     sum_turn: Vec<f64>,
-    /// `Literal` only: norm of the turn about the last frame in which the Gaussian was alive. It counts only if the
-    /// Gaussian is alive in a later frame.
+    /// `Literal` only: length of the turn about the last frame in which the Gaussian was alive. It is added to
+    /// `sum_turn` only if the Gaussian is alive in a later frame.
     pending: Vec<f64>,
-    /// `Runs` only: number of terms of `sum_step2`; `turns` counts those of `sum_turn`. The divisors of `Literal`
-    /// follow from the life span.
+    /// `Runs` only: number of steps summed in `sum_step2`; `turns` is the number of turns summed in `sum_turn`.
+    /// `Literal` divides by numbers that follow from the life span instead.
     steps: Vec<u32>,
     turns: Vec<u32>,
     history: Vec<u8>,
@@ -66,8 +69,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame of positions `[3, len]` and opacities. `steps` are the durations, in mean steps, of the last time
-    /// step and of the one before it. `steady` states that the opacities are those of every frame before.
+    /// Adds a frame with these positions (`[3, len]`) and opacities. `steps` holds the durations of the latest time
+    /// step and of the one before, each divided by the mean duration of a step. `steady`: the opacities have been the
+    /// same in every frame so far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
@@ -90,8 +94,8 @@ impl MotionSums {
         self.frames += 1;
     }
 
-    /// Adds a frame as `Runs` defines it. `EVEN` states that both steps last 1 mean step, so that the divisions are
-    /// skipped; they would cost more than the rest of the loop.
+    /// Adds a frame by the definition `Runs`. `EVEN` states that both time steps have the mean duration, so that no
+    /// division is needed; divisions would take longer than the rest of the loop.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,
@@ -119,8 +123,9 @@ impl MotionSums {
         }
     }
 
-    /// [`MotionSums::add_frame_of_runs`] for a frame in which no Gaussian appears or disappears. Which terms count is
-    /// then known without reading the history, so half of the memory is touched (`cargo bench --bench scan`).
+    /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame with the opacities of all frames before. Which
+    /// steps and turns count is then known without reading the history, so half as much memory is accessed (`cargo
+    /// bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -135,14 +140,14 @@ impl MotionSums {
         }
     }
 
-    /// Counts the steady frames in `steps`, `turns` and `history`, and clears the sums of Gaussians that are not alive;
-    /// must be called before results are read.
+    /// Adds the frames counted by `steady` to `steps`, `turns` and `history`, and sets the sums of Gaussians that are
+    /// not alive to 0; must be called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
             return;
         }
-        // Steady frames follow the first frame directly, so the first of them completes a step but no turn.
+        // Such frames directly follow the first frame, so the first of them completes a step but no turn.
         for (i, history) in self.history.iter_mut().enumerate() {
             if *history & ALIVE == 0 {
                 (self.sum_step2[i], self.sum_turn[i]) = (0.0, 0.0);
@@ -165,10 +170,12 @@ impl MotionSums {
         for i in 0..n {
             let alive = opacity[i] >= alpha_min;
             let (step2, turn) = differences::<true>([row(x, i), row(previous, i), row(before, i)], [1.0; 2]);
-            // The previous frame is the center of a counting turn if it is alive and not the first frame alive.
+            // The turn about the previous frame counts if the Gaussian was alive in it and it is not the first such
+            // frame.
             let center = (history[i] & ALIVE != 0) & (history[i] & BORN_BEFORE != 0);
             let waiting = if center { turn } else { pending[i] };
-            // The pending center was not the last frame alive if the Gaussian is alive now.
+            // The Gaussian is alive now, so the frame whose turn is pending was not the last frame in which it was
+            // alive.
             sum_turn[i] += if alive { waiting } else { 0.0 };
             pending[i] = if alive { 0.0 } else { waiting };
             sum_step2[i] += if alive & !first { step2 } else { 0.0 };
@@ -176,13 +183,15 @@ impl MotionSums {
         }
     }
 
-    /// Returns D of every Gaussian from its life span in frames; 0 if no step counts.
+    /// Returns the trajectory magnitude D of every Gaussian, in scene units per frame; 0 if none of its steps counts.
+    /// `life` holds the number of frames in which each is alive.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
-    /// Returns κ of every Gaussian from its life span in frames; 0 if no turn counts.
+    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if none of its turns counts. `life`
+    /// holds the number of frames in which each is alive.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()
@@ -214,22 +223,23 @@ impl MotionSums {
     }
 }
 
-/// Returns the planes x, y, z of a column of `n` Gaussians. Slicing to `n` shows the compiler equal lengths, which
-/// removes the bounds checks.
+/// Returns the x, y and z values of the `n` positions in `column`. Slicing to `n` shows the compiler that the lengths
+/// are equal, which removes the bounds checks.
 #[inline(always)]
 fn planes(column: &AttributeValues, n: usize) -> [&[f32]; 3] {
     std::array::from_fn(|axis| &column.plane(axis)[..n])
 }
 
-/// Returns the position of Gaussian `i`. Written without `map`, which over an array stays a function call in functions
-/// with other target features.
+/// Returns the position of Gaussian `i`. Written without `map` on an array, which would remain a function call in
+/// functions compiled for other target features.
 #[inline(always)]
 fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns ‖last step‖² and ‖turn about the previous frame‖ per mean step, from the positions in the current frame, the
-/// previous one and the one before it. The values are meaningless if fewer frames were added.
+/// Returns the square of the last step and the length of the turn about the previous frame, both per mean step. The
+/// positions are those in the current frame, the previous one and the one before. `step` and `step_before` are the
+/// durations of the last two steps, in mean steps. With fewer than three frames the values are meaningless.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);
@@ -251,7 +261,8 @@ fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, 
     (step2, turn2.sqrt())
 }
 
-/// Returns the history bits after the current frame has become the previous one.
+/// Returns the history bits for the next frame: the current frame, in which the Gaussian is `alive` or not, becomes the
+/// previous one.
 #[inline(always)]
 fn next_history(history: u8, alive: bool) -> u8 {
     let now = if alive { ALIVE } else { 0 };

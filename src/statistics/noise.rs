@@ -1,34 +1,35 @@
-//! Removal of apparent motion that is only the rounding of f32 positions.
+//! Removal of apparent motion that is only the rounding of positions to f32.
 //!
-//! A resting Gaussian whose positions are rounded to f32 has D ≈ 0.71 ulp and κ ≈ 1.2 ulp of its coordinates. All
-//! coordinates of a scene share one offset, so one ulp, that of the largest coordinate, is the unit for every Gaussian.
+//! A resting Gaussian whose positions are rounded to f32 has a trajectory magnitude D ≈ 0.71 ulp and a curvature κ ≈
+//! 1.2 ulp, where one ulp is the distance between neighboring f32 values. All coordinates of a scene share one offset,
+//! so the ulp of the largest coordinate is used for every Gaussian.
 
 use crate::model::{Flags, Rows};
 
-/// Bound below which D counts as noise, in ulp of the largest coordinate.
+/// Trajectory magnitude D below which motion counts as rounding noise, in ulp of the scene's largest coordinate.
 const D_NOISE_ULP: f64 = 2.0;
-/// Bound below which κ counts as noise, in ulp of the largest coordinate.
+/// Curvature κ below which motion counts as rounding noise, in ulp of the scene's largest coordinate.
 const KAPPA_NOISE_ULP: f64 = 4.0;
 
-/// Numbers of values that were set to 0.
+/// Numbers of Gaussians whose motion was set to 0 because it was rounding noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Snapped {
-    /// Number of Gaussians whose D was set to 0.
+    /// Number of Gaussians whose trajectory magnitude D was set to 0.
     pub d: usize,
-    /// Number of Gaussians whose κ was set to 0.
+    /// Number of Gaussians whose curvature κ was set to 0.
     pub kappa: usize,
 }
 
-/// Returns the distance from `x` (finite, not negative) to the next larger f32, as f64 so that it exists for
-/// [`f32::MAX`] too.
+/// Returns the ulp of `x` (finite, not negative): the distance to the next larger f32. The result is f64, so that it
+/// exists for [`f32::MAX`] too.
 pub fn ulp(x: f32) -> f64 {
     let exponent = (x.to_bits() >> 23 & 0xff) as i32;
     2f64.powi(exponent.max(1) - 127 - 23)
 }
 
-/// Sets D below 2 ulp and κ below 4 ulp of `largest_coordinate` to exactly 0, flags these rows and counts them.
-/// `largest_coordinate` is the largest |coordinate| of the whole scene, at least 0. Values that are 0 already are
-/// neither flagged nor counted.
+/// Sets every trajectory magnitude D below 2 ulp and curvature κ below 4 ulp of `largest_coordinate` to exactly 0,
+/// flags these rows, and returns their numbers. `largest_coordinate` is the largest |coordinate| of the whole scene, at
+/// least 0. Values that are 0 already are neither flagged nor counted.
 pub fn snap(rows: &mut Rows, largest_coordinate: f32) -> Snapped {
     let ulp = ulp(largest_coordinate);
     Snapped {

@@ -1,4 +1,5 @@
-//! The scan: one pass over every Gaussian at every frame, with blocks of Gaussians on all threads.
+//! The scan: one pass over all Gaussians at all frames that computes their statistics, with blocks of Gaussians on all
+//! threads.
 
 pub(crate) mod blocks;
 pub(crate) mod staged;
@@ -17,23 +18,25 @@ use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
 use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
 
-/// Result of a scan.
+/// Statistics that a scan has computed.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct ScanResult {
-    /// One row per Gaussian. D and κ still include rounding noise, and E is not filled.
+    /// Statistics, one row per Gaussian. The trajectory magnitude D and the curvature κ still include rounding noise;
+    /// the anisotropy E is not filled yet.
     pub rows: Rows,
     /// Number of Gaussians alive in each frame.
     pub alive_per_frame: Vec<u32>,
-    /// Largest |coordinate| of any position in any frame.
+    /// Largest |coordinate| of all positions in all frames, scene units.
     pub largest_coordinate: f32,
 }
 
-/// Scans `source` as seen by the cameras of `schedule`. Blocks of Gaussians run in parallel, or in pipeline stages if
-/// the source is slow to read ([`FrameSource::ahead`]).
+/// Scans all frames of `source`: computes the statistics of all Gaussians, as seen by the cameras of `schedule`. Blocks
+/// of Gaussians are processed in parallel, or by the stages of a pipeline if the source is slow to read
+/// ([`FrameSource::ahead`]).
 ///
-/// Memory: a row per Gaussian, twice while blocks are joined, and 4 bytes per frame. Per thread: one block of Gaussians
-/// with its accumulators ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; two
-/// readers in stages.
+/// Memory: a row per Gaussian (twice while blocks are joined), and 4 bytes per frame. Per thread: the accumulators of
+/// one block of Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its attributes at one frame, and its reader
+/// (two readers in a pipeline).
 ///
 /// # Errors
 /// Frames that cannot be read.
@@ -41,12 +44,12 @@ pub fn scan(source: &dyn FrameSource, schedule: &ViewSchedule, plan: &ScanPlan) 
     scan_blocks(source, schedule, plan, 0..scan_units(source.info()), &Events::IGNORED)
 }
 
-/// Returns the number of blocks of Gaussians that [`scan`] processes.
+/// Returns the number of blocks of Gaussians into which [`scan`] divides a sequence.
 pub fn scan_units(info: &SequenceInfo) -> usize {
     info.count.div_ceil(BLOCK)
 }
 
-/// Scans some consecutive blocks of Gaussians only. [`ScanResult::join`] combines several such results.
+/// Scans only the blocks of Gaussians `blocks` at all frames. [`ScanResult::join`] combines several such results.
 pub fn scan_blocks(
     source: &dyn FrameSource,
     schedule: &ViewSchedule,
@@ -67,7 +70,7 @@ pub fn scan_blocks(
 }
 
 impl ScanResult {
-    /// Appends the result of the Gaussians that follow these, for the same frames.
+    /// Appends the result of a scan of the Gaussians that follow these, at the same frames.
     pub fn join(&mut self, mut other: ScanResult) {
         self.rows.append(&mut other.rows);
         self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
@@ -75,7 +78,7 @@ impl ScanResult {
     }
 }
 
-/// Joins the rows and largest coordinates of consecutive blocks into one result.
+/// Joins the rows and the largest coordinates of consecutive blocks of Gaussians into one result.
 fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
     let mut rows = Rows::default();
     let mut largest_coordinate = 0.0f32;
@@ -86,23 +89,25 @@ fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u3
     ScanResult { rows, alive_per_frame, largest_coordinate }
 }
 
-/// Scan of frames that arrive over time: [`scan`] with the frames cut into groups that are read once each.
+/// Scan of frames that arrive over time. It gives the same result as [`scan`], and takes the frames in groups, each of
+/// which is read once.
 ///
 /// Memory: the accumulators of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), 4 bytes per frame, and
-/// one block's state at one frame per thread.
+/// per thread the attributes of one block of Gaussians at one frame.
 pub struct RunningScan<'a> {
     blocks: Vec<BlockScan<'a>>,
     alive_per_frame: Vec<u32>,
 }
 
 impl<'a> RunningScan<'a> {
-    /// Creates a scan of `count` Gaussians without frames.
+    /// Creates a scan of `count` Gaussians that has no frames yet.
     pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
         let block = |start: usize| BlockScan::new(BLOCK.min(count - start), start, plan);
         RunningScan { blocks: (0..count).step_by(BLOCK).map(block).collect(), alive_per_frame: Vec::new() }
     }
 
-    /// Adds the next frames: all frames of `source`, each with the cameras that see it.
+    /// Adds the next frames, which are all frames of `source`. `cameras` lists for each of them the cameras that see
+    /// it.
     ///
     /// # Errors
     /// Frames that cannot be read.
@@ -119,8 +124,8 @@ impl<'a> RunningScan<'a> {
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
                     let changed = wanted(first + t, info.varying);
-                    // The state buffer is new, so the first read fills attributes that do not vary too; the
-                    // accumulators know them already.
+                    // The buffer is new, so its first read must also fill the attributes that do not vary. They count
+                    // as unchanged all the same, since the scan knows them already.
                     let want = if t == 0 { changed | NEEDED } else { changed };
                     reader.read(t, want, &mut state)?;
                     scan.frame(first + t, &state, cameras, changed);
@@ -137,7 +142,7 @@ impl<'a> RunningScan<'a> {
         Ok(())
     }
 
-    /// Returns the rows, computed with the plan for the complete sequence.
+    /// Returns the result after the last frame. `plan` is the plan for the complete sequence.
     ///
     /// # Panics
     /// If `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
@@ -160,11 +165,11 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
-    /// Scene whose positions alone vary, which records the reads of its readers.
+    /// Scene of which only the positions vary in time. It records what its readers read.
     struct RecordingScene {
         scene: Scene,
         info: SequenceInfo,
-        /// Frame and columns of each read.
+        /// Frame and attributes of each read.
         reads: Mutex<Vec<(usize, Attributes)>>,
     }
 

@@ -1,4 +1,4 @@
-//! Parameters of a scan that are fixed before its first frame.
+//! Parameters of a scan (the pass that computes statistics) that are fixed before its first frame.
 
 use serde::Serialize;
 
@@ -6,28 +6,30 @@ use crate::error::{Error, Result};
 use crate::model::{Camera, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
-/// Largest deviation of a time step from the mean step, as a fraction of the mean step, up to which frames count as
-/// evenly spaced. Time stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5; real gaps are far larger.
+/// Frames count as evenly spaced if every time step differs from the mean step by at most this fraction of the mean
+/// step. Time stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5 frames; real gaps are far larger.
 const EVEN_TOLERANCE: f64 = 1e-2;
 
-/// Shortest time step, as a fraction of the mean step. κ divides differences of positions by two steps and squares the
-/// result, which must not overflow.
+/// Shortest accepted time step, as a fraction of the mean step. The curvature κ divides differences of positions by two
+/// steps, and is then squared, which must not overflow.
 const LEAST_STEP: f64 = 1e-50;
 
-/// Number of bits of the largest contribution of one (frame, view) pair in fixed point. [`super::projection`] rounds by
-/// adding 2⁵², so a contribution must stay below 2⁵²; one bit is kept in reserve.
+/// Number of bits of the largest contribution that a Gaussian can have in one (frame, view) pair, as a fixed-point
+/// number. [`super::projection`] rounds by adding 2⁵², so a contribution must stay below 2⁵²; one bit is kept in
+/// reserve.
 const CONTRIBUTION_BITS: i32 = 51;
 
-/// Number of contributions that fit into a u64 sum before it must be carried: 2¹² contributions of 2⁵¹, with one bit in
-/// reserve.
+/// Number of contributions that fit into a u64 sum before its high bits must be carried: 2¹² contributions of at most
+/// 2⁵¹, with one bit in reserve.
 pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 
-/// Parameters of the scan of any block: one plan serves all blocks of a sequence.
+/// Parameters of the scan of any block of Gaussians; all blocks of a sequence use the same plan.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanPlan {
     pub(super) alpha_min: f64,
     pub(super) motion: MotionParams,
-    /// Time step into frame t in units of the mean step; empty if frames are evenly spaced.
+    /// For each frame t the duration of the time step into it, divided by the mean duration; empty if frames are evenly
+    /// spaced.
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
     pub(super) pairs: u32,
@@ -37,13 +39,13 @@ pub struct ScanPlan {
 impl ScanPlan {
     /// Creates the plan for frames at `times` (strictly increasing) seen by the cameras of `schedule`.
     ///
-    /// Motion is measured per mean step. With [`MotionParams::Runs`], a step that lasts h mean steps is divided by h,
-    /// so evenly spaced frames give the plain formula exactly. [`MotionParams::Literal`] ignores time stamps.
+    /// Motion is measured per mean time step. With [`MotionParams::Runs`], a step that lasts h mean steps is divided by
+    /// h; evenly spaced frames give exactly the formula without h. [`MotionParams::Literal`] ignores time stamps.
     ///
     /// # Errors
     /// [`Error::Usage`] for time stamps that do not increase, for two time stamps so close that their distance vanishes
-    /// beside the mean step, and for more than 2³² (frame, view) pairs. An internal error for a schedule with a
-    /// different number of frames.
+    /// beside the mean step, and for more than 2³² (frame, view) pairs. An internal error if `schedule` has another
+    /// number of frames.
     pub fn new(scan: &ScanParams, times: &[f64], schedule: &ViewSchedule) -> Result<Self> {
         if let Some(t) =
             (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))
@@ -78,8 +80,8 @@ impl ScanPlan {
         Ok(ScanPlan { steps, frames: times.len(), pairs, ..ScanPlan::arriving(scan, &schedule.cameras) })
     }
 
-    /// Creates the plan for frames that have not arrived yet, on the assumption that they are evenly spaced. If that
-    /// proves right, the plan for the complete sequence can finish the scan ([`ScanPlan::finishes`]).
+    /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If they turn out
+    /// to be, the plan for the complete sequence can finish the scan ([`ScanPlan::finishes`]).
     pub fn arriving(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
@@ -92,7 +94,7 @@ impl ScanPlan {
         }
     }
 
-    /// Returns whether this plan, made for all frames, can finish a scan begun with `arriving`.
+    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`.
     pub fn finishes(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pairs: arriving.pairs, ..self.clone() }
     }
@@ -107,19 +109,20 @@ impl ScanPlan {
         self.pairs
     }
 
-    /// Returns the resolution of C in pixels. Contributions are summed as multiples of it, so their sum is the same in
-    /// any order.
+    /// Returns the resolution of the contribution C in pixels. Contributions are summed as integer multiples of this
+    /// number, so their sum is the same in any order.
     pub fn coverage_resolution_px(&self) -> f64 {
         2f64.powi(-self.coverage_exponent)
     }
 
-    /// Returns the duration of the step into frame `t` in mean steps.
+    /// Returns the duration of the time step into frame `t`, divided by the mean duration.
     pub(super) fn step(&self, t: usize) -> f64 {
         self.steps.get(t).copied().unwrap_or(1.0)
     }
 }
 
-/// Returns the time steps in units of their mean (entry 0 is unused), or an empty list if all count as 1.
+/// Returns the durations of the time steps, divided by their mean; entry 0 is unused. Returns an empty list if all
+/// count as 1.
 fn uneven_steps(times: &[f64]) -> Vec<f64> {
     let [first, .., last] = times else { return Vec::new() };
     let mean = (last - first) / (times.len() - 1) as f64;
@@ -127,8 +130,9 @@ fn uneven_steps(times: &[f64]) -> Vec<f64> {
     if steps().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps().collect() }
 }
 
-/// Returns the largest e for which one contribution of `image_px` pixels, times 2ᵉ, has at most [`CONTRIBUTION_BITS`]
-/// bits. The number of pairs does not enter, because a stream does not know it in advance; sums are carried instead.
+/// Returns the largest exponent e for which a contribution of `image_px` pixels (the whole image), times 2ᵉ, has at
+/// most [`CONTRIBUTION_BITS`] bits. It does not depend on the number of contributions, which is unknown for a stream;
+/// the sums carry their high bits instead.
 fn coverage_exponent(image_px: f64) -> i32 {
     CONTRIBUTION_BITS - image_px.log2().ceil() as i32
 }

@@ -1,73 +1,76 @@
-//! Projected coverage: the number of pixels that a Gaussian covers in one view, times its opacity.
+//! Projected coverage of a Gaussian: the number of pixels A that it covers in one view, times its opacity.
 //!
-//! Elliptical weighted averaging with the conventions of the original rasterizer: Gaussians at depth z ≤ 0.2 (the
-//! camera's near plane) are culled, the Jacobian is evaluated at x/z and y/z clamped to ±1.3·tan(fov/2), and 0.3 px² is
-//! added to the diagonal of the 2-D covariance Σ = MMᵀ + 0.3·I, where M = J·W·R·S is 2×3 (EWA splatting, Zwicker et al.
-//! 2001).
+//! Elliptical weighted averaging (Zwicker et al., "EWA Splatting", 2002) with the conventions of the original
+//! rasterizer. Gaussians at a depth z of at most 0.2 (the camera's near plane) are culled. The Jacobian of the
+//! projection is evaluated at x/z and y/z clamped to ±1.3·tan(fov/2). The 2-D covariance in the image is Σ = MMᵀ +
+//! 0.3·I (px²), where M = J·W·R·S is 2×3: Jacobian J, camera rotation W, rotation R and scales S of the Gaussian.
 //!
-//! A = 9π·√det Σ × (fraction of the box u ± 3√Σ_xx, v ± 3√Σ_yy that lies inside the image), where 9π·√det Σ is the area
-//! of the 3σ ellipse. As √det Σ ≤ √(Σ_xx Σ_yy), A is at most π/4 of the image without a cap.
+//! A = 9π·√det Σ × (fraction of the box u ± 3√Σ_xx, v ± 3√Σ_yy that lies inside the image), where (u, v) is the
+//! projected center and 9π·√det Σ is the area of the ellipse at three standard deviations. As √det Σ ≤ √(Σ_xx Σ_yy), A
+//! is at most π/4 of the image without a further limit.
 //!
-//! det Σ is never computed as Σ_xx Σ_yy − Σ_xy², which has no correct digit left for a long needle. The sum det(MMᵀ +
-//! d·I) = Σ(2×2 minors of M)² + d·tr(MMᵀ) + d² has positive terms only (Cauchy–Binet).
+//! det Σ is never computed as Σ_xx Σ_yy − Σ_xy², which has no correct digit left for a long needle. With d = 0.3,
+//! det(MMᵀ + d·I) = Σ(2×2 minors of M)² + d·tr(MMᵀ) + d² is a sum of positive terms only (Cauchy–Binet).
 //!
-//! The inner loop runs over planes without branches, so that it vectorizes. It uses no fused multiply-add, so every
-//! instruction set gives the same bits.
+//! The inner loop runs over whole arrays without branches, so that the compiler vectorizes it. It uses no fused
+//! multiply-add, so every instruction set gives the same bits.
 
 use std::f64::consts::FRAC_PI_4;
 
 use crate::model::Camera;
 
-/// Multiple of the tangent of half the field of view to which x/z and y/z are clamped in the Jacobian.
+/// Limit for |x/z| and |y/z| in the Jacobian, as a multiple of the tangent of half the field of view.
 const JACOBIAN_CLAMP: f64 = 1.3;
-/// Value added to the diagonal of the 2-D covariance, px².
+/// Value added to the diagonal of a projected Gaussian's 2-D covariance, px².
 const DILATION_PX2: f64 = 0.3;
-/// Half size of a footprint's bounding box, in standard deviations.
+/// Half the side of a projected Gaussian's bounding box, in standard deviations.
 const REACH: f64 = 3.0;
-/// Number of Gaussians processed by one stage of the projection before the next stage. A single loop over all stages is
-/// a dependency chain of about 150 cycles per iteration, too long for a processor to overlap two iterations.
+/// Number of Gaussians that pass through one step of the projection before the next step. In a single loop over all
+/// steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap two
+/// iterations.
 const BLOCK_LANES: usize = 32;
 /// Constant 2⁵². Adding it to x in [0, 2⁵²) leaves x, rounded to an integer, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;
 
-/// Attribute planes of a block of Gaussians at one frame, all of equal length.
+/// Attributes of a block of Gaussians at one frame, as arrays of equal length with one value per Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct FootprintPlanes<'a> {
-    /// World positions: planes x, y, z.
+    /// Positions in scene coordinates: arrays of x, y and z.
     pub position: [&'a [f32]; 3],
-    /// Matrix R·S. Column k is the k-th axis of the Gaussian times its scale; the entry in `row` and column k is plane
-    /// 3·row + k.
+    /// Matrix R·S (rotation times scales). Column k is the k-th axis of the Gaussian times its scale. The entries of
+    /// `row` and column k are in array 3·row + k.
     pub axes: [&'a [f64]; 9],
     /// Opacity in [0, 1].
     pub opacity: &'a [f64],
 }
 
-/// Sums over the (frame, view) pairs so far, with the length of the [`FootprintPlanes`].
+/// Sums over the (frame, view) pairs so far, one per Gaussian of the [`FootprintPlanes`].
 #[derive(Debug)]
 pub struct CoverageSums<'a> {
-    /// Σ A·opacity in units of 2^−exponent px.
+    /// Sum of covered pixels times opacity, as a multiple of 2^−exponent px ([`CoverageScale::exponent`]).
     pub coverage: &'a mut [u64],
-    /// Number of pairs in which the Gaussian is alive and its box overlaps the image.
+    /// Number of (frame, view) pairs in which the Gaussian is alive and its bounding box overlaps the image.
     pub touched: &'a mut [u32],
 }
 
-/// Fixed-point scale of contributions, and the opacity threshold.
+/// Fixed-point scale of contributions to the sums, and the opacity threshold.
 #[derive(Debug, Clone, Copy)]
 pub struct CoverageScale {
-    /// Exponent of the fixed-point scale. Contributions are rounded to multiples of 2^−exponent px; image area ·
-    /// 2^exponent < 2⁵².
+    /// Exponent of the fixed-point scale: contributions are rounded to multiples of 2^−exponent px. The number of
+    /// pixels of an image times 2^exponent must be below 2⁵².
     pub exponent: i32,
-    /// Minimum opacity of a Gaussian that counts as alive.
+    /// Minimum opacity at which a Gaussian counts as alive.
     pub alpha_min: f64,
 }
 
-/// Adds the view of `camera` to the sums.
+/// Adds the contribution of every Gaussian of `planes` in the view of `camera` to `sums`.
 ///
-/// Values that are not finite give an arbitrary count, but no panic. Finite values of any size give the contribution
-/// above with a relative error of about 1e-14 plus half a fixed-point unit.
+/// Values that are not finite give an arbitrary contribution, but no panic. Finite values of any size give the
+/// contribution that the module documentation defines, with a relative error of about 1e-14 plus half a fixed-point
+/// unit.
 ///
 /// # Panics
-/// If the planes differ in length.
+/// If the arrays of `planes` and `sums` differ in length.
 pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let view = ScanView::new(camera);
     #[cfg(target_arch = "x86_64")]
@@ -79,7 +82,7 @@ pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageSca
     project_planes(&view, planes, scale, sums);
 }
 
-/// [`project_planes`] compiled for AVX2: the same operations, four lanes at a time.
+/// Does the same as [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
@@ -113,7 +116,7 @@ impl ScanView {
     }
 }
 
-/// Adds one view to the sums, in stages over [`BLOCK_LANES`] Gaussians. Inlined into the copy for each instruction set.
+/// Adds one view to the sums, in steps over [`BLOCK_LANES`] Gaussians. Inlined into the copy of each instruction set.
 #[inline(always)]
 fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let n = planes.opacity.len();
@@ -128,16 +131,16 @@ fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: Coverage
     }
 }
 
-/// Intermediate values of `N` Gaussians that one stage passes to the next.
+/// Intermediate values of `N` Gaussians, which one step of the projection passes to the next.
 struct ProjectedBlock<const N: usize> {
     depth: [f64; N],
-    /// 1/depth; 1 for a culled Gaussian.
+    /// 1/depth; 1 for a Gaussian that is culled.
     inverse_depth: [f64; N],
-    /// x/z and y/z.
+    /// x/z and y/z of the center in camera space.
     slope: [[f64; N]; 2],
-    /// √Σ_xx and √Σ_yy, px.
+    /// Standard deviations √Σ_xx and √Σ_yy of the projected Gaussian, px.
     sigma: [[f64; N]; 2],
-    /// √det Σ, px².
+    /// √det Σ, where Σ is the 2-D covariance of the projected Gaussian; px².
     root_det: [f64; N],
 }
 
@@ -147,7 +150,7 @@ impl<const N: usize> ProjectedBlock<N> {
         ProjectedBlock { depth: zeros, inverse_depth: zeros, slope: [zeros; 2], sigma: [zeros; 2], root_det: zeros }
     }
 
-    /// Projects the `N` Gaussians of number `block` and adds them to the sums.
+    /// Projects the `N` Gaussians of block number `block` and adds their contributions to the sums.
     #[inline(always)]
     fn project(
         &mut self,
@@ -168,7 +171,7 @@ impl<const N: usize> ProjectedBlock<N> {
         );
     }
 
-    /// Projects the centers: depth and slopes x/z, y/z in camera space.
+    /// Projects the centers of the Gaussians: computes depth z and slopes x/z, y/z in camera space.
     #[inline(always)]
     fn project_centers(&mut self, view: &ScanView, [px, py, pz]: [&[f32; N]; 3]) {
         let ScanView { rotation: [w0, w1, w2], translation: t, near, .. } = view;
@@ -183,7 +186,7 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Computes the 2-D covariance of each Gaussian.
+    /// Computes standard deviations and determinant of the 2-D covariance of each projected Gaussian.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
     fn project_covariances(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {
@@ -207,7 +210,7 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Adds the area inside the image times the opacity to the sums.
+    /// Adds the covered area inside the image, times the opacity, of each Gaussian to the sums.
     #[inline(always)]
     fn accumulate(
         &self,
@@ -224,7 +227,8 @@ impl<const N: usize> ProjectedBlock<N> {
             let inside = |k: usize| overlap(focal[k] * self.slope[k][i] + principal[k], REACH * sigma[k], size[k]);
             let (inside_x, inside_y) = (inside(0), inside(1));
             let touches = (self.depth[i] > *near) & (inside_x > 0.0) & (inside_y > 0.0);
-            // 9π√det × inside_x·inside_y / (6σ_x · 6σ_y)
+            // 9π√det Σ × inside_x·inside_y / (6σ_x · 6σ_y): area of the ellipse times the fraction of its box inside
+            // the image
             let area = FRAC_PI_4 * (self.root_det[i] / (sigma[0] * sigma[1])) * (inside_x * inside_y);
             let contribution = if touches { area * opacity[i] } else { 0.0 };
             let fixed = (contribution * unit + ROUNDER).to_bits().wrapping_sub(ROUNDER.to_bits());
@@ -235,7 +239,8 @@ impl<const N: usize> ProjectedBlock<N> {
     }
 }
 
-/// Returns a row of J·W, the gradient of a pixel coordinate: f/z·(w − slope·w₂).
+/// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate by position:
+/// f/z·(w − slope·w₂), with the camera axis w of this coordinate and the viewing axis w₂.
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))
@@ -278,7 +283,8 @@ mod tests {
         (hash_id(k as u64) >> 11) as f64 / 2f64.powi(53)
     }
 
-    /// Runs `with` on Gaussians around a camera, including some behind it and some very large ones.
+    /// Runs `with` on random Gaussians around a camera, including some behind it and some very large ones, and returns
+    /// the sums.
     fn run_on_random_gaussians(
         with: impl Fn(&ScanView, &FootprintPlanes<'_>, CoverageScale, &mut CoverageSums<'_>),
     ) -> (Vec<u64>, Vec<u32>) {

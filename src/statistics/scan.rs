@@ -1,5 +1,5 @@
-//! Scan of one block of Gaussians through all frames: accumulators of every statistic, and the rows that follow from
-//! them.
+//! Scan of one block of Gaussians through all frames: accumulates every statistic, and computes rows of statistics from
+//! the sums.
 
 use std::mem::size_of;
 
@@ -10,29 +10,30 @@ use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
 use super::state::{BlockState, CHUNK};
 use crate::model::{Attributes, Camera, Flags, Gaussians, Rows};
 
-/// Resident bytes of a [`BlockScan`] per Gaussian, independent of the number of frames.
+/// Bytes of memory that a [`BlockScan`] takes per Gaussian, independent of the number of frames.
 pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
     + LifeSpans::BYTES_PER_GAUSSIAN
     + MotionSums::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
     + 2 * size_of::<u32>();
 
-/// Opacity, 2⁻⁵³, below which a Gaussian adds nothing to a coverage sum: a view has fewer than 2⁵² fixed-point units.
+/// Opacity (2⁻⁵³) below which a Gaussian adds nothing to a sum of contributions: its contribution to a view, less than
+/// 2⁵² fixed-point units times the opacity, rounds to 0.
 const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 
-/// Number of low bits of a coverage sum that remain when the rest is carried. 2³² pairs of at most 2⁵¹ leave 31 bits
-/// above them.
+/// Number of low bits that remain in a sum of contributions when its high bits are carried. 2³² contributions of at
+/// most 2⁵¹ leave 31 bits above them, which fit into u32.
 const CARRY_BITS: u32 = 52;
 
-/// Columns that a scan needs for every model; SH may be omitted.
+/// Attributes that a scan needs of every model; SH coefficients may be omitted.
 pub const NEEDED: Attributes = Attributes::all().difference(Attributes::SH);
 
-/// Returns the columns to read at `frame`: all of them at the first frame, the `varying` ones after it.
+/// Returns the attributes to read at frame `frame`: all of them at frame 0, and only the `varying` ones after it.
 pub(super) fn wanted(frame: usize, varying: Attributes) -> Attributes {
     if frame == 0 { Attributes::all() } else { varying }
 }
 
-/// Running statistics of a block of consecutive Gaussians.
+/// Statistics of a block of consecutive Gaussians over the frames added so far.
 pub struct BlockScan<'a> {
     plan: &'a ScanPlan,
     first_id: usize,
@@ -42,32 +43,34 @@ pub struct BlockScan<'a> {
     state: BlockState,
     life: LifeSpans,
     motion: MotionSums,
-    /// Low part of Σ A·opacity in fixed point; the sum is `carried · 2^CARRY_BITS + coverage`.
+    /// Low part of the sum of covered pixels times opacity, in fixed point, for each Gaussian; the whole sum is
+    /// `carried · 2^CARRY_BITS + coverage`.
     coverage: Vec<u64>,
     carried: Vec<u32>,
-    /// Number of pairs added to `coverage` since it was last carried.
+    /// Number of (frame, view) pairs added to `coverage` since its high bits were last carried.
     uncarried: usize,
     touched: Vec<u32>,
     alive_per_frame: Vec<u32>,
 }
 
-/// Statistics of a block after its last frame.
+/// Statistics of a block of Gaussians after its last frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BlockStatistics {
     /// Id of the block's first Gaussian.
     pub first_id: usize,
-    /// One row per Gaussian. `e` is 0 until [`super::fill_anisotropy`]; D and κ include rounding noise until
-    /// [`super::snap`]. A Gaussian with [`Flags::NON_FINITE`] has zeros throughout.
+    /// Statistics, one row per Gaussian. The anisotropy `e` is 0 until [`super::fill_anisotropy`]; the trajectory
+    /// magnitude D and the curvature κ include rounding noise until [`super::snap`]. All statistics of a Gaussian with
+    /// [`Flags::NON_FINITE`] are 0.
     pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame that [`BlockScan::take_alive`] has not returned yet;
-    /// Gaussians with NaN values are included.
+    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive`] has not
+    /// returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
 }
 
 impl<'a> BlockScan<'a> {
-    /// Creates an empty scan of the Gaussians `first_id .. first_id + len`.
+    /// Creates a scan, without frames yet, of the Gaussians with the ids `first_id .. first_id + len`.
     pub fn new(len: usize, first_id: usize, plan: &'a ScanPlan) -> Self {
         BlockScan {
             plan,
@@ -85,12 +88,12 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from the previous
-    /// frame; in frame 0 all columns but SH count as changed. SH is only checked for non-finite values, and only if
+    /// Adds frame `t` and the cameras that see it. `changed` names the attributes that may differ from the previous
+    /// frame; in frame 0 all attributes but SH count as changed. SH is only checked for non-finite values, and only if
     /// `changed` contains it.
     ///
     /// # Panics
-    /// If frames are not added in order, or a column does not have the length of the block.
+    /// If frames are not added in order, or an attribute does not have one value for each Gaussian of the block.
     pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Attributes) {
         assert_eq!(t, self.next_frame, "frames are scanned in order");
         self.next_frame += 1;
@@ -105,7 +108,7 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Moves the high bits of `coverage` to `carried`, so that [`PAIRS_PER_CARRY`] more pairs fit.
+    /// Moves the high bits of the sums `coverage` to `carried`, so that [`PAIRS_PER_CARRY`] more contributions fit.
     fn carry(&mut self) {
         for (coverage, carried) in self.coverage.iter_mut().zip(&mut self.carried) {
             *carried += (*coverage >> CARRY_BITS) as u32;
@@ -114,7 +117,7 @@ impl<'a> BlockScan<'a> {
         self.uncarried = 0;
     }
 
-    /// Returns the number of the block's Gaussians alive in each frame added since the last call, and removes these
+    /// Returns how many of the block's Gaussians are alive in each frame added since the last call, and forgets these
     /// numbers.
     pub fn take_alive(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
@@ -130,21 +133,21 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// [`BlockScan::advance_portable`] compiled for AVX2: the same operations, several lanes at a time.
+    /// Does the same as [`BlockScan::advance_portable`], compiled for AVX2: the same operations, several Gaussians at a
+    /// time.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Updates state, life spans and motion by one frame. Inlined, with the loops it calls, into the copy for each
-    /// instruction set.
+    /// Adds a frame to decoded attributes, life spans and motion. Inlined, with the loops it calls, into the copy of
+    /// each instruction set.
     #[inline(always)]
     fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);
         let alpha_min = self.plan.alpha_min;
-        // The first frame is the one that the others are compared with; its opacities are new even if `changed` omits
-        // them.
+        // The opacities of all frames are compared with those of frame 0, which are new even if `changed` omits them.
         self.steady &= t == 0 || !changed.contains(Attributes::OPACITY);
         let repeats = t > 0 && self.steady;
         let opacity = &self.state.opacity;
@@ -183,7 +186,7 @@ impl<'a> BlockScan<'a> {
         self.state.resident_bytes() + self.life.resident_bytes() + self.motion.resident_bytes() + sums
     }
 
-    /// Returns the statistics after every frame was added.
+    /// Returns the statistics after all frames have been added.
     pub fn finish(self) -> BlockStatistics {
         let plan = self.plan;
         self.finish_by(plan)
@@ -243,7 +246,7 @@ mod tests {
         (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
     }
 
-    /// Returns a frame with the positions of frame `t` and the opacities of frame `opacity_frame`.
+    /// Returns a frame that has the positions of frame `t` and the opacities of frame `opacity_frame`.
     fn test_frame(t: usize, opacity_frame: usize) -> Gaussians {
         let mut frame = Gaussians::zeros(77, 0);
         for (column, t) in [(Attributes::POSITION, t), (Attributes::OPACITY, opacity_frame), (Attributes::ROTATION, 0)]
@@ -260,8 +263,8 @@ mod tests {
     fn unchanged_opacities_may_be_omitted_from_changed() {
         for motion in [MotionParams::Literal, MotionParams::Runs] {
             let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
-            // Number of the frame whose opacities each frame has: always the first; changed late, then steady again;
-            // changed from the second frame on; a single frame.
+            // For each frame, the number of the frame whose opacities it has: always those of frame 0; changed late,
+            // then steady again; changed from frame 1 on; a single frame.
             let opacity_frames: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
             for opacities in opacity_frames {
                 let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();

@@ -1,29 +1,30 @@
-//! Decoded attributes of a block at the current frame: opacities and scaled axes in f64. They are kept between frames,
-//! so only columns that changed are decoded again.
+//! Opacities and scaled axes of a block of Gaussians at the current frame, computed in f64 from stored attributes. They
+//! are kept between frames, so only attributes that changed are computed again.
 
 use std::mem::size_of;
 use std::ops::Range;
 
 use crate::model::{self, AttributeValues, Attributes, Flags, Gaussians};
 
-/// Largest ln(scale); larger values are clamped to it. e¹⁰⁰ scene units cause no overflow later and already cover every
-/// view entirely.
+/// Largest ln(scale); larger values are clamped to it. A scale of e¹⁰⁰ scene units causes no overflow later, and such a
+/// Gaussian already covers every view entirely.
 const MAX_LOG_SCALE: f64 = 100.0;
 
-/// Number of Gaussians projected together. At about 108 bytes each, every view of a frame but the first finds them in
-/// the first-level cache.
+/// Number of Gaussians whose projection is computed together. Each takes about 108 bytes, so after the first view of a
+/// frame they are found in the first-level cache.
 pub(super) const CHUNK: usize = 256;
 
-/// Decoded attributes of a block at the current frame.
+/// Opacities, axes and flags of a block of Gaussians at the current frame.
 pub(super) struct BlockState {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
-    /// Matrix R·S, plane 3·row + axis, as of the last update of the Gaussian's chunk.
+    /// Matrix R·S (rotation times scales) of each Gaussian: entry (row, axis) is in array 3·row + axis. Valid as of the
+    /// last update of the Gaussian's chunk.
     pub(super) axes: [Vec<f64>; 9],
-    /// Whether R or S of each chunk changed since its axes were updated.
+    /// For each chunk of Gaussians, whether rotations or scales have changed since the axes were computed.
     axes_outdated: Vec<bool>,
     pub(super) flags: Vec<Flags>,
-    /// Largest finite |coordinate| so far.
+    /// Largest finite |coordinate| of the positions so far, scene units.
     pub(super) largest_coordinate: f32,
 }
 
@@ -40,8 +41,8 @@ impl BlockState {
         }
     }
 
-    /// Decodes the columns `changed` and flags non-finite values and zero quaternions in them. Axes are only needed for
-    /// projection; [`BlockState::update_axes`] updates them.
+    /// Takes over the attributes `changed` of the next frame, and flags non-finite values and zero quaternions in them.
+    /// Axes are only needed for projection and are computed later, by [`BlockState::update_axes`].
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
@@ -86,7 +87,7 @@ impl BlockState {
         }
     }
 
-    /// Recomputes the axes of a chunk from `gaussians` if they are outdated.
+    /// Computes the axes of the Gaussians of a chunk again if they are outdated.
     pub(super) fn update_axes(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
         if !std::mem::take(&mut self.axes_outdated[chunk.start / CHUNK]) {
             return;
@@ -113,8 +114,8 @@ impl BlockState {
     }
 }
 
-/// Returns the largest |x|, or a non-finite value if any value is not finite. The bits of magnitudes order like the
-/// magnitudes, with infinity and NaN last, and integers are compared many at a time.
+/// Returns the largest |x| of `values`, or a non-finite number if any value is not finite. Without their signs, floats
+/// order as their bits do, with infinity and NaN last; integers are compared many at a time.
 #[inline(always)]
 fn largest_magnitude(values: &[f32]) -> f32 {
     f32::from_bits(values.iter().fold(0, |largest, x| largest.max(x.abs().to_bits())))
@@ -124,8 +125,8 @@ fn largest_finite(values: &[f32]) -> f32 {
     values.iter().filter(|x| x.is_finite()).fold(0.0, |largest, x| largest.max(x.abs()))
 }
 
-/// Returns the rows of the rotation matrix of a wxyz quaternion of any length but zero. Dividing the quadratic form by
-/// the squared length avoids a square root; f64 holds the square of any f32, including subnormals.
+/// Returns the rows of the rotation matrix of a wxyz quaternion of any length but zero. Dividing by the squared length
+/// avoids a square root; f64 holds the square of any f32, subnormals included.
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     let s = 2.0 / (w * w + x * x + y * y + z * z);
     [

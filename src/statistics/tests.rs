@@ -1,5 +1,5 @@
-//! Tests of the scan: against the slow definitions in [`crate::diagnostics::selfcheck::oracle`], against closed
-//! formulas, and as invariants.
+//! Tests of the scan: against slow f64 definitions of the statistics ([`crate::diagnostics::selfcheck::oracle`]),
+//! against closed formulas, and of invariants.
 
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
@@ -14,12 +14,12 @@ fn recipe(motion: MotionParams) -> ScanParams {
     ScanParams { motion, ..Recipe::preset("default").unwrap().scan }
 }
 
-/// Returns the `k`-th number of a fixed pseudo-random stream in [0, 1).
+/// Returns number `k` of a pseudo-random sequence of numbers in [0, 1) that follows from `seed`.
 fn random(seed: u64, k: u64) -> f64 {
     (hash_id(hash_id(seed) ^ k) >> 11) as f64 / 2f64.powi(53)
 }
 
-/// Returns a camera on the sphere of radius 4 that looks at the origin.
+/// Returns a camera, at a distance of 4, that looks at the origin.
 fn camera(seed: u64) -> Camera {
     let eye = DQuat::from_rotation_y(6.3 * random(seed, 0)) * DVec3::new(0.0, 2.0 * random(seed, 1) - 1.0, -4.0);
     let forward = -eye.normalize();
@@ -45,7 +45,7 @@ fn schedule(frames: usize, views: u32) -> ViewSchedule {
     schedule
 }
 
-/// Returns the frames of `n` wandering Gaussians. Each is dead in about a third of its frames.
+/// Returns frames of `n` Gaussians that wander about. Each is not alive in about a third of the frames.
 fn wanderers(n: usize, frames: usize, seed: u64) -> Vec<Gaussians> {
     (0..frames)
         .map(|t| {
@@ -147,7 +147,8 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
     let half = (omega / 2.0).sin();
     for motion in BOTH {
         let rows = scan_one(steps + 1, |t| (omega * t as f64).sin() as f32, |_| ALIVE, motion).rows;
-        // Mean of (sin ωt − sin ω(t−1))² over whole periods: 2 sin²(ω/2). The paper divides by |life|.
+        // Mean of (sin ωt − sin ω(t−1))² over whole periods: 2 sin²(ω/2). The paper divides by the number of life
+        // frames.
         let divisor = steps + usize::from(motion == MotionParams::Literal);
         close("D", rows.d[0], half * (2.0 * steps as f64 / divisor as f64).sqrt(), 1e-6, 0.0);
         // Second difference 4 sin²(ω/2)·|sin ωt|; the mean of |sin| over 1000 samples is cot(ω/2)/500. Frame 0,
@@ -168,7 +169,7 @@ fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
 #[test]
 fn nearly_constant_opacity_keeps_its_variance() {
     let rows = scan_one(10_000, |_| 0.0, |t| 0.999 + 1e-5 * (t % 2) as f64, MotionParams::Runs).rows;
-    // f32 logits around 7 place the two opacities to 5e-10, 5e-5 of their distance.
+    // f32 logits around 7 give the two opacities with an error of 5e-10, which is 5e-5 of their difference.
     close("V", rows.v[0], 2.5e-11, 1e-3, 0.0);
 }
 
@@ -209,18 +210,19 @@ fn alternating_opacity_has_no_interior_triples() {
     let alive = |t: usize| if t.is_multiple_of(2) { ALIVE } else { DEAD };
     let rows = scan_one(9, |t| (t * t) as f32, alive, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0], rows.life[0]), (0.0, 0.0, 5));
-    // In the paper's formula, the neighbors of a center need not be alive: centers 2, 4 and 6 turn by 2 each.
+    // In the paper's formula, the neighbors of a turn's central frame need not be alive: the turns about frames 2, 4
+    // and 6 are 2 each.
     assert_eq!(scan_one(9, |t| (t * t) as f32, alive, MotionParams::Literal).rows.kappa[0], 2.0);
 }
 
 #[test]
 fn turn_about_the_last_frame_alive_is_ignored() {
-    // Straight motion while alive, then a jump: only the turn about the last frame alive would see the jump.
+    // Straight motion while alive, then a jump: only the turn about the last frame alive would include the jump.
     for (last, motion) in [(6, BOTH[0]), (6, BOTH[1]), (9, BOTH[0]), (9, BOTH[1])] {
         let x = |t: usize| if t <= last { t as f32 } else { 50.0 };
         assert_eq!(scan_one(10, x, |t| if t <= last { ALIVE } else { DEAD }, motion).rows.kappa[0], 0.0);
     }
-    // If a later frame is alive, the center is interior and the jump counts.
+    // If a later frame is alive, the turn's central frame is not the last one, and the jump counts.
     let rows =
         scan_one(10, |t| if t <= 6 { t as f32 } else { 50.0 }, |t| if t == 7 { DEAD } else { ALIVE }, BOTH[0]).rows;
     close("kappa", rows.kappa[0], (43.0 + 0.0) / 7.0, 1e-12, 0.0);
@@ -274,7 +276,8 @@ fn zero_quaternion_is_flagged_and_counts_as_identity() {
     assert_eq!((got.c, got.flags), (expected.c, vec![Flags::ZERO_ROTATION, Flags::empty()]));
 }
 
-/// Returns the area, the visibility and the area by the oracle of one Gaussian in one view.
+/// For one Gaussian in one view: returns the area, the visibility, and the area as the slow reference (oracle) computes
+/// it.
 fn one_view(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
     let schedule = schedule(1, 1);
     let mut g = Gaussians::zeros(1, 0);
@@ -315,7 +318,7 @@ fn area_stays_within_the_image_for_extreme_scales() {
 
 #[test]
 fn needle_keeps_the_digits_of_its_area() {
-    // Here Σ_xx·Σ_yy is 1e13 times det Σ, so the difference Σ_xx Σ_yy − Σ_xy² would keep three digits.
+    // For this Gaussian Σ_xx·Σ_yy is 1e13 times det Σ, so the difference Σ_xx Σ_yy − Σ_xy² would keep three digits.
     let camera = camera(0);
     let (length, depth) = (1e5, camera.center().length());
     let mut g = Gaussians::zeros(1, 0);
@@ -367,7 +370,7 @@ fn uneven_frames_are_measured_by_their_time_stamps() {
         .collect();
     let rows = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Runs)).rows;
     close("kappa", rows.kappa[0], 2.0 * unit * unit, 1e-12, 0.0);
-    // The mean velocity over a step is the sum of its two stamps.
+    // For x = τ², the mean velocity over a step is the sum of its two time stamps.
     let squares = stamps.windows(2).map(|pair| (pair[0] + pair[1]).powi(2) + 4.0).sum::<f64>();
     close("D", rows.d[0], unit * (squares / 6.0).sqrt(), 1e-12, 0.0);
     let literal = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Literal)).rows;
@@ -377,7 +380,7 @@ fn uneven_frames_are_measured_by_their_time_stamps() {
 
 #[test]
 fn mean_coverage_of_300_000_equal_views_is_that_of_one() {
-    // More contributions than a 64-bit fixed-point sum holds; the mean of equal contributions is any of them.
+    // More contributions than a 64-bit fixed-point sum holds; the mean of equal contributions equals each of them.
     let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
     frames[0].log_scale.planes_mut().fill(2.0);
     let mut many = ViewSchedule::new(one.cameras.clone());
@@ -458,7 +461,7 @@ proptest! {
     }
 }
 
-/// Returns the Gaussians of `range`.
+/// Returns the Gaussians of `from` in `range`.
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
     for column in Attributes::all().iter() {

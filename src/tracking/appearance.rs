@@ -1,41 +1,43 @@
-//! Appearance of a Gaussian as far as it is compared, and the cost of differences.
+//! Appearance of a Gaussian, as far as tracking compares it between frames, and the cost of differences in appearance.
 
 use rayon::prelude::*;
 
 use crate::model::{AttributeValues, Gaussians, SH_C0};
 
-/// Largest magnitude of the natural log of a scale; others are clamped to it, so that squares of scales stay finite in
-/// f32.
+/// Largest magnitude of the natural log of a scale. Larger ones are clamped to this value, so that squares of scales
+/// stay finite in f32.
 const MAX_LOG_SCALE: f32 = 30.0;
-/// Differences in size (natural log), shape, opacity and color that cost 1 each.
+/// Difference in size (as a natural log) that costs 1. The next three constants are such differences in shape, opacity
+/// and color.
 const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
 const COLOR_UNIT: f32 = 0.1;
-/// Parameters r and q of the [module](super) for near-duplicates.
+/// Parameters r (distance) and q (appearance) of the cost in the [module documentation](super) by which two Gaussians
+/// are near-duplicates.
 const DUPLICATE_REACH: f32 = 0.25;
 const DUPLICATE_STRICTNESS: f32 = 4.0;
 
-/// Attributes of a Gaussian at one frame that are compared.
+/// Position and appearance of a Gaussian at one frame, as far as tracking compares them.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ComparedAppearance {
     /// Position, scene units.
     pub(super) position: [f32; 3],
-    /// Root mean square of the scales, scene units; `ln_size` is its natural log.
+    /// Size: root mean square of the three scales, scene units. `ln_size` is its natural log.
     pub(super) size: f32,
     pub(super) ln_size: f32,
-    /// Covariance divided by its trace: xx, yy, zz, and √2 times xy, xz, yz, so that the sum of squares is that of the
-    /// matrix.
+    /// Shape: covariance divided by its trace, as xx, yy, zz, and √2 times xy, xz, yz. The factor √2 makes the sum of
+    /// squares equal that of all nine entries of the matrix.
     shape: [f32; 6],
     opacity: f32,
-    /// Base color: red, green, blue; 0 to 1 is the range of a screen.
+    /// Base color (without view dependence): red, green, blue; 0 to 1 is the range of a screen.
     color: [f32; 3],
     /// Hash of the bits of position, rotation, scales, opacity and base color.
     pub(super) bits: u64,
 }
 
 impl ComparedAppearance {
-    /// Returns the appearances of all Gaussians of a frame.
+    /// Returns the appearance of every Gaussian of a frame, in their order.
     pub(super) fn all_from_state(state: &Gaussians) -> Vec<ComparedAppearance> {
         (0..state.len())
             .into_par_iter()
@@ -65,38 +67,40 @@ impl ComparedAppearance {
         }
     }
 
-    /// Returns the same appearance at another position.
+    /// Returns this appearance, moved to `position`.
     pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
         ComparedAppearance { position, ..self }
     }
 
-    /// Returns the sum of the color channels, by which Gaussians of a crowded cell are selected.
+    /// Returns the sum of the color channels. It selects the Gaussians that are compared if a grid cell holds too many.
     pub(super) fn brightness(&self) -> f32 {
         self.color.iter().sum()
     }
 
-    /// Returns the difference A of the [module](super), which is symmetric.
+    /// Returns the difference A in size, shape, opacity and color, as the [module documentation](super) defines it. A
+    /// is symmetric.
     pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.difference_without_opacity(other) + opacity * opacity
     }
 
-    /// Returns whether both look the same except for opacity: closer than the first round's reach, with a small
-    /// difference.
+    /// Returns whether two Gaussians are near-duplicates: their distance is at most a quarter of the smaller size, and
+    /// they differ little in size, shape and color. Opacity does not count.
     pub(super) fn is_near_duplicate(&self, other: &ComparedAppearance) -> bool {
         self.distance_cost(other, DUPLICATE_REACH, DUPLICATE_STRICTNESS) <= 1.0
     }
 
-    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A of the [module](super), opacity excluded, where r is
-    /// `reach` and q is `strictness`. If the distance alone costs more than 1, only that cost is returned.
+    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A between Gaussians a and b: positions x, sizes s,
+    /// difference in appearance A without opacity. `reach` is r, `strictness` is q. If the distance term alone exceeds
+    /// 1, returns only this term.
     pub(super) fn distance_cost(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
         let unit = reach * self.size.min(other.size);
         let distance = squared_distance(&self.position, &other.position) / (unit * unit);
-        // Most Gaussians in the cells of a grid are too far away, so their difference is not computed.
+        // Most Gaussians in the cells of a grid are too far away; their difference in appearance is not computed.
         if distance > 1.0 { distance } else { distance + strictness * self.difference_without_opacity(other) }
     }
 
-    /// Returns the difference A without its opacity term.
+    /// Returns the difference A in size, shape and color (A of the [module documentation](super) without opacity).
     fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
@@ -109,14 +113,15 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
-/// Hashes `x` with a bijection in which every bit depends on all lower bits and, through the shift, on higher ones (S.
-/// Vigna, splitmix64, 2015, one round).
+/// Hashes `x` by two rounds of an exclusive or with its upper half (a shift by 32 bits) and a multiplication by an odd
+/// constant, modulo 2⁶⁴. Both steps are bijections, so different numbers have different hashes.
 pub(super) fn mix(x: u64) -> u64 {
     let x = (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93);
     (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93)
 }
 
-/// Returns R·diag(v)·Rᵀ for a wxyz quaternion of any length; a zero quaternion is the identity.
+/// Returns the matrix R·diag(v)·Rᵀ in the form of [`ComparedAppearance::shape`]. R is the rotation of the wxyz
+/// quaternion, which may have any length; a zero quaternion is the identity.
 fn shape(quaternion: [f32; 4], v: [f32; 3]) -> [f32; 6] {
     let length = quaternion.iter().map(|x| x * x).sum::<f32>();
     let [w, x, y, z] = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { quaternion };

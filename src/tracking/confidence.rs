@@ -1,24 +1,24 @@
-//! Probability that links are wrong, and removal of the doubtful ones.
+//! Probability that links between tracks and Gaussians are wrong, and removal of the doubtful links.
 
 use super::appearance::ComparedAppearance;
 use super::links::Links;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Largest fraction of a frame's links that may be expected to be wrong.
+/// Largest accepted fraction of a frame's links that is expected to be wrong.
 pub(super) const MAX_WRONG: f64 = 0.005;
-/// Difference below which two costs count as equal.
+/// Difference below which two costs of links count as equal.
 const COST_TOLERANCE: f32 = 1e-6;
-/// Probability that a track is absent although an unrelated Gaussian lies within its reach.
+/// Assumed probability that a track's own Gaussian is absent from a frame, although an unrelated one lies within reach.
 const ABSENCE_PROBABILITY: f32 = 0.25;
 
-/// Estimates of how many links of a frame are wrong.
+/// Estimates of how many of a frame's links between tracks and Gaussians are wrong.
 pub(super) struct LinkConfidence {
-    /// Expected number of wrong links.
+    /// Expected number of wrong links: the sum of the probabilities that a link is wrong.
     expected_wrong: f64,
-    /// Tracks whose link is wrong with a probability above [`MAX_WRONG`], with that probability.
+    /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
-    /// For every linked track, the cost of its link and a rival's, divided by their cost with the Gaussians exchanged:
-    /// the largest ratio over all rivals.
+    /// For every track, how well a rival link would do: the cost of the track's link plus that of the rival link,
+    /// divided by their cost with the Gaussians exchanged. The largest ratio over all rivals; 0 without a rival.
     ratios: Vec<f32>,
 }
 
@@ -27,7 +27,8 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Adds the links made in a round, given the candidates of the tracks that took part.
+    /// Adds the links made in a round of linking. `candidates_by_track` holds, for the tracks that took part, the
+    /// Gaussians that might have continued them.
     pub(super) fn add_round(
         &mut self,
         links: &Links,
@@ -81,8 +82,8 @@ impl LinkConfidence {
         }
     }
 
-    /// Drops the least certain links until at most the fraction [`MAX_WRONG`] of the remaining ones is expected to be
-    /// wrong. Returns the Gaussians of the dropped links.
+    /// Removes the least certain links until the number of wrong ones among the rest is expected to be at most the
+    /// fraction [`MAX_WRONG`]. Returns the Gaussians whose links were removed.
     pub(super) fn drop_doubtful(mut self, links: &mut Links) -> Vec<u32> {
         self.doubtful.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let count = links.count();

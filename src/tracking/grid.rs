@@ -1,5 +1,5 @@
-//! Grid of the Gaussians of a frame for neighbor searches: one grid of cells per octave of sizes, all in one hash
-//! table.
+//! Grid of the Gaussians of a frame, to find neighbors of similar size. There is one grid of cells per octave (factor
+//! of two) of sizes; all of them share one hash table.
 //!
 //! Memory: 72 bytes per Gaussian, and 4 bytes for each of up to four times as many buckets.
 
@@ -7,32 +7,33 @@ use std::ops::RangeInclusive;
 
 use super::appearance::{ComparedAppearance, mix};
 
-/// Maximum number of Gaussians of one cell that a search visits.
+/// Maximum number of Gaussians that a search visits in one cell, so that crowded cells do not make searches slow.
 const MAX_PER_CELL: usize = 64;
-/// Maximum number of cells along an axis that a search visits. The reach of the fastest track stays within them.
+/// Maximum number of cells along an axis that a search visits. The distance within which the fastest track is searched
+/// never takes more.
 const MAX_CELLS_PER_AXIS: i64 = 8;
 
-/// Some Gaussians of a frame, sorted by their cells.
+/// Some of the Gaussians of a frame, sorted by the cells of the grid in which they lie.
 pub(super) struct CellGrid {
     reach: f64,
     mask: usize,
-    /// Index of the first Gaussian of each bucket, and the total count at the end.
+    /// Index in `entries` of the first Gaussian of each hash bucket, and the total count at the end.
     starts: Vec<u32>,
-    /// Cell of each Gaussian. Kept separately from `entries`, so that Gaussians of other cells are skipped within the
-    /// cache.
+    /// Cell of each entry of `entries`, in the same order. A list of its own, so that Gaussians of other cells in a
+    /// bucket are skipped without loading their entries into the cache.
     cells: Vec<u64>,
     entries: Vec<CellEntry>,
 }
 
-/// Gaussian in a cell.
+/// Gaussian in the grid.
 struct CellEntry {
     appearance: ComparedAppearance,
     number: u32,
 }
 
 impl CellGrid {
-    /// Builds the grid of the Gaussians `numbers` of `appearances`, with cells sized for searches within `reach` times
-    /// the size.
+    /// Builds the grid of the Gaussians with the indices `numbers` in `appearances`. Cells are sized for searches
+    /// within `reach` times the size of a Gaussian.
     pub(super) fn new(appearances: &[ComparedAppearance], numbers: &[u32], reach: f32) -> CellGrid {
         let reach = f64::from(reach);
         let buckets = (2 * numbers.len()).next_power_of_two();
@@ -52,7 +53,7 @@ impl CellGrid {
         for bucket in starts.windows(2) {
             let bucket_order = &mut order[bucket[0] as usize..bucket[1] as usize];
             if bucket_order.len() > MAX_PER_CELL {
-                // Sorting by index as well keeps equal Gaussians in the order of their numbers.
+                // Sorting by index as well keeps Gaussians with equal keys in the order of their numbers.
                 bucket_order.sort_unstable_by(|&a, &b| {
                     let brightness = appearance(a).brightness().total_cmp(&appearance(b).brightness());
                     cells[a as usize].cmp(&cells[b as usize]).then(brightness).then(a.cmp(&b))
@@ -66,8 +67,9 @@ impl CellGrid {
         CellGrid { reach, mask, starts, cells, entries }
     }
 
-    /// Calls `visit` with the number and appearance of every Gaussian of about the size of `appearance` within `radius`
-    /// of `center` along each axis. Gaussians somewhat farther away are visited too.
+    /// Calls `visit` with the number and appearance of every Gaussian whose size is about that of `appearance` and
+    /// whose position differs from `center` by at most `radius` (scene units) along each axis. Some Gaussians farther
+    /// away are visited too.
     pub(super) fn for_each_near(
         &self,
         appearance: &ComparedAppearance,
@@ -112,7 +114,7 @@ impl CellGrid {
             }
         }
         for index in indices {
-            // Several cells may share a bucket.
+            // Several cells may share a hash bucket.
             if self.cells[index] == cell {
                 let entry = &self.entries[index];
                 visit(entry.number, &entry.appearance);
@@ -121,13 +123,15 @@ impl CellGrid {
     }
 }
 
-/// Returns the octaves that contain sizes within a factor of √2.
+/// Returns the octaves of sizes that contain all sizes within a factor of √2 of the size with the natural log
+/// `ln_size`.
 fn levels(ln_size: f32) -> RangeInclusive<i64> {
     let octave = f64::from(ln_size) / std::f64::consts::LN_2;
     floor(octave - 0.5)..=floor(octave + 0.5)
 }
 
-/// Returns the width of the cells of an octave: the diameter of a search for the largest Gaussian of that octave.
+/// Returns the width (scene units) of the cells for octave `level` of sizes: the diameter of a search around the
+/// largest Gaussian of that octave, within `reach` times its size.
 fn side(level: i64, reach: f64) -> f64 {
     2.0 * reach * ((level + 1) as f64).exp2()
 }
@@ -142,16 +146,16 @@ fn own_cell(appearance: &ComparedAppearance, reach: f64) -> u64 {
         .cell()
 }
 
-/// Returns the largest integer that is not above `x`. Written out so that it is inlined on processors without a
+/// Returns the largest integer that is not above `x`. Unlike `f64::floor`, it is inlined on processors without a
 /// rounding instruction.
 fn floor(x: f64) -> i64 {
     let toward_zero = x as i64;
     toward_zero - i64::from(x < toward_zero as f64)
 }
 
-/// Hash of a cell, computed from its octave and its index along each axis. Two cells with equal hashes cost time but
-/// change no result. The eight cells of a cube of 2×2×2 differ in the last three bits only, so they are adjacent in the
-/// table.
+/// Hash of a grid cell, computed from its octave of sizes and its index along each axis. Two cells with equal hashes
+/// cost time but change no result. The eight cells of a cube of 2×2×2 cells have hashes that differ in the last three
+/// bits only, so they are adjacent in the hash table.
 #[derive(Clone, Copy)]
 struct CellKey {
     cube: u64,

@@ -1,37 +1,39 @@
-//! Test whether the order of the Gaussians in frames identifies them.
+//! Test whether equal indices in two frames denote the same Gaussian, so that frames need not be linked.
 
 use super::appearance::ComparedAppearance;
 use crate::model::Gaussians;
 
-/// Maximum number of Gaussians of a pair of frames that are compared.
+/// Maximum number of Gaussians that are compared for a pair of frames.
 const MAX_COMPARED: usize = 4096;
-/// Largest difference of Gaussians at the same index, as a fraction of that of unrelated Gaussians, at which the order
-/// counts as kept.
+/// Two frames are in the same order if the median difference between Gaussians at the same index is at most this
+/// fraction of that between unrelated Gaussians.
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
-/// Minimum number of Gaussians for the test. With fewer, the order counts as kept.
+/// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
-/// Difference that the rounding of exporters may cause (in sizes, and in units of cost). Smaller differences count as
-/// 0.
+/// Largest difference that may come from rounding by the program that wrote the frames. A distance is given in sizes of
+/// a Gaussian, another difference in units of A. Smaller differences count as 0.
 const NEGLIGIBLE: f64 = 1e-3;
 
-/// Median differences between Gaussians at the same index of two frames.
+/// Differences between the Gaussians of two frames at the same index, and between unrelated ones. All are medians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrderDifference {
-    /// Distance between Gaussians at the same index, in sizes.
+    /// Distance between the positions of Gaussians at the same index, in units of the smaller Gaussian's size.
     pub moved: f64,
-    /// Distance between unrelated Gaussians, in sizes: index i of the first frame and index i + N/2 of the second.
+    /// Distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the second), in
+    /// units of the smaller Gaussian's size.
     pub apart: f64,
-    /// Difference in size, shape, opacity and base color between Gaussians at the same index: A of the [module](super).
+    /// Difference in size, shape, opacity and base color between Gaussians at the same index: A of the [module
+    /// documentation](super).
     pub unlike: f64,
-    /// Difference A between unrelated Gaussians.
+    /// Difference A between unrelated Gaussians, paired as for `apart`.
     pub strangers: f64,
-    /// Whether the same index in both frames means the same Gaussian: distance and difference are both at most half of
-    /// those of unrelated Gaussians.
+    /// Whether equal indices in the two frames denote the same Gaussian: `moved` is at most half of `apart`, and
+    /// `unlike` is at most half of `strangers`.
     pub holds: bool,
 }
 
-/// Compares two frames of equally many Gaussians, index by index, at up to 4096 indices. Returns that the order holds
-/// if there are fewer than 16 Gaussians, or if Gaussians at the same index differ by no more than rounding does.
+/// Compares two frames with equally many Gaussians, index by index, at up to 4096 indices. The order always holds if
+/// there are fewer than 16 Gaussians, or if Gaussians at the same index differ by no more than rounding.
 pub fn identity(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let (before, after) = (ComparedAppearance::all_from_state(before), ComparedAppearance::all_from_state(after));
     let count = before.len().min(after.len());
@@ -46,13 +48,14 @@ pub fn identity(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     OrderDifference { moved, apart, unlike, strangers, holds }
 }
 
-/// Returns the distance between two Gaussians in units of the smaller size.
+/// Returns the distance between the positions of two Gaussians, divided by the smaller of their sizes.
 fn distance(a: &ComparedAppearance, b: &ComparedAppearance) -> f64 {
     let squared: f64 = (0..3).map(|c| f64::from(a.position[c] - b.position[c]).powi(2)).sum();
     squared.sqrt() / f64::from(a.size.min(b.size))
 }
 
-/// Returns the median, the upper one of an even number of values; 0 if there are none. NaN counts as the largest value.
+/// Returns the median of `values`: the upper one of the two middle values if their number is even, 0 if there are none.
+/// NaN counts as the largest value.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.map(|value| if value.is_nan() { f64::INFINITY } else { value }).collect();
     let middle = values.len() / 2;

@@ -1,5 +1,5 @@
-//! Joining of tracks that belong to one Gaussian: a track that ends where and when a similar one begins (rule 6 of the
-//! [module](super)).
+//! Joining of tracks that belong to one Gaussian: a track that ends, and a similar one that begins where and when it
+//! ends (rule 6 of the [module documentation](super)).
 
 use std::mem::size_of;
 
@@ -11,42 +11,43 @@ use super::linker::Linker;
 use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round};
 use crate::model::{AttributeValues, Gaussians};
 
-/// Parameters r and q of the two rules: `ALIKE` for tracks that may be one Gaussian, `CLOSE` for tracks that look the
-/// same.
+/// Join rules, with parameters r (distance) and q (appearance) of rule 6: `ALIKE` for tracks that may be one Gaussian;
+/// `CLOSE`, which is stricter, for tracks that look the same.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, includes_missing: true };
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true };
-/// Largest size ratio of joined tracks, √2, as a natural log. The grid finds no other sizes.
+/// Largest ratio of the sizes of joined tracks: √2, as a natural log. The grid finds no other sizes.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
-/// Maximum number of frames in which both tracks are present, less the frames in which only one is: one fades out while
-/// the other fades in.
+/// Largest number of frames in which two tracks may both be present and still be joined. Frames in which only one of
+/// them is present are subtracted. A Gaussian may fade out as one track while it fades in as the other.
 const MAX_SHARED_FRAMES: u8 = 4;
 
-/// Rules by which tracks are joined. Whatever satisfies the second rule also satisfies the first.
+/// Rules by which tracks are joined. Tracks that satisfy the second rule also satisfy the first.
 const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
-/// Observer of a [`Linker`] that finds tracks of one Gaussian, by the rule `ALIKE` and by the rule `CLOSE`.
+/// Finds the tracks that belong to one Gaussian, by the rule `ALIKE` and by the rule `CLOSE`. It is shown every frame
+/// after the [`Linker`] has linked it.
 pub struct Joiner([JoinedTracks; 2]);
 
-/// Tracks joined by one rule.
+/// Tracks that are joined by one of the two rules.
 struct JoinedTracks {
     rule: &'static Round,
-    /// Pairs that may still be joined, in the order of the later track, then of cost.
+    /// Pairs of tracks that may still be joined, in the order of the later track, then of cost.
     pairs: Vec<TrackPair>,
-    /// Earlier track that each track is joined to; `NONE` if there is none.
+    /// For each track the number of the earlier track that it is joined to; `NONE` if there is none.
     predecessor: Vec<u32>,
-    /// Whether a later track is joined to the end of each track.
+    /// For each track whether a later track has been joined to its end.
     has_successor: Vec<bool>,
 }
 
-/// A track and an earlier one that it may continue.
+/// Pair of a track and an earlier track that it may continue.
 #[derive(Debug, Clone, Copy)]
 struct TrackPair {
     track: u32,
     earlier: u32,
     cost: f32,
-    /// Number of frames in which both were present, less the later frames in which only one was.
+    /// Number of frames in which both tracks were present, less the later frames in which only one was; at least 0.
     shared_frames: u8,
-    /// Whether both satisfied the rule `CLOSE` in all of these frames.
+    /// Whether the two tracks satisfied the rule `CLOSE` in every frame in which both were present.
     are_close: bool,
     /// Whether the earlier track has ended.
     has_ended: bool,
@@ -60,14 +61,15 @@ impl Default for Joiner {
 }
 
 impl Joiner {
-    /// Bytes for each track so far, in lists that grow by being copied to twice their length, including the result.
+    /// Bytes of memory for each track begun so far, including the result. The lists grow by being copied to twice their
+    /// length.
     pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
-    /// Bytes for each open track.
+    /// Bytes of memory for each open track, that is, each track that may still continue.
     pub const BYTES_PER_OPEN_TRACK: usize = 2 * size_of::<ComparedAppearance>()
         + 6 * size_of::<u32>()
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
-    /// Adds the frame that `linker` has linked last.
+    /// Takes note of the frame that `linker` has linked last; to be called after every frame.
     pub fn see(&mut self, linker: &Linker) {
         let tracks = linker.open_tracks();
         let born = self.0[0].predecessor.len();
@@ -81,14 +83,15 @@ impl Joiner {
         self.add_pairs(old, new);
     }
 
-    /// Pairs the tracks that begin in this frame with earlier open tracks.
+    /// Pairs the tracks `new`, which begin in this frame, with similar ones among the earlier open tracks `old`.
     fn add_pairs(&mut self, old: &[OpenTrack], new: &[OpenTrack]) {
         if old.is_empty() || new.is_empty() {
             return;
         }
         let appearances: Vec<ComparedAppearance> =
             old.iter().map(|track| track.appearance.at(track.current_position())).collect();
-        // A succeeded track is not joined to tracks that begin later.
+        // A succeeded track (one that is missing although a Gaussian like it is in its place) is not joined to later
+        // tracks.
         let numbers: Vec<u32> = (0..old.len() as u32).filter(|&at| !old[at as usize].is_succeeded).collect();
         let grid = CellGrid::new(&appearances, &numbers, ALIKE.reach);
         let paired = new.par_iter().with_min_len(256).map(|track| {
@@ -111,7 +114,7 @@ impl Joiner {
         });
         let paired: Vec<(&OpenTrack, [Candidates; 2])> = paired.collect();
         for (track, candidates) in &paired {
-            // It does not matter which of two indistinguishable tracks continues if both are close.
+            // Which of two indistinguishable tracks continues does not matter if both are close.
             let is_in_doubt = track.is_in_doubt;
             for (joined, candidates) in self.0.iter_mut().zip(candidates) {
                 joined.pairs.extend(candidates.iter().filter_map(|candidate| {
@@ -126,16 +129,16 @@ impl Joiner {
         }
     }
 
-    /// Ends after the last frame. Returns for each of the two rules, `ALIKE` first, the number of the joined track of
-    /// every track, in the order of their beginnings, and the number of joined tracks.
+    /// Ends the joining; to be called after the last frame. Returns for each join rule (`ALIKE` first) the index of the
+    /// joined track of every track, in the order in which the tracks began, and the number of joined tracks.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
     }
 }
 
 impl JoinedTracks {
-    /// Updates the pairs by a frame: drops pairs that no longer satisfy the rule, and marks those whose earlier track
-    /// has ended.
+    /// Updates the pairs by a frame whose open tracks are `tracks`: removes pairs that no longer satisfy the rule, and
+    /// marks pairs whose earlier track has ended.
     fn update_pairs(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);
         let rule = self.rule;
@@ -156,15 +159,15 @@ impl JoinedTracks {
                 pair.are_close &= cost(&a.appearance, &b.appearance, &CLOSE) <= 1.0;
                 pair.shared_frames <= MAX_SHARED_FRAMES && cost(&a.appearance, &b.appearance, rule) <= 1.0
             }
-            // If a Gaussian reappears often, a track that fades out may be linked to the second track that fades in
-            // after it, so missing frames are counted back.
+            // If a Gaussian reappears often, a track that fades out may be joined to the second track that fades in
+            // after it. So frames in which one of the two tracks is missing reduce the count of shared frames.
             _ => {
                 pair.shared_frames = pair.shared_frames.saturating_sub(1);
                 true
             }
         });
-        // A track that began and ended while the other was open was a part of it. Pairs are in the order of cost, so
-        // the cheapest counts.
+        // A track that began and ended while the other was open was a part of the other. Pairs are in the order of
+        // cost, so the cheapest one decides.
         for pair in absorbed {
             if self.predecessor[pair.track as usize] == NONE {
                 self.predecessor[pair.track as usize] = pair.earlier;
@@ -174,8 +177,8 @@ impl JoinedTracks {
         self.pairs.retain(|pair| predecessor[pair.track as usize] == NONE);
     }
 
-    /// Joins each track to the earlier track of its cheapest pair, if that track has ended: in the order of cost, each
-    /// end and each beginning once.
+    /// Joins each track to the earlier track of its cheapest pair if that earlier track has ended. Goes through the
+    /// pairs in the order of cost; each track continues at most one other and is continued by at most one.
     fn join_ended(&mut self) {
         loop {
             let firsts = self.pairs.chunk_by(|a, b| a.track == b.track).map(|pairs| pairs[0]);
@@ -197,7 +200,7 @@ impl JoinedTracks {
         }
     }
 
-    /// Returns the number of the joined track of each track, and the number of joined tracks.
+    /// Returns for each track the index of its joined track, and the number of joined tracks.
     fn finish(mut self, linker: &Linker) -> (Vec<u32>, usize) {
         let open_tracks = linker.open_tracks();
         self.pairs.retain_mut(|pair| {
@@ -209,7 +212,7 @@ impl JoinedTracks {
         self.join_ended();
         let (mut joined, mut count) = (self.predecessor, 0);
         for track in 0..joined.len() {
-            // The earlier track of a pair has a smaller number, so its result is known.
+            // The earlier track of a pair has a smaller number, so its joined track is known.
             joined[track] = match joined[track] {
                 NONE => {
                     count += 1;
@@ -222,8 +225,8 @@ impl JoinedTracks {
     }
 }
 
-/// Returns the cost of joining two tracks, opacity excluded; infinite if one is more than √2 times as large as the
-/// other.
+/// Returns the cost of joining two tracks by `rule`, from the appearances of both; opacity does not count. Infinite if
+/// one is more than √2 times as large as the other.
 fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MAX_LN_SIZE_RATIO {
         return f32::INFINITY;
@@ -231,9 +234,9 @@ fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     a.distance_cost(b, rule.reach, rule.strictness)
 }
 
-/// Writes the blend of the Gaussians `rows` to row `rows[0]` of `state`: opacity 1 − Π(1 − αᵢ), and the mean of all
-/// other attributes weighted by αᵢ. Quaternions get the sign closest to that of the first row. Does nothing if the
-/// opacities sum to 0 or are not finite.
+/// Blends the Gaussians in the rows `rows` of `state` and writes the result to row `rows[0]`. The opacity becomes 1 −
+/// Π(1 − αᵢ); all other attributes become means weighted by the opacities αᵢ. Before averaging, quaternions get the
+/// sign closest to that of the first row. Does nothing if the opacities sum to 0 or are not finite.
 pub fn blend(state: &mut Gaussians, rows: &[usize]) {
     let first = rows[0];
     let alpha = |&i: &usize| 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
@@ -263,7 +266,8 @@ pub fn blend(state: &mut Gaussians, rows: &[usize]) {
     mean(&mut state.rotation, Some(&signs));
     mean(&mut state.log_scale, None);
     mean(&mut state.sh, None);
-    // Logit ln(α / (1 − α)) with 1 − α = Π(1 − αᵢ). The logs of 1 − αᵢ are exact even if opacities are nearly 1.
+    // Logit ln(α / (1 − α)) of the blended opacity α, where 1 − α = Π(1 − αᵢ). The logs of 1 − αᵢ are exact even if
+    // opacities are nearly 1.
     let clear: f64 = rows.iter().map(|&i| -softplus(f64::from(state.opacity_logit.plane(0)[i]))).sum();
     let logit = (-clear.exp_m1()).ln() - clear;
     state.opacity_logit.plane_mut(0)[first] = logit as f32;

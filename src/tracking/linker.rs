@@ -1,4 +1,4 @@
-//! Linking of frames in order: which Gaussian of a frame continues which track.
+//! Linking of frames in time order: finds which Gaussian of a frame continues which track.
 
 use std::mem::size_of;
 
@@ -11,59 +11,61 @@ use super::links::Links;
 use super::track::{Candidate, MAX_CANDIDATES, NONE, OpenTrack, ROUNDS};
 use crate::model::Gaussians;
 
-/// Maximum number of consecutive frames that a track may be missing from before it ends.
+/// Maximum number of consecutive frames in which a track may have no Gaussian before it ends.
 pub const GAP: u32 = 3;
-/// Parameters r and q of the [module](super) for a Gaussian that succeeds a missing track.
+/// Parameters r (distance) and q (appearance) of rule 3 of the [module documentation](super), by which a Gaussian
+/// succeeds a track: it looks like the missing track and is in its place.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
-/// Minimum number of Gaussians for the detection of cuts.
+/// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
 const MIN_FOR_CUT: usize = 16;
 
-/// Links frames that arrive in order.
+/// Links the Gaussians of successive frames into tracks. Takes the frames one by one in time order.
 #[derive(Default)]
 pub struct Linker {
-    /// Open tracks, in the order of their numbers.
+    /// Tracks that may still continue, in the order of their numbers.
     tracks: Vec<OpenTrack>,
     born: u32,
 }
 
-/// Result of linking a frame.
+/// Result of linking the Gaussians of one frame to tracks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FrameLinks {
-    /// Number of the track of every Gaussian.
+    /// For every Gaussian the number of the track that it continues or begins.
     pub tracks: Vec<u32>,
-    /// Number of Gaussians that continue a track as an exact repeat.
+    /// Number of Gaussians that continue a track and equal its last Gaussian bit by bit (exact repeats).
     pub repeated: usize,
-    /// Number of Gaussians that continue a track, exact repeats included.
+    /// Number of Gaussians that continue a track of earlier frames, exact repeats included.
     pub linked: usize,
-    /// Number of Gaussians whose link was dropped as doubtful. They begin new tracks.
+    /// Number of Gaussians whose link to a track was dropped because it was probably wrong. They begin new tracks.
     pub doubtful: usize,
-    /// Whether the previous frame shows something else (a cut), so that no track continues.
+    /// Whether this frame shows something else than the previous frame (a cut), so that no track continues.
     pub is_cut: bool,
 }
 
 impl Linker {
-    /// Bytes for each Gaussian of the frame that is linked, without the frame itself.
+    /// Bytes of memory for each Gaussian of the frame that is being linked, not counting the frame itself.
     pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<ComparedAppearance>() + 9 * size_of::<u32>();
-    /// Bytes for each open track, in a list that grows by being copied to twice its length.
+    /// Bytes of memory for each open track (track that may continue), in a list that grows by being copied to twice its
+    /// length.
     pub const BYTES_PER_TRACK: usize =
         2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + MAX_CANDIDATES * size_of::<Candidate>() + size_of::<f32>();
 
-    /// Returns the number of open tracks.
+    /// Returns the number of open tracks: tracks that may still continue.
     pub fn open_track_count(&self) -> usize {
         self.tracks.len()
     }
 
-    /// Returns the open tracks, in the order of their numbers.
+    /// Returns the tracks that may still continue, in the order of their numbers.
     pub(super) fn open_tracks(&self) -> &[OpenTrack] {
         &self.tracks
     }
 
-    /// Returns the number of tracks so far, including those that have ended.
+    /// Returns the number of tracks that have begun so far, including those that have ended.
     pub fn tracks(&self) -> u32 {
         self.born
     }
 
-    /// Links the next frame. The result does not depend on the number of threads.
+    /// Links the Gaussians of the next frame, `state`, to tracks. The result does not depend on the number of threads.
     pub fn link(&mut self, state: &Gaussians) -> FrameLinks {
         let appearances = ComparedAppearance::all_from_state(state);
         let mut links = Links {
@@ -90,8 +92,9 @@ impl Linker {
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Advances the open tracks by a frame and returns the track of every Gaussian. The Gaussians `in_doubt` begin
-    /// tracks whose link was doubtful.
+    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. Gaussians that are
+    /// not linked begin tracks; those in `in_doubt` lost a link that was probably wrong, and their tracks are marked
+    /// so.
     fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
@@ -119,8 +122,8 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the tracks that are missing for the first time although a Gaussian at their expected position looks like
-    /// them.
+    /// Returns the numbers of the tracks that are missing for the first time although a Gaussian at their expected
+    /// position looks like them.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

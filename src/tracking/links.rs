@@ -1,4 +1,4 @@
-//! Links between open tracks and the Gaussians of a frame.
+//! Links between open tracks (tracks that may continue) and the Gaussians of a frame.
 
 use rayon::prelude::*;
 
@@ -6,13 +6,13 @@ use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Maximum number of rounds in which tracks exchange their Gaussians.
+/// Maximum number of times that all tracks are tried for exchanges of their Gaussians.
 const MAX_EXCHANGES: usize = 4;
 
-/// Links between open tracks and the Gaussians of a frame.
+/// Links between the open tracks and the Gaussians of a frame, in both directions.
 pub(super) struct Links {
-    /// Gaussian of every track; `NONE` if the track is not linked. `track_of_gaussian` holds the track of every
-    /// Gaussian.
+    /// For every open track the Gaussian that continues it; `NONE` if there is none. `track_of_gaussian` holds the
+    /// inverse: for every Gaussian the track that it continues.
     pub(super) gaussian_of_track: Vec<u32>,
     pub(super) track_of_gaussian: Vec<u32>,
 }
@@ -26,7 +26,7 @@ impl Links {
         (self.gaussian_of_track[track as usize], self.track_of_gaussian[gaussian as usize]) = (gaussian, track);
     }
 
-    /// Removes the link of a track and returns its Gaussian.
+    /// Removes the link of the open track `track` and returns the Gaussian that it was linked to.
     pub(super) fn undo(&mut self, track: u32) -> u32 {
         let gaussian = std::mem::replace(&mut self.gaussian_of_track[track as usize], NONE);
         self.track_of_gaussian[gaussian as usize] = NONE;
@@ -37,7 +37,8 @@ impl Links {
         self.gaussian_of_track[track as usize] == NONE && self.track_of_gaussian[gaussian as usize] == NONE
     }
 
-    /// Links each track to the first free Gaussian that equals it bit by bit, in the order of tracks and Gaussians.
+    /// Links each track to the first Gaussian, among those not linked yet, that equals the track's last Gaussian bit by
+    /// bit. Goes through tracks and Gaussians in order.
     pub(super) fn add_repeats(&mut self, tracks: &[OpenTrack], appearances: &[ComparedAppearance]) {
         let buckets = (2 * appearances.len()).next_power_of_two();
         let bucket = |appearance: &ComparedAppearance| appearance.bits as usize & (buckets - 1);
@@ -51,7 +52,7 @@ impl Links {
             order[*to as usize] = gaussian as u32;
             *to += 1;
         }
-        // From here on, `next` holds the first Gaussian of each bucket that is not linked.
+        // From here on, `next` holds the first Gaussian of each hash bucket that is not linked.
         next.copy_from_slice(&starts);
         for (number, track) in tracks.iter().enumerate() {
             let bucket = bucket(&track.appearance);
@@ -68,8 +69,8 @@ impl Links {
         }
     }
 
-    /// Links the tracks and Gaussians that are still free by the costs of `round`. Returns the candidates of each track
-    /// that took part.
+    /// Links tracks and Gaussians that are not linked yet, by the costs and limits of `round`. Returns the tracks that
+    /// took part, each with its candidates (the Gaussians that could continue it).
     pub(super) fn add_round(
         &mut self,
         tracks: &[OpenTrack],
@@ -95,8 +96,8 @@ impl Links {
         candidates_by_track
     }
 
-    /// Exchanges the Gaussians of two tracks if that lowers their total cost, in the order of the tracks. Returns
-    /// whether any exchange was made.
+    /// Exchanges the Gaussians of two tracks if that lowers the total cost of their links. Goes through the tracks in
+    /// order. Returns whether any exchange was made.
     fn exchange(&mut self, candidates_by_track: &[(u32, Candidates)], cost: impl Fn(u32, u32) -> f32) -> bool {
         let mut any = false;
         for (track, candidates) in candidates_by_track {
@@ -117,7 +118,7 @@ impl Links {
         any
     }
 
-    /// Links candidates in the order of cost, then track, then Gaussian.
+    /// Links tracks to their candidates, cheapest first; ties in the order of track, then Gaussian.
     fn link_by_cost(&mut self, candidates_by_track: &[(u32, Candidates)]) {
         let mut best = vec![(f32::INFINITY, NONE); self.track_of_gaussian.len()];
         for (track, candidates) in candidates_by_track {
@@ -128,7 +129,8 @@ impl Links {
                 }
             }
         }
-        // Mutually best candidates come before all others of both, so they are linked without sorting.
+        // A track and a Gaussian that are each other's best candidate precede all other candidates of both, so they are
+        // linked without sorting.
         for (track, candidates) in candidates_by_track {
             if let Some(first) = candidates.iter().next().filter(|first| best[first.gaussian as usize].1 == *track) {
                 self.link(*track, first.gaussian);

@@ -1,9 +1,10 @@
 //! Correspondence of Gaussians between frames that do not share Gaussian ids.
 //!
-//! Input: frames in order, each with any number of Gaussians in any order. Output: the number of a *track* for every
-//! Gaussian. A track is one Gaussian followed through the frames. Memory: [`Linker::BYTES_PER_GAUSSIAN`] for every
-//! Gaussian of the frame that is linked, and [`Linker::BYTES_PER_TRACK`] for every open track, which is a track seen in
-//! this frame or within the last [`GAP`] frames before it. Time: linear in the number of Gaussians, wherever they lie.
+//! Input: frames in order, each with any number of Gaussians in any order. Output: for every Gaussian the number of a
+//! *track*, which is one Gaussian followed through the frames. Memory: [`Linker::BYTES_PER_GAUSSIAN`] for every
+//! Gaussian of the frame that is being linked, and [`Linker::BYTES_PER_TRACK`] for every open track. A track is open if
+//! it had a Gaussian in this frame or in one of the [`GAP`] frames before it. Time: linear in the number of Gaussians,
+//! wherever they lie.
 //!
 //! The appearance of a Gaussian is its position x, its size s (the root mean square of its three scales), its shape Ŝ
 //! (the covariance divided by its trace), its opacity α and its base color c. A track last seen n frames ago has the
@@ -20,11 +21,11 @@
 //!    track and each Gaussian once. (Linking those that are mutually best until none are left gives the same result.)
 //!    Then two tracks exchange their Gaussians if that lowers their total cost, in the order of the tracks and of their
 //!    candidates, in up to four rounds.
-//! 3. *Rounds.* The first round has r = ¼ and q = 4 and includes only tracks seen in the previous frame. The second has
-//!    r = 1 and q = 1, the third r = 4 and q = 4; both include all open tracks that are not linked yet. A track of the
-//!    previous frame is *succeeded* if it is missing although a Gaussian at its expected position looks like it: if
-//!    |x_b − p_a|² / (¼·min(s_a, s_b))² + A ≤ 1, where A excludes opacity. From then on it continues by rule 1 only,
-//!    and no track that begins later is joined to it (rule 6).
+//! 3. *Rounds.* The first round of linking has r = ¼ and q = 4 and includes only tracks with a Gaussian in the previous
+//!    frame. The second has r = 1 and q = 1, the third r = 4 and q = 4; both include all open tracks that are not
+//!    linked yet. A track of the previous frame is *succeeded* if it is missing although a Gaussian at its expected
+//!    position looks like it: if |x_b − p_a|² / (¼·min(s_a, s_b))² + A ≤ 1, where A excludes opacity. From then on it
+//!    continues by rule 1 only, and no track that begins later is joined to it (rule 6).
 //! 4. *Doubtful links.* The probability that a link is wrong is the larger of two estimates. *Rivals:* R⁵ / (1 + R⁵),
 //!    where R is the cost of the link and of a rival link, divided by their cost with the Gaussians exchanged. R is the
 //!    largest over all other candidates of the link's track and all other tracks with the link's Gaussian as a

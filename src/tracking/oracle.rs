@@ -1,26 +1,26 @@
-//! Slow, independent implementation of the rules of the [module](super) in f64, which compares every pair of track and
-//! Gaussian. Tests compare the linker and the joiner with it.
+//! Slow, independent implementation of the rules of the [module documentation](super) in f64. It compares every pair of
+//! track and Gaussian. Tests compare the linker and the joiner with it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::GAP;
 use crate::model::{Gaussians, SH_C0, opacity};
 
-/// Returns the root mean square of the scales of Gaussian `i`, scene units.
+/// Returns the size of Gaussian `i`: the root mean square of its three scales, scene units.
 pub(super) fn rms_size(state: &Gaussians, i: usize) -> f64 {
     let squares = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
     (squares.iter().sum::<f64>() / 3.0).sqrt()
 }
 
-/// Linker by the rules 1 to 4 of the [module](super), without cuts.
+/// Slow linker of frames by the rules 1 to 4 of the [module documentation](super), without detection of cuts.
 #[derive(Default)]
 pub(super) struct SlowLinker {
     tracks: Vec<SlowTrack>,
-    /// Number of tracks so far.
+    /// Number of tracks that have begun so far.
     pub(super) born: u32,
 }
 
-/// Track that may continue.
+/// Track that may still continue.
 struct SlowTrack {
     number: u32,
     frames_since_seen: f64,
@@ -29,7 +29,7 @@ struct SlowTrack {
     is_succeeded: bool,
 }
 
-/// Appearance of a Gaussian at one frame.
+/// Position and appearance of a Gaussian at one frame.
 #[derive(Clone)]
 pub(super) struct SeenGaussian {
     position: [f64; 3],
@@ -40,7 +40,7 @@ pub(super) struct SeenGaussian {
     bits: Vec<u32>,
 }
 
-/// Returns the appearance of Gaussian `i`.
+/// Returns the position and appearance of Gaussian `i` of a frame.
 pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     let [w, x, y, z] = {
         let q = state.rotation.row::<4>(i).map(f64::from);
@@ -71,7 +71,8 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     }
 }
 
-/// Returns the difference A of the [module](super) without its opacity term.
+/// Returns the difference in size, shape and color between two Gaussians (A of the [module documentation](super)
+/// without opacity).
 fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
     let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
@@ -79,14 +80,15 @@ fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     size * size + shape / 0.25f64.powi(2) + color / 0.1f64.powi(2)
 }
 
-/// Returns whether two Gaussians look the same except for opacity.
+/// Returns whether two Gaussians are near each other and look the same except for opacity.
 fn is_near_duplicate(a: &SeenGaussian, b: &SeenGaussian) -> bool {
     let distance: f64 = (0..3).map(|c| (b.position[c] - a.position[c]).powi(2)).sum();
     distance / (0.25 * a.size.min(b.size)).powi(2) + 4.0 * difference(a, b) <= 1.0
 }
 
 impl SlowTrack {
-    /// Returns the cost that a Gaussian continues the track.
+    /// Returns the cost of linking the track to the Gaussian `b` with the parameters `r` (distance) and `q`
+    /// (appearance).
     fn cost(&self, b: &SeenGaussian, r: f64, q: f64) -> f64 {
         let v = self.velocity.unwrap_or_default();
         let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -98,8 +100,8 @@ impl SlowTrack {
 }
 
 impl SlowLinker {
-    /// Returns the probability that its link is wrong for every track that a round has linked. `candidates` are all
-    /// (cost, track, Gaussian) of the round.
+    /// Returns, for every track that a round has linked, the probability that its link is wrong. `candidates` holds all
+    /// possible links of the round as (cost, track, Gaussian).
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
@@ -134,7 +136,7 @@ impl SlowLinker {
         linked.iter().map(probability).collect()
     }
 
-    /// Links the next frame and returns the track of every Gaussian.
+    /// Links the next frame and returns the number of the track of every Gaussian.
     pub(super) fn link(&mut self, state: &Gaussians) -> Vec<u32> {
         let all: Vec<SeenGaussian> = (0..state.len()).map(|i| seen(state, i)).collect();
         let mut gaussian_of: BTreeMap<usize, usize> = BTreeMap::new();
@@ -186,7 +188,7 @@ impl SlowLinker {
             };
             probabilities.extend(Self::probabilities(&candidates, &gaussian_of, &taken, cost, are_duplicates));
         }
-        // Drop links until at most one in two hundred is expected to be wrong.
+        // Drop the least certain links until at most one in two hundred is expected to be wrong.
         probabilities.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
         let mut expected_wrong: f64 = probabilities.iter().map(|(probability, _)| probability).sum();
         for (probability, a) in probabilities {
@@ -199,7 +201,7 @@ impl SlowLinker {
         self.extend_tracks(&all, &gaussian_of)
     }
 
-    /// Advances the open tracks by a frame and returns the track of every Gaussian.
+    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian.
     fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {
@@ -240,11 +242,11 @@ impl SlowLinker {
     }
 }
 
-/// Appearance of each track at the frames in which it was seen.
+/// For each track, its Gaussian at each frame in which it was seen.
 pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
 
-/// Returns the position of a track, observed or extrapolated, at a frame after its first, and the number of frames
-/// since it was seen.
+/// Returns the position of a track at a frame after its first, observed or extrapolated, and the number of frames since
+/// it was last seen.
 fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
     let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
     let mut velocity: Option<[f64; 3]> = None;
@@ -258,13 +260,13 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
     (std::array::from_fn(|c| at.position[c] + (frame - last) as f64 * v[c]), frame - last)
 }
 
-/// Pairs of tracks by the later track and the bits of the cost: the earlier track, the number of frames in which both
-/// were present, whether they are close, and whether the earlier track has ended.
+/// Pairs of tracks. Key: the later track and the bits of the pair's cost. Value: the earlier track, the number of
+/// frames in which both were present, whether the two are close, and whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks by rule 6 of the [module](super) with the parameters (r, q), and returns the joined track of every
-/// track. `in_doubt` are tracks that began because a link was doubtful; `succeeded` are pairs of a frame and a track
-/// that is succeeded in it.
+/// Joins tracks by rule 6 of the [module documentation](super) with the parameters (r, q), and returns for every track
+/// the number of its joined track. `in_doubt` are tracks that began because a link was probably wrong. `succeeded`
+/// holds (frame, track) for every track that is missing in the frame although a Gaussian like it is in its place.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,
@@ -342,7 +344,7 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Joins the later track of each cheapest pair to the earlier one if that has ended, until nothing changes.
+/// Joins the later track of each cheapest pair to the earlier track if that one has ended, until nothing changes.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

@@ -25,7 +25,8 @@ impl UniformNumbers {
     }
 }
 
-/// Returns Gaussians in a cube of side 1. About `crowd` of them lie within the largest scale of each.
+/// Returns `count` Gaussians in a cube of side 1, sized so that about `crowd` of them lie within the largest scale of
+/// each.
 fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;
@@ -39,8 +40,8 @@ fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     state
 }
 
-/// Returns the cloud `t` frames later. Each half of it moves on a circle, and all Gaussians jitter by `noise` of their
-/// size.
+/// Returns the Gaussians of `cloud` as they are `t` frames later. Each half of them moves on a circle, and every
+/// coordinate jitters by up to `noise` times the size of the Gaussian.
 fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = cloud.clone();
     for i in 0..cloud.len() {
@@ -53,7 +54,7 @@ fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut UniformNumbers) -
     state
 }
 
-/// Returns the Gaussians of `cloud` that `is_present` selects, in random order, and that order.
+/// Returns the Gaussians of `cloud` for which `is_present` holds, in random order, and their indices in `cloud`.
 fn shuffled_part(
     cloud: &Gaussians,
     random: &mut UniformNumbers,
@@ -82,7 +83,7 @@ fn tracks_equal_those_of_the_slow_linker() {
         let (mut linked, mut doubtful) = (0, 0);
         for t in 0..8 {
             let state = later(&cloud, t, 0.3, &mut random);
-            // Every Gaussian is missing in some frames of its own; a sixth do not move.
+            // Every Gaussian is missing in some frames, different ones for each; a sixth of the Gaussians do not move.
             let is_away = |i: u32| (t as u32 + i).is_multiple_of(7) || (t as u32 + i) % 11 < 2;
             let mut state = state;
             (0..250).step_by(6).for_each(|i| state.position.set_row(i, cloud.position.row::<3>(i)));
@@ -148,7 +149,7 @@ fn tracks_survive_a_gap_of_three_frames_but_not_four() {
         let mut linker = Linker::default();
         for t in 0..3 + away + 1 {
             let mut state = cloud.clone();
-            // Motion in a straight line by one size per frame: the Gaussian is only found at its expected position.
+            // Motion in a straight line by one size per frame: a Gaussian is only found at its expected position.
             let size = rms_size(&cloud, 0) as f32;
             let [x, y, z] = cloud.position.row::<3>(0);
             state.position.set_row(0, [x + t as f32 * size, y, z]);
@@ -246,7 +247,7 @@ fn kept_order_is_told_from_shuffled_order() {
     let (mixed, _) = shuffled_part(&next, &mut random, |_| true);
     let lost = identity(&cloud, &mixed);
     assert!(!lost.holds && lost.moved > 5.0, "{lost:?}");
-    // Each frame sorted by position on its own: near, but unrelated Gaussians.
+    // Each frame is sorted by position on its own, so equal indices denote near but unrelated Gaussians.
     let sorted = |state: &Gaussians| {
         let mut order: Vec<u32> = (0..5000).collect();
         order.sort_by(|&a, &b| state.position.plane(1)[a as usize].total_cmp(&state.position.plane(1)[b as usize]));
@@ -262,9 +263,9 @@ fn kept_order_is_told_from_shuffled_order() {
     assert!(identity(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).holds);
 }
 
-/// Returns frames of a cloud whose Gaussians are alive for `shortest` to `shortest` + 4 frames at a time and fade over
-/// `overlap` of them, with the index of each Gaussian. The colors vary by `tint` between these periods, and after one
-/// in seven of them there is a gap.
+/// Returns frames of `cloud`, with the index of each Gaussian. Gaussians are alive for `shortest` to `shortest` + 4
+/// frames at a time, and fade over `overlap` of them. Colors vary by `tint` between these periods. After one period in
+/// seven there is a gap.
 fn fading_frames(
     cloud: &Gaussians,
     frames: usize,
@@ -310,7 +311,7 @@ fn joined_tracks_equal_those_of_the_slow_joiner() {
         [(21, 6, 2, 0.05), (22, 6, 0, 0.8), (23, 6, 3, 0.5), (24, 6, 5, 0.05), (25, 4, 2, 0.05)]
     {
         let mut random = UniformNumbers(seed * 1_000_000);
-        // Sparse, because the grid does not visit all Gaussians of a crowded cell.
+        // Sparse, because the grid does not visit all Gaussians of a crowded cell, as the slow implementation does.
         let cloud = cloud(120, 0.03, &mut random);
         let frames = fading_frames(&cloud, 24, shortest, overlap, tint, &mut random);
         let (mut linker, mut joiner) = (Linker::default(), Joiner::default());

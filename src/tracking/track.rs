@@ -1,47 +1,50 @@
-//! An open track, and the Gaussians that may continue it.
+//! An open track (one that may continue), and the Gaussians of the next frame that may continue it.
 
 use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 
-/// Maximum number of candidates of a track.
+/// Maximum number of Gaussians that are considered as the continuation of a track.
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Largest term that speed adds to the unit of distance of a track, in sizes.
+/// Largest amount by which speed lengthens a track's unit of distance, in sizes of its Gaussian.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// Rounds of linking. Each round links what the previous ones left free.
+/// Rounds of linking, in order. Each round links only tracks and Gaussians that the previous rounds left without a
+/// link.
 pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 0.25, strictness: 4.0, includes_missing: false },
     Round { reach: 1.0, strictness: 1.0, includes_missing: true },
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round: `reach` is r and `strictness` is q of the [module](super). `includes_missing` states whether
-/// tracks that were missing in the previous frame take part.
+/// Parameters of a round of linking: `reach` is r (distance) and `strictness` is q (appearance) of the cost in the
+/// [module documentation](super). `includes_missing` states whether tracks without a Gaussian in the previous frame
+/// take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
     pub(super) includes_missing: bool,
 }
 
-/// Track that may continue.
+/// Track that may still continue: it had a Gaussian in the last frame or in one of the [`GAP`](super::GAP) frames
+/// before.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
-    /// Number of frames since the track was seen: 1 if it was seen in the previous frame.
+    /// Number of frames from the track's last Gaussian to the next frame: 1 if it had a Gaussian in the previous frame.
     pub(super) frames_since_seen: u32,
-    /// Velocity, scene units per frame; `None` before the first step.
+    /// Velocity, scene units per frame; `None` until the track has a second Gaussian.
     pub(super) velocity: Option<[f32; 3]>,
     pub(super) appearance: ComparedAppearance,
-    /// Whether the track began because the link of its first Gaussian was doubtful.
+    /// Whether the track began with a Gaussian whose link to another track was dropped as probably wrong.
     pub(super) is_in_doubt: bool,
-    /// Whether a Gaussian that looks like the track was at its expected position when it was first missing. The track
-    /// then continues only with an exact repeat.
+    /// Whether, when the track was missing for the first time, a Gaussian at its expected position looked like it. The
+    /// track then continues only with a Gaussian that equals its last one bit by bit.
     pub(super) is_succeeded: bool,
 }
 
-/// Gaussian that may continue a track, and the cost of that link.
+/// Gaussian that may continue a track, and the cost of linking the two.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) struct Candidate {
     pub(super) cost: f32,
@@ -49,25 +52,26 @@ pub(super) struct Candidate {
 }
 
 impl OpenTrack {
-    /// Creates a track that begins with a Gaussian.
+    /// Creates the track `number`, which begins with a Gaussian of this appearance.
     pub(super) fn new(number: u32, appearance: ComparedAppearance) -> OpenTrack {
         OpenTrack { number, frames_since_seen: 1, velocity: None, appearance, is_in_doubt: false, is_succeeded: false }
     }
 
-    /// Returns the expected position in the next frame.
+    /// Returns the position where the track's Gaussian is expected in the next frame, scene units.
     pub(super) fn expected_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
         std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
     }
 
-    /// Returns u of the [module](super), the unit of distance.
+    /// Returns the unit of distance of link costs, scene units: the Gaussian's size plus an amount that grows with its
+    /// speed (u in the [module documentation](super)).
     fn distance_unit(&self) -> f32 {
         let speed = self.velocity.unwrap_or_default().iter().map(|v| v * v).sum::<f32>().sqrt();
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost that a Gaussian with this appearance continues the track. A link is impossible above 1; if the
-    /// distance alone costs more than 1, only that cost is returned.
+    /// Returns the cost of linking the track to a Gaussian of this appearance; above 1 a link is impossible. If the
+    /// distance term alone exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
@@ -75,17 +79,18 @@ impl OpenTrack {
     fn cost_at(&self, appearance: &ComparedAppearance, expected: [f32; 3], distance_unit: f32, strictness: f32) -> f32 {
         let squared_distance: f32 = (0..3).map(|c| (appearance.position[c] - expected[c]).powi(2)).sum();
         let distance = squared_distance / (distance_unit * distance_unit);
-        // Most Gaussians in the visited cells are too far away, so their difference is not computed.
+        // Most Gaussians in the visited cells are too far away; their difference in appearance is not computed.
         if distance > 1.0 { distance } else { distance + strictness * self.appearance.difference(appearance) }
     }
 
-    /// Returns the position, observed or extrapolated, in the frame that was linked last.
+    /// Returns the position of the track's Gaussian in the frame that was linked last: observed, or extrapolated if it
+    /// was missing there.
     pub(super) fn current_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
         std::array::from_fn(|c| self.appearance.position[c] + (self.frames_since_seen - 1) as f32 * velocity[c])
     }
 
-    /// Continues the track with a Gaussian of the next frame, and updates the velocity.
+    /// Continues the track with a Gaussian of the next frame, and updates the track's velocity.
     pub(super) fn extend(&mut self, appearance: ComparedAppearance) {
         let step: [f32; 3] = std::array::from_fn(|c| {
             (appearance.position[c] - self.appearance.position[c]) / self.frames_since_seen as f32
@@ -97,7 +102,7 @@ impl OpenTrack {
         (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// Returns the Gaussians that may continue the track.
+    /// Returns the Gaussians in `grid` that may continue the track in this round.
     pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
         let mut candidates = Candidates::default();
         let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());
@@ -108,7 +113,7 @@ impl OpenTrack {
     }
 }
 
-/// Candidates of least cost of a track, in the order of cost.
+/// The Gaussians that may continue a track at the least cost, in the order of cost.
 pub(super) struct Candidates {
     best: [Candidate; MAX_CANDIDATES],
 }
@@ -120,7 +125,7 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds a Gaussian if its cost is at most 1.
+    /// Adds a Gaussian if its cost is at most 1 and is among the least so far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

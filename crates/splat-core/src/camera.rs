@@ -22,18 +22,18 @@ pub struct Camera {
     pub rotation: DMat3,
     /// Translation from world to camera: `x_camera = rotation · x_world + translation`.
     pub translation: DVec3,
-    /// View depth in scene units; Gaussians at this depth or nearer are not drawn.
+    /// Depth of the near plane in scene units; Gaussians whose center has this depth or less are not drawn.
     pub near: f64,
 }
 
 impl Camera {
-    /// Value of [`Camera::near`] in the original CUDA rasterizer, with which models are trained.
+    /// Depth of the near plane ([`Camera::near`]) in the original CUDA rasterizer, with which models are trained.
     pub const NEAR: f64 = 0.2;
 
-    /// Creates a camera at `eye` that has `target` in its image center, world z pointing up and square pixels.
+    /// Creates a camera at `eye` that looks at `target`. World z points up in the image, and pixels are square.
     ///
-    /// `horizontal_fov` is the horizontal field of view in radians; the size is (width, height) in pixels. The rotation
-    /// is NaN if the two points are equal or lie on one vertical line.
+    /// `horizontal_fov` is the horizontal field of view in radians; the last argument is the image size in pixels. The
+    /// rotation is NaN if `eye` and `target` are equal or lie on one vertical line.
     pub fn look_at(eye: DVec3, target: DVec3, horizontal_fov: f64, (width, height): (u32, u32)) -> Camera {
         let forward = (target - eye).normalize();
         let right = forward.cross(DVec3::Z).normalize();
@@ -53,7 +53,7 @@ impl Camera {
         }
     }
 
-    /// Returns the position of the camera in the world, scene units.
+    /// Returns the position of the camera in world coordinates, scene units.
     pub fn center(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
     }

@@ -1,29 +1,30 @@
 //! Scales and rotation of a covariance matrix that is not given by scales and a rotation.
 //!
-//! Some model formats define Σ by a formula other than R S Sᵀ Rᵀ of stored values: with a quaternion that is not of
-//! unit length, or as a slice through a four-dimensional Gaussian. Renderers and statistics need scales and a rotation.
+//! Some model formats define a covariance Σ by a formula other than R S Sᵀ Rᵀ of stored scales S and rotation R: with a
+//! quaternion that is not of unit length, or as a slice through a four-dimensional Gaussian. Renderers and statistics
+//! need scales and a rotation.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Smallest eigenvalue, squared scene units: that of a scale of 1e-7.
+/// Smallest eigenvalue of a covariance, in squared scene units. It corresponds to a scale of 1e-7 scene units.
 const MIN_EIGENVALUE: f64 = 1e-14;
-/// Maximum number of sweeps over the three off-diagonal entries. Convergence is quadratic; 6 to 8 sweeps suffice from
-/// any start.
+/// Maximum number of Jacobi sweeps, each of which rotates away the three off-diagonal entries of a matrix once.
+/// Convergence is quadratic; 6 to 8 sweeps suffice from any start.
 const MAX_SWEEPS: usize = 12;
 
-/// Computes scales s and a unit quaternion (wxyz) of R with Σ = R diag(s)² Rᵀ. `sigma` holds xx xy xz yy yz zz of Σ,
-/// squared scene units.
+/// Computes the scales s and the unit quaternion (wxyz) of a rotation R with Σ = R diag(s)² Rᵀ. `sigma` holds the
+/// entries xx, xy, xz, yy, yz, zz of the covariance Σ in squared scene units; the scales are in scene units.
 ///
-/// The order and directions of the axes follow the quaternion `like` (wxyz, of any length; 0 counts as the identity).
-/// Of the six orders of the axes, the one closest to the axes of `like` is taken. Each axis points in the direction of
-/// its counterpart, except that the axis furthest from its counterpart is reversed if the axes would form a reflection
-/// otherwise. The sign of the result follows the sign of `like`. If eigenvalues coincide, any axes are valid, and the
-/// axes of `like` are taken if they are valid. The result depends on nothing else, so a Gaussian has one state at each
-/// time.
+/// Order and directions of the axes of R are chosen close to the axes of the quaternion `like` (wxyz, of any length; 0
+/// counts as the identity). Of the six orders of the axes, the one closest to the axes of `like` is taken. Each axis
+/// points in the direction of the corresponding axis of `like`. If the three axes would then form a reflection, the one
+/// furthest from the corresponding axis is reversed. Of the two quaternions of R, the one nearer to `like` is returned.
+/// If eigenvalues coincide, the axes are not unique, and those of `like` are taken if they are valid. The result
+/// depends on `sigma` and `like` only, so a Gaussian has one scale and rotation at each time.
 ///
 /// Method: Jacobi iteration in f64, started at the axes of `like`. The result reproduces Σ to about 1e-15 of its
-/// largest entry. Eigenvalues are at least 1e-14, also those that rounding made negative. An entry that is not finite
-/// gives NaN scales and the rotation `like`.
+/// largest entry. Eigenvalues below 1e-14, such as those that rounding made negative, are raised to 1e-14. An entry of
+/// `sigma` that is not finite gives NaN scales and the rotation `like`.
 pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     let [xx, xy, xz, yy, yz, zz] = sigma;
     let like = DQuat::from_xyzw(like[1], like[2], like[3], like[0]);
@@ -38,7 +39,7 @@ pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     let entries = [0, 1, 2].map(|i| [0, 1, 2].map(|j| entry(i, j)));
     let (values, axes) = eigen(entries);
 
-    // Component i of axis j is its scalar product with axis i of `like`.
+    // Component i of an axis in `axes` is the scalar product of this axis and axis i of `like`.
     let mut best = ([0, 1, 2], f64::NEG_INFINITY);
     for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
         let closeness: f64 = (0..3).map(|i| axes[order[i]][i].abs()).sum();
@@ -57,7 +58,7 @@ pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     (best.0.map(|axis| values[axis].max(MIN_EIGENVALUE).sqrt()), [rotation.w, rotation.x, rotation.y, rotation.z])
 }
 
-/// Computes the eigenvalues and unit eigenvectors of a symmetric matrix by Jacobi iteration.
+/// Computes the eigenvalues and unit eigenvectors of the symmetric matrix `a` by Jacobi iteration.
 fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let scale = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
@@ -96,7 +97,8 @@ mod tests {
         prop::array::uniform4(-2.0..2.0f64).prop_filter("direction", |q| q.iter().map(|x| x * x).sum::<f64>() > 0.05)
     }
 
-    /// Returns R diag(s)² Rᵀ of a quaternion of any length, with the formula of unit quaternions after normalization.
+    /// Returns the covariance R diag(s)² Rᵀ (xx, xy, xz, yy, yz, zz) of scales s and a quaternion `q` of any length.
+    /// Independent of the tested code: normalizes `q` and applies the formula of unit quaternions.
     fn sigma(scales: [f64; 3], q: [f64; 4]) -> [f64; 6] {
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         let [w, x, y, z] = q.map(|c| c / length);
@@ -109,7 +111,7 @@ mod tests {
         [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
     }
 
-    /// Returns the largest difference of the entries, relative to the largest expected entry.
+    /// Returns the largest difference between entries of `got` and `expected`, divided by the largest expected entry.
     fn relative_error(got: [f64; 6], expected: [f64; 6]) -> f64 {
         let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
         got.iter().zip(expected).fold(0.0f64, |largest, (a, b)| largest.max((a - b).abs())) / most
@@ -133,7 +135,7 @@ mod tests {
             q in quaternion(), turn in prop::array::uniform3(-0.1..0.1f64), logs in prop::array::uniform3(-3.0..1.0f64)
         ) {
             prop_assume!((0..3).all(|i| (logs[i] - logs[(i + 1) % 3]).abs() > 1e-3));
-            // The two rotations differ by less than a twelfth of a turn.
+            // The rotations `near` and `q` differ by less than a twelfth of a full turn.
             let [w, x, y, z] = q;
             let product = |[a, b, c, d]: [f64; 4]| [
                 w * a - x * b - y * c - z * d,
@@ -161,7 +163,7 @@ mod tests {
     #[test]
     fn flat_and_tiny_covariances_have_small_finite_scales() {
         let like = [1.0, 0.0, 0.0, 0.0];
-        // Rank 1; rounding may make the other two eigenvalues negative.
+        // This covariance has rank 1; rounding may make two of its eigenvalues slightly negative.
         let v = [0.1f64, 0.7, -0.3];
         let (scales, rotation) =
             scale_rotation([v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]], like);

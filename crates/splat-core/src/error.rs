@@ -1,4 +1,4 @@
-//! Errors, and the exit code of each kind of error.
+//! Errors of the library, and the exit code of the command for each kind of error.
 
 use std::fmt;
 use std::io;
@@ -15,7 +15,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 ///
 /// | exit code | kind | meaning |
 /// |---|---|---|
-/// | 0 | – | Success. Also: the requested part of the work is done. |
+/// | 0 | – | Success, or the requested shard (part) of the work is finished. |
 /// | 1 | [`Input`](ErrorKind::Input) | An input file is missing, malformed, or larger than allowed. |
 /// | 1 | [`Output`](ErrorKind::Output) | The result or a temporary file cannot be written. |
 /// | 1 | [`Internal`](ErrorKind::Internal) | A bug in splatsieve, or the self-check failed. |
@@ -26,40 +26,41 @@ pub type Result<T> = std::result::Result<T, Error>;
 /// A panic is also a bug; the Rust runtime ends it with exit code 101.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Malformed content of a file. The user repairs or replaces the file.
+    /// A file has malformed content. The user should repair or replace the file.
     #[error("{0}")]
     Input(Box<InputError>),
-    /// Failed system call. The user checks the path, the permissions and the free space.
+    /// A system call failed. The user should check the path, the permissions and the free disk space.
     #[error("cannot {action} {path}: {source}{advice}", path = path.shown(), advice = advice(source))]
     Io {
-        /// Attempted operation, as a verb: "open", "create", "rename".
+        /// Attempted operation, as a verb for the message: "open", "create", "rename".
         action: &'static str,
-        /// File that the operation was applied to.
+        /// File or folder that the operation was applied to.
         path: PathBuf,
         /// Error of the operating system.
         source: io::Error,
     },
-    /// Invalid request. The user changes the arguments or the recipe.
+    /// The request is invalid. The user should change the arguments or the recipe.
     #[error("{0}")]
     Usage(String),
-    /// Request that needs more memory than allowed. The user raises the limit.
+    /// The request needs more memory than the limit (`--memory`) allows. The user should raise the limit.
     #[error("{0}")]
     MemoryLimit(String),
-    /// Early end of a run that was asked for one shard of the work and has finished it. Stages return it to their
-    /// callers. The public entry points of the library turn it into a success, so callers of the library never see it.
+    /// The run was asked for one shard (one of n equal parts) of a stage, and this shard is finished, so the run ends
+    /// early. Stages return this value to their callers; the public entry points of the library turn it into a success,
+    /// so callers of the library never see it.
     #[error("{0}")]
     ShardDone(String),
-    /// Inconsistent state inside the program, whatever the request and the input: a bug.
+    /// The program reached an inconsistent state, which no request or input should cause: a bug.
     #[error(
         "internal error: {0}\n  this is a bug in splatsieve: please report it with the command line and this message"
     )]
     Internal(String),
-    /// Results of the self-check that should agree but do not: a broken build or a broken machine.
+    /// Results of the self-check differ although they should agree: the program or the machine is defective.
     #[error(
         "selfcheck failed: {0}\n  do not trust results of this program on this machine, and report the table above"
     )]
     Unsound(String),
-    /// Malformed `gseq` container, or failed access to it.
+    /// A `gseq` container (the file format for sequences of Gaussians) is malformed, or cannot be read or written.
     #[error(transparent)]
     Container(#[from] gseq::Error),
 }
@@ -73,7 +74,7 @@ pub enum ErrorKind {
     Input,
     /// The result or a temporary file cannot be written.
     Output,
-    /// The request needs more memory than allowed.
+    /// The request needs more memory than the limit (`--memory`) allows.
     MemoryLimit,
     /// A signal ended the run. No [`Error`] has this kind, because the signal handler ends the process.
     Interrupted {
@@ -94,28 +95,30 @@ impl ErrorKind {
         }
     }
 
-    /// Returns the kind of a failed system call from its `action`.
+    /// Returns the kind of failure of a failed system call: an input or an output error, depending on the verb with
+    /// which `action` begins.
     fn from_action(action: &str) -> ErrorKind {
         const READING: [&str; 7] = ["open", "read", "list", "find", "map", "examine", "decompress"];
         let verb = action.split(' ').next().unwrap_or_default();
-        // Only files that this run wrote are read back, so that a failure concerns an output.
+        // The action "read back" concerns files that this run wrote, so its failure is an output error.
         let is_reading = READING.contains(&verb) && !action.starts_with("read back");
         if is_reading { ErrorKind::Input } else { ErrorKind::Output }
     }
 }
 
-/// Description of a malformed input: file, place in the file, expectation, finding, and advice.
+/// Description of a malformed input file: where the file is malformed, what was expected and found there, and advice
+/// for the user.
 #[derive(Debug)]
 pub struct InputError {
     /// File or folder that was read.
     pub path: PathBuf,
-    /// Place in the file: "byte 1234", "element vertex", "frame 12, Gaussian 7". May be empty.
+    /// Place of the malformed content in the file, such as "byte 1234" or "frame 12, Gaussian 7". May be empty.
     pub place: String,
     /// Content that a valid file has at this place.
     pub expected: String,
     /// Content that this file has at this place.
     pub found: String,
-    /// Advice on the next step. May be empty.
+    /// Advice to the user on the next step. May be empty.
     pub hint: String,
 }
 
@@ -133,7 +136,8 @@ impl fmt::Display for InputError {
     }
 }
 
-/// Returns a line of advice for the user if the disk or the quota is full, otherwise an empty text.
+/// Returns advice for the user, as a line to append to the message, if `source` says that the disk or the quota is
+/// full. Returns an empty text for other errors.
 fn advice(source: &io::Error) -> &'static str {
     match source.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
@@ -144,7 +148,7 @@ fn advice(source: &io::Error) -> &'static str {
 }
 
 impl Error {
-    /// Returns the error of a malformed input file. See [`InputError`].
+    /// Creates the error of a malformed input file. The arguments are the fields of [`InputError`].
     pub fn input(path: &Path, place: impl Into<String>, expected: impl Into<String>, found: impl Into<String>) -> Self {
         Error::Input(Box::new(InputError {
             path: path.to_owned(),
@@ -155,7 +159,7 @@ impl Error {
         }))
     }
 
-    /// Adds advice on the next step to an input error. Other errors stay unchanged.
+    /// Adds advice for the user on the next step to an [`Error::Input`]. Leaves other errors unchanged.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         if let Error::Input(input) = &mut self {
             input.hint = hint.into();
@@ -163,24 +167,24 @@ impl Error {
         self
     }
 
-    /// Returns a function that makes an [`Error::Io`] of a failed system call on `path`. Use as
+    /// Returns a function that converts the error of a failed system call on `path` to an [`Error::Io`]. Use it as
     /// `.map_err(Error::io("open", path))`.
     pub fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Error::Io { action, path, source }
     }
 
-    /// Returns the error of an invalid request.
+    /// Creates the error of an invalid request.
     pub fn usage(message: impl Into<String>) -> Self {
         Error::Usage(message.into())
     }
 
-    /// Returns the error of an inconsistent state inside the program.
+    /// Creates the error of an inconsistent state inside the program, which is a bug.
     pub fn internal(message: impl Into<String>) -> Self {
         Error::Internal(message.into())
     }
 
-    /// Returns the kind of this failure.
+    /// Returns the kind of this failure, which decides the exit code of the command.
     pub fn kind(&self) -> ErrorKind {
         match self {
             Error::Usage(_) => ErrorKind::Usage,

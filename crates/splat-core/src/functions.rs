@@ -1,16 +1,17 @@
-//! Exponentials and logarithms as polynomials.
+//! Exponential and logarithm functions, computed with polynomials.
 //!
-//! Loops over planes that call these functions are vectorized by the compiler. Results have the same bits with every
-//! system's math library, because no operation is fused. Source: Taylor series after the range reduction of Cody and
-//! Waite, "Software Manual for the Elementary Functions", 1980.
+//! The compiler vectorizes loops over arrays that call these functions. Results have the same bits on every system,
+//! because the functions neither call the math library of the system nor fuse operations. Source: Taylor series after
+//! the range reduction of Cody and Waite, "Software Manual for the Elementary Functions", 1980.
 
 use std::f64::consts::{FRAC_1_SQRT_2, LOG2_E};
 
-/// Rounding constant 1.5 · 2⁵²: a sum with it holds the rounded integer in its low bits.
+/// Rounding constant 1.5 · 2⁵². Adding it to a number rounds the number to an integer, which the low bits of the sum
+/// then hold.
 const ROUND: f64 = 6_755_399_441_055_744.0;
-/// Upper part of ln 2, with trailing zeros so that its products with n are exact.
+/// Upper digits of ln 2. The constant ends in zero bits, so that its product with an integer n is exact.
 const LN_2_HIGH: f64 = 0.693_147_180_369_123_8;
-/// Lower part of ln 2.
+/// Lower digits of ln 2: ln 2 minus `LN_2_HIGH`.
 const LN_2_LOW: f64 = 1.908_214_929_270_587_7e-10;
 
 /// Computes eˣ for |x| ≤ 700 with a relative error of at most 1e-15.
@@ -28,7 +29,7 @@ pub fn exp_m1(x: f64) -> f64 {
     power * (expm1_over_r(r) * r) + (power - 1.0)
 }
 
-/// Splits x = n·ln 2 + r with |r| ≤ ½·ln 2. Returns r, and a number whose low bits hold n.
+/// Splits x into n·ln 2 + r with |r| ≤ ½·ln 2 and an integer n. Returns r, and a number whose low bits hold n.
 #[inline(always)]
 fn reduce_range(x: f64) -> (f64, f64) {
     let rounded = x * LOG2_E + ROUND;
@@ -59,12 +60,12 @@ fn expm1_over_r(r: f64) -> f64 {
     sum
 }
 
-/// Computes ln x of a normal positive x with a relative error of at most 1e-15.
+/// Computes the natural logarithm of a normal positive x with a relative error of at most 1e-15.
 ///
 /// Returns about −709 for 0 and subnormal numbers, and x itself for ∞ and NaN.
 #[inline(always)]
 pub fn ln(x: f64) -> f64 {
-    /// 2⁵²: the low bits of this and of the following numbers hold an integer.
+    /// 2⁵². An f64 from 2⁵² to 2⁵³ holds the integer by which it exceeds 2⁵² in its low bits.
     const INTEGERS: f64 = 4_503_599_627_370_496.0;
     const BIAS: u64 = 1023;
     // x = 2ⁿ·m with m between √½ and √2.

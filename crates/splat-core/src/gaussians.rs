@@ -1,12 +1,12 @@
-//! Attributes of a block of Gaussians at one frame, as planes of f32.
+//! Attributes of Gaussians at one frame, stored as planes: one array of f32 for each component of an attribute.
 
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
 use super::sh_coefficients;
 
-/// Values of one attribute of `len` Gaussians: `width` planes, where plane `c` holds component `c` of every Gaussian.
-/// The plane layout keeps the inner loops of projection and statistics contiguous in memory.
+/// Values of one attribute (such as the position) of `len` Gaussians, stored as `width` planes. Plane `c` holds
+/// component `c` of every Gaussian, so that the inner loops of projection and statistics read memory contiguously.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct AttributeValues {
     width: usize,
@@ -15,15 +15,16 @@ pub struct AttributeValues {
 }
 
 impl AttributeValues {
-    /// Creates `width × len` zeros.
+    /// Creates an attribute of `width` components for `len` Gaussians. All values are 0.
     pub fn zeros(width: usize, len: usize) -> Self {
         AttributeValues { width, len, data: vec![0.0; width * len] }
     }
 
-    /// Creates an attribute from its planes, one after the other: `[width, len]`.
+    /// Creates an attribute of `width` components from `data`, which holds its planes one after the other (`[width,
+    /// len]`).
     ///
     /// # Panics
-    /// If the length of `data` is not a multiple of `width`.
+    /// Panics if the length of `data` is not a multiple of `width`.
     pub fn from_planes(width: usize, data: Vec<f32>) -> Self {
         assert!(data.len().is_multiple_of(width), "{} values are not {width} planes", data.len());
         AttributeValues { width, len: data.len() / width, data }
@@ -44,13 +45,13 @@ impl AttributeValues {
         self.len == 0
     }
 
-    /// Resizes to `len` Gaussians. The values are unspecified until written.
+    /// Changes the number of Gaussians to `len`. All values are unspecified until they are written.
     pub fn resize(&mut self, len: usize) {
         self.len = len;
         self.data.resize(self.width * len, 0.0);
     }
 
-    /// Keeps the first `width` components and drops the others.
+    /// Keeps the first `width` components of every Gaussian and drops the others.
     fn narrow(&mut self, width: usize) {
         self.width = width;
         self.data.truncate(width * self.len);
@@ -66,12 +67,12 @@ impl AttributeValues {
         &mut self.data[c * self.len..(c + 1) * self.len]
     }
 
-    /// Returns all planes, one after the other: `[width, len]`.
+    /// Returns all planes in one slice, one after the other: `[width, len]`.
     pub fn planes(&self) -> &[f32] {
         &self.data
     }
 
-    /// Returns all planes for writing: `[width, len]`.
+    /// Returns all planes for writing in one slice, one after the other: `[width, len]`.
     pub fn planes_mut(&mut self) -> &mut [f32] {
         &mut self.data
     }
@@ -81,13 +82,13 @@ impl AttributeValues {
         std::array::from_fn(|c| self.data[c * self.len + i])
     }
 
-    /// Returns the values of the Gaussians `rows`, in that order.
+    /// Returns the values of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> AttributeValues {
         let data = (0..self.width).flat_map(|c| rows.iter().map(move |&i| self.plane(c)[i as usize])).collect();
         AttributeValues { width: self.width, len: rows.len(), data }
     }
 
-    /// Writes the first `W` components of Gaussian `i`.
+    /// Sets the first `W` components of Gaussian `i` to `row`.
     pub fn set_row<const W: usize>(&mut self, i: usize, row: [f32; W]) {
         for (c, value) in row.into_iter().enumerate() {
             self.data[c * self.len + i] = value;
@@ -95,21 +96,21 @@ impl AttributeValues {
     }
 }
 
-/// Attributes of Gaussians at one frame in stored encoding: position, wxyz quaternion (not necessarily of unit length),
-/// natural logarithm of the scales, opacity logit, SH coefficients.
+/// Attributes of Gaussians at one frame, in the encoding of trained models: scales as logarithms, opacity as logit,
+/// color as spherical harmonics (SH).
 ///
-/// Plane `3·k + channel` of `sh` is coefficient `k` of a color channel (red, green, blue).
+/// Plane `3·k + channel` of `sh` holds SH coefficient `k` of a color channel (0 red, 1 green, 2 blue).
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Gaussians {
-    /// Position `[3]`, scene units.
+    /// Position: 3 planes, scene units.
     pub position: AttributeValues,
-    /// Rotation `[4]`: wxyz quaternion of any length.
+    /// Rotation: 4 planes, a quaternion in the order w, x, y, z, not necessarily of unit length.
     pub rotation: AttributeValues,
-    /// Natural logarithm of the scales `[3]`; scales are in scene units.
+    /// Natural logarithm of the scales: 3 planes. Scales are standard deviations in scene units.
     pub log_scale: AttributeValues,
-    /// Logit of the opacity `[1]`.
+    /// Logit of the opacity: 1 plane.
     pub opacity_logit: AttributeValues,
-    /// SH coefficients `[3·(degree + 1)²]`.
+    /// SH coefficients of the color: 3·(degree + 1)² planes.
     pub sh: AttributeValues,
 }
 
@@ -135,7 +136,7 @@ impl Gaussians {
         self.len() == 0
     }
 
-    /// Returns the SH degree.
+    /// Returns the degree of the SH coefficients.
     pub fn sh_degree(&self) -> usize {
         (self.sh.width() / 3).isqrt().saturating_sub(1)
     }
@@ -145,14 +146,14 @@ impl Gaussians {
         self.sh.narrow(3 * sh_coefficients(sh_degree.min(self.sh_degree())));
     }
 
-    /// Resizes to `len` Gaussians. The values are unspecified until written.
+    /// Changes the number of Gaussians to `len`. All values are unspecified until they are written.
     pub fn resize(&mut self, len: usize) {
         for column in Attributes::all().iter() {
             self.column_mut(column).resize(len);
         }
     }
 
-    /// Returns the Gaussians `rows`, in that order.
+    /// Returns the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> Gaussians {
         Gaussians {
             position: self.position.pick(rows),
@@ -163,11 +164,11 @@ impl Gaussians {
         }
     }
 
-    /// Copies the Gaussians of `block` to rows `first` and following. Ignores SH coefficients of `block` above this SH
-    /// degree.
+    /// Replaces the Gaussians from index `first` on by those of `block`. Ignores SH coefficients of `block` above the
+    /// SH degree of `self`.
     ///
     /// # Panics
-    /// If these rows do not exist.
+    /// Panics if `self` ends before the last Gaussian of `block` is copied.
     pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
         for column in Attributes::all().iter() {
             let (from, to) = (block.column(column), self.column_mut(column));
@@ -177,10 +178,10 @@ impl Gaussians {
         }
     }
 
-    /// Returns the values of a single attribute.
+    /// Returns the values of the single attribute `which`.
     ///
     /// # Panics
-    /// If `which` is not exactly one attribute.
+    /// Panics if `which` is not exactly one attribute.
     pub fn column(&self, which: Attributes) -> &AttributeValues {
         match which {
             Attributes::POSITION => &self.position,
@@ -199,10 +200,10 @@ impl Gaussians {
         Attributes::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
     }
 
-    /// Returns the values of a single attribute for writing.
+    /// Returns the values of the single attribute `which` for writing.
     ///
     /// # Panics
-    /// If `which` is not exactly one attribute.
+    /// Panics if `which` is not exactly one attribute.
     pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
             Attributes::POSITION => &mut self.position,
@@ -216,24 +217,25 @@ impl Gaussians {
 }
 
 bitflags! {
-    /// Set of attributes, in storage order from bit 0. Frame streams contain these bits.
+    /// Set of attributes. The bits are in storage order and are part of the frame stream format, so they must not
+    /// change.
     #[derive(Debug, Clone, Copy, PartialEq, Eq)]
     pub struct Attributes: u32 {
-        /// Position.
+        /// Position of the center.
         const POSITION = 1;
-        /// Rotation.
+        /// Rotation, as a quaternion.
         const ROTATION = 2;
-        /// Log scale.
+        /// Natural logarithm of the three scales.
         const LOG_SCALE = 4;
-        /// Opacity logit.
+        /// Logit of the opacity.
         const OPACITY = 8;
-        /// SH coefficients.
+        /// Spherical-harmonic (SH) coefficients of the color.
         const SH = 16;
     }
 }
 
 impl Attributes {
-    /// Returns the number of components per Gaussian, summed over the attributes of the set, for SH degree `sh_degree`.
+    /// Returns the number of components per Gaussian of all attributes in the set, for SH degree `sh_degree`.
     pub fn width(self, sh_degree: usize) -> usize {
         let components = |column: Attributes| match column {
             Attributes::OPACITY => 1,
@@ -244,7 +246,7 @@ impl Attributes {
         self.iter().map(components).sum()
     }
 
-    /// Returns the name of a single attribute in containers and messages.
+    /// Returns the name of a single attribute, as it appears in containers (files of frames) and messages.
     pub fn name(self) -> &'static str {
         match self {
             Attributes::POSITION => "position",

@@ -4,15 +4,16 @@ use std::ops::Range;
 
 use super::{AttributeValues, Attributes, Gaussians};
 
-/// Derivatives ∂L/∂value of the stored values of N Gaussians: f32 sums in the layout of [`Gaussians`].
+/// Derivatives ∂L/∂value of a loss L with respect to the stored values of N Gaussians, in the layout of [`Gaussians`].
+/// Each derivative is an f32 sum to which parts are added.
 ///
-/// The caller chooses the attributes that are differentiated. The SH degree may be lower than that of the Gaussians.
-/// Other values take neither memory nor time. Memory: 4 bytes per differentiated value.
+/// The caller chooses the attributes to differentiate; the SH degree may be lower than that of the Gaussians. The other
+/// values take neither memory nor time. Memory: 4 bytes per differentiated value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     len: usize,
     columns: Attributes,
-    /// Sums of the derivatives. Attributes that are not differentiated have no rows.
+    /// Derivatives. Attributes that are not differentiated have planes of length 0.
     sums: Gaussians,
 }
 
@@ -40,31 +41,32 @@ impl Gradients {
         self.columns
     }
 
-    /// Returns the sums of a single attribute. They have no rows if the attribute is not differentiated.
+    /// Returns the derivatives for the single attribute `which`. They are empty if the attribute is not differentiated.
     ///
     /// # Panics
-    /// If `which` is not exactly one attribute.
+    /// Panics if `which` is not exactly one attribute.
     pub fn column(&self, which: Attributes) -> &AttributeValues {
         self.sums.column(which)
     }
 
-    /// Returns the sums of a single attribute for writing.
+    /// Returns the derivatives for the single attribute `which` for writing.
     ///
     /// # Panics
-    /// If `which` is not exactly one attribute.
+    /// Panics if `which` is not exactly one attribute.
     pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         self.sums.column_mut(which)
     }
 
-    /// Sets every sum to 0.
+    /// Sets all derivatives to 0.
     pub fn clear(&mut self) {
         self.sums.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
     }
 
-    /// Copies the sums of Gaussian k of `source` to Gaussian `rows[k]`, for every k.
+    /// Copies the derivatives of Gaussian k of `source` to Gaussian `rows[k]`, for every k.
     ///
     /// # Panics
-    /// If `source` lacks an attribute, its number of Gaussians is not that of `rows`, or a row does not exist.
+    /// Panics if `source` lacks an attribute, if its number of Gaussians is not the length of `rows`, or if an index in
+    /// `rows` is out of range.
     pub fn set_rows(&mut self, rows: &[u32], source: &Gradients) {
         for column in self.columns.iter() {
             let (from, to) = (source.column(column), self.sums.column_mut(column));
@@ -76,17 +78,17 @@ impl Gradients {
         }
     }
 
-    /// Splits the sums into spans of `len` consecutive Gaussians, so that threads can add to them. The last span may be
-    /// shorter.
+    /// Splits the derivatives into spans of `len` consecutive Gaussians, to which different threads can add. The last
+    /// span may be shorter.
     ///
     /// # Panics
-    /// If `len` is 0.
+    /// Panics if `len` is 0.
     pub fn spans(&mut self, len: usize) -> Vec<GradientSpan<'_>> {
         let ids = (0..self.len).step_by(len).map(|first| first..self.len.min(first + len));
         let mut spans: Vec<GradientSpan<'_>> =
             ids.map(|ids| GradientSpan { ids, columns: self.columns, planes: Default::default() }).collect();
         for (index, column) in self.sums.columns_mut(Attributes::all()).enumerate() {
-            // An attribute without rows has no planes.
+            // An attribute that is not differentiated has no values, hence no chunks.
             for plane in column.planes_mut().chunks_exact_mut(self.len.max(1)) {
                 spans.iter_mut().zip(plane.chunks_mut(len)).for_each(|(span, part)| span.planes[index].push(part));
             }
@@ -95,12 +97,13 @@ impl Gradients {
     }
 }
 
-/// Mutable sums of some consecutive Gaussians.
+/// Derivatives of consecutive Gaussians, for one thread to add to.
 #[derive(Debug)]
 pub struct GradientSpan<'a> {
     ids: Range<usize>,
     columns: Attributes,
-    /// Planes of each attribute, in the order of [`Attributes::all`]. Attributes that are not differentiated have none.
+    /// Derivatives by attribute, in the order of [`Attributes::all`], with one plane per component. Attributes that are
+    /// not differentiated have no planes.
     planes: [Vec<&'a mut [f32]>; 5],
 }
 
@@ -115,19 +118,20 @@ impl<'a> GradientSpan<'a> {
         self.columns
     }
 
-    /// Returns the sums of a single attribute, one plane per component. Returns no planes if the attribute is not
-    /// differentiated.
+    /// Returns the derivatives for a single attribute, one plane per component. Returns no planes if the attribute is
+    /// not differentiated.
     pub fn planes(&mut self, column: Attributes) -> &mut [&'a mut [f32]] {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
-    /// Adds `parts` to the sums of one component of a single attribute, for Gaussian `first` and the following ones.
+    /// Adds `parts` to the derivatives for one component of a single attribute. The first part belongs to Gaussian
+    /// `first`, the next to the following Gaussian, and so on.
     ///
-    /// Does nothing if the attribute or component is not differentiated. Skips a part that is not finite or that would
-    /// make the f32 sum overflow. Ignores parts for Gaussians beyond the span.
+    /// Does nothing if the attribute or component is not differentiated. Skips a part that is not finite or whose
+    /// addition would overflow f32. Ignores parts for Gaussians beyond the span.
     ///
     /// # Panics
-    /// If `first` lies before the span, or beyond the index that follows its last Gaussian.
+    /// Panics if `first` lies before the span, or more than one index after its last Gaussian.
     #[inline(always)]
     pub fn add(&mut self, column: Attributes, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
         let start = first - self.ids.start;

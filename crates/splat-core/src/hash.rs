@@ -1,6 +1,8 @@
-//! Fixed hash of ids. Breaks ties without preferring a place in the file, and replaces random numbers.
+//! Fixed hash of Gaussian ids. It breaks ties without preferring a place in the file, and serves instead of random
+//! numbers.
 
-/// Returns the SplitMix64 finalizer (Steele, Lea and Flood 2014) of `id + 1` times the golden gamma.
+/// Returns a hash of `id`: the SplitMix64 finalizer (Steele, Lea and Flood 2014), applied to `id + 1` times the
+/// constant of that generator (the golden gamma).
 ///
 /// The hash is a bijection on u64, so two ids never tie. It is the same on every machine and in every version.
 pub fn hash_id(id: u64) -> u64 {

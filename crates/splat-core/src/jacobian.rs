@@ -1,13 +1,13 @@
-//! Derivative of a frame state with respect to the stored attributes.
+//! Derivative of the attributes at one frame (the frame state) with respect to the stored attributes.
 
 use super::{AttributeValues, Attributes, Gaussians, Gradients};
 
-/// Derivatives ∂state/∂stored of N Gaussians at one frame. The stored values of an attribute change only the state of
-/// the same attribute.
+/// Derivatives ∂state/∂stored of N Gaussians at one frame, where the state is the attributes at that frame. Each
+/// attribute of the state depends only on the stored values of the same attribute.
 ///
-/// An attribute of w components has one of three forms. Without planes, state and stored values change by the same
-/// amount. With one plane, each Gaussian has one factor for all components. With planes `[w, w]`, plane `i·w + j` is ∂
-/// state component i / ∂ stored component j.
+/// The derivative of an attribute of w components has one of three forms. Without planes, it is the identity: state and
+/// stored values change by the same amount. With one plane, each Gaussian has one factor for all components. With w²
+/// planes, plane `i·w + j` is ∂ state component i / ∂ stored component j.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Jacobian {
     columns: [AttributeValues; 5],
@@ -19,16 +19,17 @@ fn attribute_index(column: Attributes) -> usize {
 }
 
 impl Jacobian {
-    /// Maximum bytes per Gaussian: full matrices for position and rotation, one factor for each other attribute.
+    /// Maximum number of bytes per Gaussian: full matrices for position and rotation, one factor for each other
+    /// attribute.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
-    /// Returns the derivatives of a single attribute. The width is 0 if state and stored values change by the same
-    /// amount.
+    /// Returns the derivative of the single attribute `which`. It has no planes (width 0) if state and stored values
+    /// change by the same amount.
     pub fn column(&self, which: Attributes) -> &AttributeValues {
         &self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivatives of a single attribute for writing.
+    /// Returns the derivative of the single attribute `which` for writing.
     pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         &mut self.columns[attribute_index(which)]
     }
@@ -43,14 +44,15 @@ impl Jacobian {
         &mut self.columns
     }
 
-    /// Returns the derivatives of the Gaussians at `rows`, in that order.
+    /// Returns the derivatives of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> Jacobian {
         let picked =
             |column: &AttributeValues| if column.width() > 0 { column.pick(rows) } else { AttributeValues::default() };
         Jacobian { columns: self.columns.each_ref().map(picked) }
     }
 
-    /// Concatenates the derivatives of consecutive `blocks`, `len` Gaussians in total. All blocks have the same form.
+    /// Concatenates the derivatives of consecutive `blocks` of Gaussians, `len` Gaussians in total. In all blocks, each
+    /// attribute must have the same number of planes.
     pub fn joined(blocks: &[Jacobian], len: usize) -> Jacobian {
         let mut whole = Jacobian::default();
         for (index, to) in whole.columns.iter_mut().enumerate() {
@@ -71,10 +73,10 @@ impl Jacobian {
         whole
     }
 
-    /// Adds the first-order change of the state, ∂state/∂stored · `change`, to `state`.
+    /// Adds to `state` its first-order change if the stored values change by `change`: ∂state/∂stored · `change`.
     ///
-    /// Changes only attributes of which `change` has rows. If `change` has a lower SH degree than `state`, the higher
-    /// SH coefficients stay unchanged.
+    /// Skips attributes for which `change` is empty. If `change` has a lower SH degree than `state`, the higher SH
+    /// coefficients stay unchanged.
     pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {
         for which in Attributes::all().iter() {
             let (factors, delta, to) = (self.column(which), change.column(which), state.column_mut(which));
@@ -99,8 +101,8 @@ impl Jacobian {
         }
     }
 
-    /// Multiplies derivatives ∂L/∂state by this Jacobian in place, which gives ∂L/∂stored of the differentiated
-    /// attributes. Results that are not finite become 0.
+    /// Converts `gradients` in place from ∂L/∂state to ∂L/∂stored of a loss L, for the differentiated attributes, by
+    /// multiplication with this Jacobian. Results that are not finite become 0.
     pub fn pull_back(&self, gradients: &mut Gradients) {
         for which in gradients.columns().iter() {
             let (factors, gradient) = (self.column(which), gradients.column_mut(which));
@@ -132,7 +134,7 @@ impl Jacobian {
 mod tests {
     use super::*;
 
-    /// Fills a column with a low-discrepancy sequence in [−0.5, 0.5), which serves as noise.
+    /// Fills `column` with noise: a low-discrepancy sequence in [−0.5, 0.5) whose terms differ by `step` (modulo 1).
     fn fill_with_noise(column: &mut AttributeValues, step: f32) {
         column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract() - 0.5);
     }
@@ -143,8 +145,8 @@ mod tests {
         filled
     }
 
-    /// Returns a Jacobian with full matrices for position and rotation, a factor for opacity, and no planes for the
-    /// others.
+    /// Returns a Jacobian of `len` Gaussians: full matrices for position and rotation, one factor for opacity, and the
+    /// identity for the other attributes.
     fn jacobian(len: usize) -> Jacobian {
         let mut filled = Jacobian::default();
         for (which, width) in [(Attributes::POSITION, 9), (Attributes::ROTATION, 16), (Attributes::OPACITY, 1)] {

@@ -43,38 +43,39 @@ pub use robust_box::RobustBox;
 pub use rows::{Flags, Rows, Statistic, StatisticAccess};
 pub use schedule::{FrameView, ViewSchedule};
 
-/// Constant of the spherical-harmonic basis function of degree 0: color = 0.5 + SH_C0 · f_dc.
+/// Value of the spherical-harmonic (SH) basis function of degree 0. A color is 0.5 + SH_C0 · f_dc, where f_dc is its
+/// stored SH coefficient of degree 0.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// Returns the opacity in [0, 1] of a stored logit, in f64.
+/// Returns the opacity, in [0, 1], of a stored logit. Computed in f64.
 pub fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + (-f64::from(logit)).exp())
 }
 
-/// Returns the logit of an opacity, in f64.
+/// Returns the logit ln(o / (1 − o)) of an opacity o. Computed in f64.
 pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Returns the color, equal from all directions, of an SH coefficient of degree 0, in f64.
+/// Returns the value of one color channel from its SH coefficient of degree 0, which is equal from all directions.
 pub fn color(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }
 
-/// Returns the SH coefficient of degree 0 of a color.
+/// Returns the SH coefficient of degree 0 that gives one color channel the value `color`.
 pub fn harmonic(color: f64) -> f32 {
     ((color - 0.5) / SH_C0) as f32
 }
 
-/// Returns the number of SH coefficients per color channel up to degree `d`: (d + 1)².
+/// Returns the number of SH coefficients per color channel up to `degree`, which is (`degree` + 1)².
 pub const fn sh_coefficients(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
-/// Highest SH degree that renderers support.
+/// Highest supported degree of spherical harmonics (SH), the limit of common renderers.
 pub const MAX_SH_DEGREE: usize = 3;
 
-/// Value of an SH degree limit that keeps all coefficients.
+/// Value for a maximum SH degree that means "no limit": all SH coefficients are kept.
 pub const NO_SH_LIMIT: usize = usize::MAX;
 
 /// Properties of a sequence that are known before any frame is read.
@@ -91,10 +92,11 @@ pub struct SequenceInfo {
 }
 
 impl SequenceInfo {
-    /// Replaces the time stamps of the frames. `times` has one per frame.
+    /// Replaces the time stamps of the T frames by `times`.
     ///
     /// # Errors
-    /// The number of times is not T; times are not finite or not strictly increasing. The message names the frames.
+    /// Fails if `times` does not have T entries, or if times are not finite or not strictly increasing. The message
+    /// names the frames.
     pub fn with_times(self, times: Vec<f64>) -> Result<SequenceInfo> {
         if times.len() != self.times.len() {
             return Err(Error::usage(format!("{} times were given for {} frames", times.len(), self.times.len())));
@@ -102,10 +104,10 @@ impl SequenceInfo {
         self.at(times)
     }
 
-    /// Replaces the frames of the sequence by frames at `times`, of any number. The Gaussians stay.
+    /// Returns the same Gaussians with one frame at each of `times`, instead of the T frames so far.
     ///
     /// # Errors
-    /// Times are not finite or not strictly increasing. The message names the frames.
+    /// Fails if times are not finite or not strictly increasing. The message names the frames.
     pub fn at(self, times: Vec<f64>) -> Result<SequenceInfo> {
         if let Some(i) = times.iter().position(|time| !time.is_finite()) {
             return Err(Error::usage(format!("the time of frame {i} is {}: expected a finite number", times[i])));
@@ -121,7 +123,7 @@ impl SequenceInfo {
     }
 }
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

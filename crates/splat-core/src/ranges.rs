@@ -1,10 +1,10 @@
-//! Lists of increasing numbers as text.
+//! Formats lists of increasing numbers as text such as `1-5` and `8`.
 
 use std::fmt::Display;
 
 use num_traits::PrimInt;
 
-/// Returns increasing numbers as texts of consecutive runs, such as `3` and `10-20`.
+/// Formats increasing `numbers` as one text for each run of consecutive numbers, such as `3` or `10-20`.
 pub fn ranges<T: PrimInt + Display>(numbers: &[T]) -> Vec<String> {
     let runs = numbers.chunk_by(|&a, &b| a + T::one() == b);
     let text = |run: &[T]| match (run[0], run[run.len() - 1]) {

@@ -1,16 +1,18 @@
-//! Stored parameters from which all frames of a model follow.
+//! Stored parameters of a model format that computes every frame from them.
 
 use serde::{Deserialize, Serialize};
 
 use super::{AttributeValues, Attributes, Gaussians};
 
-/// Stored parameters of N Gaussians of a model whose frames all follow from them.
+/// Stored parameters of N Gaussians, from which a model format computes their attributes at every time.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct StoredParams {
-    /// Attributes that every model format has, in stored encoding.
+    /// Stored parameters that every model format has: position, rotation, log scales, opacity logit and SH
+    /// coefficients.
     pub gaussians: Gaussians,
-    /// Further parameters of the model format (velocities, time windows, features), as planes in an order of the
-    /// format. Width 0 if there are none.
+    /// Further parameters that only this model format has (velocities, time windows, features): one plane per
+    /// parameter, with its value for every Gaussian, in an order that the format defines. Has no planes if there are
+    /// none.
     pub own: AttributeValues,
 }
 
@@ -25,13 +27,13 @@ impl StoredParams {
         self.gaussians.is_empty()
     }
 
-    /// Returns the parameters of the Gaussians `rows`, in that order.
+    /// Returns the parameters of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> StoredParams {
         StoredParams { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
     }
 
-    /// Copies the parameters of Gaussian `row` of `from` to Gaussian `to`. `from` has at least as many values per
-    /// Gaussian.
+    /// Copies the parameters of Gaussian `row` of `from` to Gaussian `to` of `self`. `from` must have at least as many
+    /// values per Gaussian as `self`.
     pub fn set_row(&mut self, to: usize, from: &StoredParams, row: usize) {
         let set = |column: &mut AttributeValues, from: &AttributeValues| {
             (0..column.width()).for_each(|c| column.plane_mut(c)[to] = from.plane(c)[row]);
@@ -44,7 +46,7 @@ impl StoredParams {
 }
 
 impl From<Gaussians> for StoredParams {
-    /// Creates the parameters of a model format that has no further parameters.
+    /// Creates the stored parameters of a model format that stores only the attributes of `gaussians`.
     fn from(gaussians: Gaussians) -> StoredParams {
         let own = AttributeValues::zeros(0, gaussians.len());
         StoredParams { gaussians, own }

@@ -1,4 +1,4 @@
-//! Cameras of a data set and the views that they took.
+//! Cameras of a data set, and the views (a camera at a time) from which the scene was photographed.
 
 use std::path::{Path, PathBuf};
 
@@ -8,11 +8,11 @@ use super::camera::Camera;
 use super::schedule::{FrameView, ViewSchedule};
 use crate::error::{Error, Result};
 
-/// Part of a data set.
+/// Part of a data set that a view belongs to: training, validation or test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// Training views of the model. Compression scores with these views.
+    /// Views with which the model was trained. Compression scores Gaussians with these views.
     Train,
     /// Validation views. Evaluation uses them if there are no test views.
     Val,
@@ -20,14 +20,14 @@ pub enum Split {
     Test,
 }
 
-/// View that a camera took or may have taken: view number, camera, and time stamp.
+/// View of the scene: a camera at a time stamp. There may be a photograph of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
-    /// View number.
+    /// Number of the view in the data set.
     pub view: u32,
     /// Index into [`Rig::cameras`].
     pub camera: u32,
-    /// Time stamp, or `None` if the view exists for every frame.
+    /// Time stamp of the view. `None` if the camera sees the scene at every frame.
     pub time: Option<f64>,
     /// Part of the data set that the view belongs to.
     pub split: Split,
@@ -38,42 +38,45 @@ pub struct Shot {
 /// Cameras of a data set and all of their views.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rig {
-    /// Distinct cameras.
+    /// Distinct cameras; several views may share one.
     pub cameras: Vec<Camera>,
     /// Views of all cameras, in the order of the camera file.
     pub shots: Vec<Shot>,
     /// Background color, linear RGB in [0, 1], if the camera file gives one.
     pub background: Option<[f32; 3]>,
-    /// Source of the cameras, to show to users: a path, or the recipe of a virtual rig.
+    /// Source of the cameras for messages: the path of the camera file, or a description of a virtual rig (cameras that
+    /// the program made up).
     pub origin: String,
 }
 
-/// Maximum distance between the time of a view and the time of its frame, as a fraction of the time span. Files round
-/// their times; a million frames can still be distinguished.
+/// Maximum difference between the time of a view and the time of its frame, as a fraction of the time span of the
+/// sequence. Allows for times that a file rounded, and still distinguishes a million frames.
 const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
-    /// Bytes per distinct camera: the camera, its copy in a schedule, and an entry in a table during reading.
+    /// Bytes of memory per distinct camera: the camera, its copy in a [`ViewSchedule`], and an entry in a table while
+    /// the camera file is read.
     pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
-    /// Bytes per view without its camera and file name: the view, entries in two tables during reading, and three times
-    /// its entry in a schedule.
+    /// Bytes of memory per view, without its camera and the text of its file name: a [`Shot`], its entries in two
+    /// tables while the camera file is read, and three times its entry of 40 bytes in a [`ViewSchedule`], whose vectors
+    /// double when they grow.
     pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
-    /// Bytes per file name beside its text, for the allocator.
+    /// Bytes of memory per file name in addition to its text: the overhead of the allocator.
     pub const NAME_BYTES: u64 = 32;
 
-    /// Returns the bytes of all cameras and views, and of one schedule of them.
+    /// Returns the bytes of memory that all cameras and views take, including one [`ViewSchedule`] of them.
     pub fn bytes(&self) -> u64 {
         let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
         let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_BYTES).sum();
         Rig::BYTES_PER_CAMERA * self.cameras.len() as u64 + Rig::BYTES_PER_VIEW * self.shots.len() as u64 + names
     }
 
-    /// Returns the distinct times of all views, increasing. Empty if no view has a time.
+    /// Returns the distinct times of all views in increasing order. Returns no times if no view has a time.
     ///
-    /// A time that exceeds another one by at most half the tolerance of [`Rig::schedule`] counts as equal to it,
-    /// because training and test views of one moment may have been rounded differently.
+    /// Times that differ by at most half the tolerance of [`Rig::schedule`] count as equal, because training and test
+    /// views of one moment may have been rounded differently.
     pub fn times(&self) -> Vec<f64> {
         let mut times: Vec<f64> = self.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
@@ -82,26 +85,27 @@ impl Rig {
         times
     }
 
-    /// Returns the held-out split: test, or validation if there are no test views. `None` if all views are training
-    /// views.
+    /// Returns the split of the views that were held out of training: test, or validation if there are no test views.
+    /// Returns `None` if all views are training views.
     pub fn held_out(&self) -> Option<Split> {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
-    /// Returns the maximum distance between the time of a view and the time of its frame, if the frames span the times
-    /// of the views.
+    /// Returns the maximum difference between the time of a view and the time of its frame, for a sequence whose frames
+    /// cover the same time span as the views.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }
     }
 
-    /// Builds the schedule of the views of one split (`None`: of all splits).
+    /// Builds the schedule (the list of views of each frame) from the views of one split; `None` takes all splits.
     ///
-    /// `frame_times` must increase. A view with a time belongs to the nearest frame, which must lie within 1e-6 of the
-    /// time span (within 1e-6 if there is one frame). A view without a time belongs to every frame.
+    /// `frame_times` must increase. A view with a time belongs to the frame with the nearest time. The two times may
+    /// differ by at most 1e-6 times the time span of the frames (by 1e-6 if there is only one frame). A view without a
+    /// time belongs to every frame.
     ///
     /// # Errors
-    /// [`Error::Usage`] if no frame has the time of a view.
+    /// Fails with [`Error::Usage`] if no frame has the time of a view of the split.
     pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<ViewSchedule> {
         let (mut timed, mut timeless) = (Vec::new(), Vec::new());
         for (place, shot) in self.shots.iter().enumerate() {
@@ -129,10 +133,11 @@ impl Rig {
         Ok(schedule)
     }
 
-    /// Returns the frame that `shot` belongs to by the rule of [`Rig::schedule`]. `None` if it belongs to every frame.
+    /// Returns the index of the frame that `shot` belongs to by the rule of [`Rig::schedule`]. Returns `None` if the
+    /// view belongs to every frame.
     ///
     /// # Errors
-    /// [`Error::Usage`] if no frame has the time of the view.
+    /// Fails with [`Error::Usage`] if no frame has the time of the view.
     pub fn frame_of(&self, shot: &Shot, frame_times: &[f64]) -> Result<Option<usize>> {
         let Some(time) = shot.time else { return Ok(None) };
         let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
@@ -142,8 +147,8 @@ impl Rig {
             .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
-    /// Returns the path of the photograph of `picture`, if the camera file names one. `frame_times` as in
-    /// [`Rig::schedule`].
+    /// Returns the path of the photograph of the view `picture`, if the camera file names one. `frame_times` are the
+    /// increasing times of the frames.
     pub fn image(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();
@@ -153,7 +158,7 @@ impl Rig {
         self.shots.iter().find(shows)?.image.as_deref()
     }
 
-    /// Returns the error of a view whose time is not the time of any frame.
+    /// Creates the error of a view whose `time` is not the time of any frame.
     fn no_such_frame(&self, view: u32, time: f64, frame_times: &[f64]) -> Error {
         let frames = match frame_times {
             [] => "has no frames".to_owned(),
@@ -168,7 +173,7 @@ impl Rig {
     }
 }
 
-/// Returns the last time minus the first, or 0 for fewer than two times.
+/// Returns the time span of increasing `times`: the last time minus the first, or 0 for fewer than two times.
 fn span(times: &[f64]) -> f64 {
     match times {
         [first, .., last] => last - first,
@@ -176,7 +181,8 @@ fn span(times: &[f64]) -> f64 {
     }
 }
 
-/// Returns the index of the nearest of the increasing `times`. Of two equally near times, the earlier one wins.
+/// Returns the index of the entry of the increasing `times` that is nearest to `time`, the earlier one if two are
+/// equally near. Returns `None` if `times` is empty.
 fn nearest(times: &[f64], time: f64) -> Option<usize> {
     let after = times.partition_point(|&t| t < time);
     [after.wrapping_sub(1), after]

@@ -1,23 +1,24 @@
-//! Extent of a scene without outliers: the unit of relative lengths.
+//! Extent of a scene without outliers, in which relative lengths are measured.
 
 use glam::DVec3;
 
 use crate::AttributeValues;
 
-/// Box between the 1st and the 99th percentile of the positions along each axis. A few floaters do not enlarge it.
+/// Box between the 1st and the 99th percentile of the positions along each axis. A few floaters (stray Gaussians far
+/// from the scene) do not enlarge this box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobustBox {
-    /// 1st percentiles, scene units.
+    /// 1st percentile of the positions along each axis, scene units.
     pub low: DVec3,
-    /// Medians, scene units.
+    /// Median of the positions along each axis, scene units.
     pub middle: DVec3,
-    /// 99th percentiles, scene units.
+    /// 99th percentile of the positions along each axis, scene units.
     pub high: DVec3,
 }
 
 impl RobustBox {
-    /// Computes the box of `position` (`[3, N]`). Percentiles are nearest ranks over the finite values. An axis without
-    /// finite values gets 0.
+    /// Computes the box of the positions `position` (`[3, N]`). Percentiles are nearest ranks among the finite values.
+    /// An axis without finite values gets percentiles of 0.
     pub fn from_positions(position: &AttributeValues) -> RobustBox {
         let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
         for axis in 0..3 {
@@ -36,7 +37,8 @@ impl RobustBox {
         found
     }
 
-    /// Returns the longest side in scene units. Returns 1 if all sides are 0, so that lengths can be divided by it.
+    /// Returns the longest side of the box in scene units, or 1 if all sides are 0, so that lengths can be divided by
+    /// it.
     pub fn extent(&self) -> f64 {
         let longest = (self.high - self.low).max_element();
         if longest > 0.0 { longest } else { 1.0 }

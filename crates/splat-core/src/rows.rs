@@ -1,4 +1,4 @@
-//! Statistics of every Gaussian, as arrays over Gaussians (docs/method.md, section 1).
+//! Statistics of every Gaussian over all frames, one array per statistic (docs/method.md, section 1).
 //!
 //! A new statistic is a field of [`Rows`] and a variant of [`Statistic`]. Tables, histograms, temporary files and
 //! memory plans then include it.
@@ -7,51 +7,52 @@ use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
 bitflags! {
-    /// Anomalies of a Gaussian that the scan found.
+    /// Anomalies of a Gaussian that the pass over all frames found.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     pub struct Flags: u8 {
         /// A value in some frame was NaN or infinite.
         const NON_FINITE = 1;
         /// The quaternion was zero in some frame; the identity was used there.
         const ZERO_ROTATION = 2;
-        /// D was below the noise floor of the f32 positions and was set to 0.
+        /// The trajectory magnitude D was below the rounding noise of f32 positions and was set to 0.
         const SNAPPED_D = 4;
-        /// κ was below the noise floor of the f32 positions and was set to 0.
+        /// The curvature κ of the trajectory was below the rounding noise of f32 positions and was set to 0.
         const SNAPPED_KAPPA = 8;
     }
 }
 
-/// Statistic of a Gaussian. Its methods declare its names, its meaning, and the array that holds its values.
+/// Statistic that is computed for each Gaussian. The methods return its names, its meaning, and the array of [`Rows`]
+/// that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
-    /// Trajectory magnitude, [`Rows::d`].
+    /// Trajectory magnitude, see [`Rows::d`].
     D,
-    /// Curvature, [`Rows::kappa`].
+    /// Curvature of the trajectory, see [`Rows::kappa`].
     Kappa,
-    /// Variance of the opacity, [`Rows::v`].
+    /// Variance of the opacity over time, see [`Rows::v`].
     V,
-    /// Life span, [`Rows::life`].
+    /// Number of frames in which the opacity reaches a threshold, see [`Rows::life`].
     Life,
-    /// Mean contribution, [`Rows::c`].
+    /// Mean contribution to a render, see [`Rows::c`].
     C,
-    /// Anisotropy, [`Rows::e`].
+    /// Anisotropy of the scales, see [`Rows::e`].
     E,
-    /// Visibility, [`Rows::vis`].
+    /// Fraction of the views that the Gaussian touches, see [`Rows::vis`].
     Vis,
-    /// Largest weight of a pixel, [`Rows::w`].
+    /// Largest blending weight in any pixel, see [`Rows::w`].
     W,
 }
 
-/// Accessors of the array of a statistic, by value type: for reading and for writing.
+/// Functions that return the array of a statistic from [`Rows`], the first for reading and the second for writing.
 #[derive(Debug, Clone, Copy)]
 pub enum StatisticAccess {
-    /// Array of real numbers.
+    /// Statistic whose values are real numbers.
     F64(fn(&Rows) -> &Vec<f64>, fn(&mut Rows) -> &mut Vec<f64>),
-    /// Array of frame counts.
+    /// Statistic whose values are numbers of frames.
     U32(fn(&Rows) -> &Vec<u32>, fn(&mut Rows) -> &mut Vec<u32>),
 }
 
-/// Names, meaning and values of a statistic.
+/// Declaration of a statistic: its names, its meaning, and the array of its values.
 struct Declaration {
     name: &'static str,
     column: &'static str,
@@ -61,10 +62,10 @@ struct Declaration {
 }
 
 impl Statistic {
-    /// Every statistic, in the order of tables.
+    /// All statistics, in the order in which tables list them.
     pub const ALL: [Statistic; 8] = [Self::D, Self::Kappa, Self::V, Self::Life, Self::C, Self::E, Self::Vis, Self::W];
 
-    /// Returns the declaration of this statistic: the single place to describe a new one.
+    /// Returns the declaration of this statistic. A new statistic is described here and nowhere else.
     const fn declaration(self) -> Declaration {
         use StatisticAccess::{F64, U32};
         match self {
@@ -127,17 +128,18 @@ impl Statistic {
         }
     }
 
-    /// Returns the name in scores and reports.
+    /// Returns the name of the statistic in score formulas and reports.
     pub fn name(self) -> &'static str {
         self.declaration().name
     }
 
-    /// Returns the name of the table column.
+    /// Returns the name of the statistic as a column of exported tables.
     pub fn column(self) -> &'static str {
         self.declaration().column
     }
 
-    /// Returns a description with the unit. Counts of frames are described as a fraction of all frames.
+    /// Returns a description of the statistic with its unit. A statistic that counts frames is described as a fraction
+    /// of all frames.
     pub fn meaning(self) -> &'static str {
         self.declaration().meaning
     }
@@ -147,12 +149,12 @@ impl Statistic {
         self.declaration().property
     }
 
-    /// Returns the accessors of the values.
+    /// Returns the functions that access the values of the statistic in [`Rows`].
     pub const fn values(self) -> StatisticAccess {
         self.declaration().values
     }
 
-    /// Returns the bytes per Gaussian.
+    /// Returns the bytes that one value of the statistic takes.
     pub const fn bytes(self) -> usize {
         match self.values() {
             StatisticAccess::F64(..) => size_of::<f64>(),
@@ -161,32 +163,35 @@ impl Statistic {
     }
 }
 
-/// Statistics of N Gaussians. Every array has N entries, except that `w` may be empty.
+/// Statistics of N Gaussians. Every array has one entry per Gaussian, except that `w` may be empty.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Rows {
-    /// Trajectory magnitude D: root mean square step, scene units per frame.
+    /// Trajectory magnitude D: root mean square of the distance moved between successive frames, scene units per frame.
     pub d: Vec<f64>,
-    /// Curvature κ: mean norm of the second difference of the position, scene units per frame².
+    /// Curvature κ: mean norm of the second difference of the position over time, scene units per frame².
     pub kappa: Vec<f64>,
-    /// Variance V of the opacity over the life span.
+    /// Variance V of the opacity over the life span (the frames in which the opacity reaches a threshold).
     pub v: Vec<f64>,
-    /// Life span in frames.
+    /// Number of frames of the life span, in which the opacity reaches a threshold.
     pub life: Vec<u32>,
-    /// Mean projected or visible contribution C, pixels.
+    /// Contribution C to a render, mean over the views, in pixels: projected area times opacity, or the sum of alpha ·
+    /// transmittance over the pixels.
     pub c: Vec<f64>,
-    /// Largest alpha · transmittance W of any pixel of any view, in [0, 0.99]. Empty if C is the projected
-    /// contribution.
+    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if C is computed from projected
+    /// areas.
     pub w: Vec<f64>,
-    /// Anisotropy E of the canonical scales: s_max/s_min, or ln(s_max/s_mid) in the logarithmic form.
+    /// Anisotropy E of the canonical (time-independent) scales: the ratio of the largest to the smallest, or in the
+    /// logarithmic form ln(largest/middle).
     pub e: Vec<f64>,
-    /// Fraction of (frame, view) pairs in which the Gaussian is alive and touches the image.
+    /// Fraction of (frame, view) pairs in which the opacity of the Gaussian reaches a threshold and the Gaussian
+    /// touches the image.
     pub vis: Vec<f64>,
-    /// Anomalies that the scan found.
+    /// Anomalies that the pass over all frames found.
     pub flags: Vec<Flags>,
 }
 
 impl Rows {
-    /// Bytes of all statistics and flags of one Gaussian, W included.
+    /// Bytes of memory per Gaussian that all statistics, `w` included, and the flags take.
     pub const BYTES_PER_GAUSSIAN: usize = {
         let (mut bytes, mut k) = (size_of::<Flags>(), 0);
         while k < Statistic::ALL.len() {
@@ -206,7 +211,7 @@ impl Rows {
         self.d.is_empty()
     }
 
-    /// Appends the statistics of the next block and leaves `next` empty.
+    /// Appends the statistics in `next`, those of the following block of Gaussians, and leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
             match statistic.values() {
@@ -217,7 +222,7 @@ impl Rows {
         self.flags.append(&mut next.flags);
     }
 
-    /// Sets the statistics of Gaussian `i` to 0. The flags stay.
+    /// Sets all statistics of Gaussian `i` to 0. Its flags stay unchanged.
     pub fn clear(&mut self, i: usize) {
         for statistic in Statistic::ALL {
             match statistic.values() {

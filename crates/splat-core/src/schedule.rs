@@ -1,19 +1,19 @@
-//! Assignment of cameras to frames.
+//! List of the views (cameras) of every frame.
 
 use serde::{Deserialize, Serialize};
 
 use super::camera::Camera;
 
-/// Views of every frame: the cameras that see it, with their view numbers.
+/// Schedule of views: for every frame the cameras that see it, with their view numbers.
 ///
-/// Memory: 16 bytes per run of frames with equal views, and 8 bytes per view of a run. Memory grows with the number of
-/// images that the camera file names, not with the number of frames.
+/// Consecutive frames with equal views form a run. Memory: 16 bytes per run, and 8 bytes per view of a run. Memory
+/// grows with the number of images that the camera file names, not with the number of frames.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewSchedule {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
     runs: Vec<ViewRun>,
-    /// Pairs (view number, camera index) of all runs, one run after the other.
+    /// Views of all runs, one run after the other, as pairs (view number, camera index).
     views: Vec<(u32, u32)>,
     frames: usize,
 }
@@ -23,35 +23,36 @@ pub struct ViewSchedule {
 struct ViewRun {
     /// Index of the first frame of the run.
     frame: usize,
-    /// Index of the first pair of the run in `views`.
+    /// Index of the first view of the run in the field `views` of [`ViewSchedule`].
     view: usize,
 }
 
-/// View of one frame: the image of one camera at one frame.
+/// One camera at one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FrameView {
     /// Index of the frame in the sequence.
     pub frame: usize,
-    /// View number.
+    /// Number of the view in the data set.
     pub view: u32,
     /// Index of the camera in [`ViewSchedule::cameras`].
     pub camera: u32,
 }
 
 impl FrameView {
-    /// Returns the name `tNNN_vNN` of frame and view number, with more digits where needed.
+    /// Returns the name `tNNN_vNN` of the view, made of frame index and view number, with more digits for larger
+    /// numbers.
     pub fn name(&self) -> String {
         format!("t{:03}_v{:02}", self.frame, self.view)
     }
 }
 
 impl ViewSchedule {
-    /// Creates a schedule of `cameras` without frames.
+    /// Creates a schedule with `cameras` and no frames.
     pub fn new(cameras: Vec<Camera>) -> ViewSchedule {
         ViewSchedule { cameras, ..ViewSchedule::default() }
     }
 
-    /// Appends `count` frames that have the given views: pairs (view number, camera index).
+    /// Appends `count` frames that all have the views `views`: pairs (view number, camera index).
     pub fn push(&mut self, count: usize, views: &[(u32, u32)]) {
         let extends_last_run = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
         if count > 0 && !extends_last_run {
@@ -61,8 +62,8 @@ impl ViewSchedule {
         self.frames += count;
     }
 
-    /// Returns the bytes of `runs` runs with at most `views` views per frame. Doubled, because growing vectors reserve
-    /// up to twice their length.
+    /// Returns the bytes of memory that a schedule of `runs` runs with at most `views` views per frame takes. The bytes
+    /// of the entries are doubled, because growing vectors reserve up to twice their length.
     pub const fn bytes(runs: u64, views: u64) -> u64 {
         2 * runs * (size_of::<ViewRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
     }
@@ -72,26 +73,26 @@ impl ViewSchedule {
         self.frames
     }
 
-    /// Returns the views of a frame: pairs (view number, camera index).
+    /// Returns the views of frame `frame` as pairs (view number, camera index).
     ///
     /// # Panics
-    /// If the frame does not exist.
+    /// Panics if there is no such frame.
     pub fn views(&self, frame: usize) -> &[(u32, u32)] {
         assert!(frame < self.frames, "no frame {frame} of {}", self.frames);
         self.views_of_run(self.runs.partition_point(|run| run.frame <= frame) - 1)
     }
 
-    /// Iterates over [`ViewSchedule::views`] of all frames.
+    /// Iterates over the frames; yields the views of each as pairs (view number, camera index).
     pub fn iter(&self) -> impl Iterator<Item = &[(u32, u32)]> {
         (0..self.runs.len()).flat_map(|run| std::iter::repeat_n(self.views_of_run(run), self.run_length(run)))
     }
 
-    /// Returns the number of (frame, view) pairs M.
+    /// Returns the number M of (frame, view) pairs, which is the number of views summed over all frames.
     pub fn pairs(&self) -> usize {
         (0..self.runs.len()).map(|run| self.run_length(run) * self.views_of_run(run).len()).sum()
     }
 
-    /// Returns the maximum number of views of a frame.
+    /// Returns the largest number of views that a frame has.
     pub fn max_views_per_frame(&self) -> usize {
         (0..self.runs.len()).map(|run| self.views_of_run(run).len()).max().unwrap_or(0)
     }
@@ -104,13 +105,13 @@ impl ViewSchedule {
         used
     }
 
-    /// Returns the views of each frame of a run: pairs (view number, camera index).
+    /// Returns the views that every frame of the run `run` has, as pairs (view number, camera index).
     fn views_of_run(&self, run: usize) -> &[(u32, u32)] {
         let end = self.runs.get(run + 1).map_or(self.views.len(), |next| next.view);
         &self.views[self.runs[run].view..end]
     }
 
-    /// Returns the number of frames of a run.
+    /// Returns the number of frames of the run `run`.
     fn run_length(&self, run: usize) -> usize {
         self.runs.get(run + 1).map_or(self.frames, |next| next.frame) - self.runs[run].frame
     }
@@ -128,7 +129,7 @@ mod tests {
             (1, &[(0, 0), (1, 1)]),
             (3, &[(0, 0), (1, 1)]),
             (1, &[(1, 1)]),
-            // As many views as before, but different ones.
+            // These frames have as many views as the ones before, but different ones.
             (1, &[(1, 0)]),
             (0, &[(3, 3)]),
             (2, &[]),

@@ -1,26 +1,27 @@
-//! Application of deltas and masks: state = raw·mask + delta, its inverse, and its derivative.
+//! Application of the deltas and masks that a deformation field computes to stored attributes (raw values): state =
+//! raw·mask + delta, its inverse, and its derivative.
 
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Deltas and masks of a block of Gaussians at one time.
+/// Deltas and masks that a deformation field computed for a block of Gaussians at one time.
 ///
-/// An active attribute has state = raw·mask + delta. The rotation is an exception: it is never masked, and its state is
-/// raw + delta, or raw ⊗ delta normalized if the field multiplies rotations. An inactive attribute has state = raw,
-/// without a mask.
+/// The state (the attributes at that time) of an active attribute is raw·mask + delta, where raw is the stored value.
+/// The rotation is never masked: its state is raw + delta or, if the field multiplies rotations, the normalized product
+/// raw ⊗ delta. The state of an inactive attribute is raw, without a mask.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Deltas {
-    /// Deltas in stored encoding. Only the `active` attributes are valid.
+    /// Deltas in the encoding of the stored attributes. Only those of the `active` attributes are valid.
     pub delta: Gaussians,
-    /// Mask of each Gaussian `[N]`; `None` if every mask is 1.
+    /// Mask (factor on the stored attributes) of each Gaussian; `None` if every mask is 1.
     pub mask: Option<Vec<f32>>,
-    /// Requested attributes that the field changes.
+    /// Attributes for which deltas were requested and which the field changes.
     pub active: Attributes,
-    /// Whether the rotation delta is a factor.
+    /// Whether the rotation delta multiplies the stored quaternion instead of being added.
     pub multiply_rotation: bool,
 }
 
 impl Deltas {
-    /// Creates an empty block for Gaussians of SH degree `sh_degree`, to be filled by
+    /// Creates deltas of no Gaussians, of SH degree `sh_degree`, to be filled by
     /// [`Field::deltas`](super::Field::deltas).
     pub fn new(sh_degree: usize) -> Self {
         Deltas {
@@ -31,7 +32,8 @@ impl Deltas {
         }
     }
 
-    /// Starts a block of `rows` Gaussians: resizes the `active` attributes and stores the arguments.
+    /// Prepares for the deltas of `rows` Gaussians: resizes the deltas of the `active` attributes and stores the other
+    /// arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);
@@ -40,7 +42,8 @@ impl Deltas {
         self.multiply_rotation = multiply_rotation;
     }
 
-    /// Computes the state of `raw` in the attributes `want` into `state`, which is resized in these attributes.
+    /// Applies the deltas and masks to the stored attributes `raw` and writes the result to `state`, for the attributes
+    /// `want` only. Resizes these attributes of `state`.
     pub fn apply(&self, raw: &Gaussians, want: Attributes, state: &mut Gaussians) {
         for column in want.iter() {
             let from = raw.column(column);
@@ -66,10 +69,11 @@ impl Deltas {
         }
     }
 
-    /// Computes the derivative of the state with respect to the raw parameters, with deltas and masks held constant.
+    /// Computes into `out` the derivative ∂state/∂raw of the resulting attributes with respect to the stored ones, with
+    /// deltas and masks held constant.
     ///
-    /// Attributes whose state changes by the same amount as the raw value get no values. Values that are not finite
-    /// become 0. `rotation` holds the raw quaternions.
+    /// Attributes for which this derivative is the identity get no values. Values that are not finite become 0.
+    /// `rotation` holds the stored quaternions.
     pub(super) fn jacobian(&self, rotation: &AttributeValues, out: &mut Jacobian) {
         for column in self.active.iter() {
             if column == Attributes::ROTATION && self.multiply_rotation {
@@ -90,10 +94,11 @@ impl Deltas {
         }
     }
 
-    /// Computes the raw parameters whose state is `state`, in the attributes `want`: the inverse of [`Deltas::apply`].
+    /// Computes the stored attributes `raw` that these deltas and masks turn into `state`, for the attributes `want`.
+    /// This is the inverse of [`Deltas::apply`].
     ///
-    /// Exact up to rounding; a rotation is recovered up to its length. If a mask or a rotation delta is zero, no raw
-    /// value leads to `state` and the result is not finite.
+    /// The result is exact up to rounding, and for rotations up to the length of the quaternion. If a mask or a
+    /// rotation delta is zero, no stored value leads to `state`, and the result is not finite.
     pub fn solve(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);
@@ -121,7 +126,7 @@ impl Deltas {
     }
 }
 
-/// Returns the Hamilton product of two wxyz quaternions.
+/// Returns the Hamilton product `a` ⊗ `b` of two quaternions in the order w, x, y, z.
 fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
     [
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -131,7 +136,7 @@ fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
     ]
 }
 
-/// Returns the quaternion at unit length. Zero stays zero, so that the reader of the state can flag it.
+/// Returns the quaternion `q` scaled to unit length. A zero quaternion stays zero, so that it can still be detected.
 fn unit(q: [f32; 4]) -> [f32; 4] {
     let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
     if length == 0.0 { q } else { q.map(|x| x / length) }
@@ -142,8 +147,8 @@ pub(super) fn finite(x: f32) -> f32 {
     if x.is_finite() { x } else { 0.0 }
 }
 
-/// Returns the derivative with respect to `a`, given the derivative with respect to the normalized product of `a` and
-/// `b`. Returns 0 if the product is zero.
+/// Returns the derivative of a value with respect to the quaternion `a`, from its derivative `by_unit` with respect to
+/// the normalized product `a` ⊗ `b`. Returns 0 if the product is zero.
 fn unit_product_gradient(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
     let whole = product(a, b);
     let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();

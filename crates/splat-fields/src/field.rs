@@ -1,8 +1,10 @@
-//! Deformation field of a 4DGaussians model: plane features, trunk and heads.
+//! Deformation field of a 4DGaussians model: plane features, an MLP shared by all attributes (the trunk), and one small
+//! MLP per attribute (the heads).
 //!
-//! Input: tensors of a state dict, canonical positions, a time. Output: deltas and masks per Gaussian. Memory: the
-//! tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about 4·LANES·(features + trunk + heads) bytes of
-//! scratch per reader. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
+//! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
+//! and a mask that multiplies its stored attributes. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared
+//! Gaussian, and per reader about 4·LANES·(features + trunk + heads) bytes of buffers, where the sum is of the widths
+//! of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
 //! behavior of its public renderer.
 
 use std::path::Path;
@@ -16,72 +18,76 @@ use super::planes::{Planes, PreparedPlanes, TimeLines};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
 
-/// Hyper-parameters that decide the evaluation and cannot be inferred from tensor shapes.
+/// Options of a trained field that change its evaluation and cannot be inferred from the shapes of its tensors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldConfig {
-    /// Attributes whose heads are on (their flags `no_dx`, `no_ds`, `no_dr`, `no_do`, `no_dshs` are false).
+    /// Attributes that the field changes, because the option that turns their head off (`no_dx`, `no_ds`, `no_dr`,
+    /// `no_do`, `no_dshs`) is false.
     pub active: Attributes,
-    /// Whether a head on the hidden features gives the mask. Takes precedence over `empty_voxel`.
+    /// Whether an additional head computes a mask, a factor on the stored attributes of each Gaussian. If true,
+    /// `empty_voxel` is ignored.
     pub static_mlp: bool,
-    /// Whether a voxel grid gives the mask.
+    /// Whether a voxel grid contains the mask, a factor on the stored attributes of each Gaussian.
     pub empty_voxel: bool,
-    /// Frequency p. Above 1, features f become `[f, sin(p·f), cos(p·f)]`.
+    /// Frequency p of an encoding of the plane features f. If p is above 1, the trunk reads `[f, sin(p·f), cos(p·f)]`
+    /// instead of f.
     pub grid_pe: i64,
-    /// Whether the trunk reads `[x, y, z, t]` instead of plane features.
+    /// Whether the trunk (first MLP) reads `[x, y, z, t]` instead of plane features.
     pub no_grid: bool,
-    /// Whether the rotation delta multiplies the quaternion instead of being added.
+    /// Whether the stored quaternion is multiplied by the rotation delta instead of adding the delta.
     pub apply_rotation: bool,
 }
 
-/// Mask that multiplies the stored attributes other than the rotation.
+/// Source of the mask, a factor on all stored attributes of a Gaussian except the rotation.
 #[derive(Debug, Clone)]
 pub(super) enum Mask {
-    /// No mask.
+    /// The field has no mask; stored attributes are used as they are.
     None,
-    /// Mask of the last head, from the hidden features. Varies with time.
+    /// The last head of the field computes the mask, which varies with time.
     Head,
-    /// Mask of a voxel grid. Constant in time.
+    /// A voxel grid contains the mask, which is constant in time.
     Voxel(VoxelMask),
 }
 
-/// Output head of the trunk: hidden layer, ReLU, output layer. Reads the trunk's output after ReLU.
+/// Small MLP that computes the deltas of one attribute, or the mask (factor on stored attributes), from the output of
+/// the trunk (the MLP shared by all attributes) after ReLU: hidden layer, ReLU, output layer.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
-    /// Attribute that the head deforms; `None` for the mask of `static_mlp`.
+    /// Attribute whose deltas the head computes; `None` if it computes the mask of the option `static_mlp`.
     pub(super) column: Option<Attributes>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
 }
 
-/// Deformation field of a 4DGaussians model. Evaluates any block of Gaussians at any time. The result of a Gaussian has
-/// the same bits in every block.
+/// Deformation field of a 4DGaussians model. It can be evaluated for any block of Gaussians at any time. The results
+/// for a Gaussian have the same bits in every block.
 #[derive(Debug, Clone)]
 pub struct Field {
     pub(super) config: FieldConfig,
-    /// Feature planes; `None` if the trunk reads positions.
+    /// Planes of features; `None` if the trunk (first MLP) reads positions and time instead.
     pub(super) planes: Option<Planes>,
     pub(super) trunk: Vec<Linear>,
     pub(super) heads: Vec<Head>,
     pub(super) mask: Mask,
 }
 
-/// Time-independent part of the evaluation of one block of Gaussians.
+/// Results for one block of Gaussians that do not depend on time: the first part of evaluating a field.
 #[derive(Debug, Clone)]
 pub struct Prepared {
     rows: usize,
     input: PreparedInput,
-    /// Mask of `empty_voxel` per Gaussian.
+    /// Mask of each Gaussian from the voxel grid; `None` if the field has no voxel grid.
     voxel: Option<Vec<f32>>,
 }
 
-/// Time-independent input of the trunk: plane features, or positions.
+/// The part of the input of the trunk (first MLP) that does not depend on time: plane features, or positions.
 #[derive(Debug, Clone)]
 enum PreparedInput {
     Planes(PreparedPlanes),
     Position(AttributeValues),
 }
 
-/// Reusable buffers for the activations of one reader.
+/// Reusable buffers for the outputs of the layers of a field. Each reader of frames has its own.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
     features: Vec<CacheLine>,
@@ -89,7 +95,8 @@ pub struct Scratch {
     hidden: Vec<CacheLine>,
 }
 
-/// Returns the name of an attribute's head in the state dict, and the flag in `cfg_args` that turns it on.
+/// Returns the name of the head of an attribute in the state dict, and the option in `cfg_args` that turns this head
+/// on.
 fn head_name(column: Attributes) -> (&'static str, &'static str) {
     match column {
         Attributes::POSITION => ("pos_deform", "no_dx=False"),
@@ -103,11 +110,12 @@ fn head_name(column: Attributes) -> (&'static str, &'static str) {
 impl Field {
     /// Builds the field from the state dict read from `path`, for Gaussians of SH degree `sh_degree`.
     ///
-    /// Depth, widths, levels and resolutions follow from the shapes of the tensors. Unused tensors (`timenet.*`,
-    /// `*_poc`, heads that are off) are ignored.
+    /// The shapes of the tensors give the number and widths of the layers, and the number and resolutions of the
+    /// planes. Unused tensors (`timenet.*`, `*_poc`, heads that are off) are ignored.
     ///
     /// # Errors
-    /// A tensor is missing, has the wrong shape, or is not finite. The message names the tensor.
+    /// Fails if a tensor is missing, has the wrong shape, or contains values that are not finite. The message names the
+    /// tensor.
     pub fn new(tensors: &Tensors, config: FieldConfig, sh_degree: usize, path: &Path) -> Result<Self> {
         let lookup = Lookup { tensors, path };
         let planes = if config.no_grid { None } else { Some(Planes::load(lookup)?) };
@@ -147,34 +155,35 @@ impl Field {
         Ok(Field { config, planes, trunk, heads, mask })
     }
 
-    /// Returns the attributes that change with time.
+    /// Returns the attributes that the field changes with time.
     pub fn active(&self) -> Attributes {
         self.config.active
     }
 
-    /// Returns whether a mask multiplies stored attributes.
+    /// Returns whether the field has a mask, a factor on the stored attributes of each Gaussian.
     pub fn has_mask(&self) -> bool {
         !matches!(self.mask, Mask::None)
     }
 
-    /// Returns the hyper-parameters of the field.
+    /// Returns the options with which the field was trained.
     pub fn config(&self) -> &FieldConfig {
         &self.config
     }
 
-    /// Returns the bytes per Gaussian in [`Prepared`].
+    /// Returns the bytes of memory per Gaussian that [`Prepared`] takes.
     pub fn bytes_per_gaussian(&self) -> usize {
         let input = self.planes.as_ref().map_or(12, Planes::bytes_per_gaussian);
         input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
     }
 
-    /// Returns the number of multiplications by weights per Gaussian and time.
+    /// Returns the number of multiplications by weights that one evaluation of one Gaussian at one time takes.
     pub fn multiplications(&self) -> usize {
         let heads = self.heads.iter().flat_map(|head| [&head.hidden, &head.output]);
         self.trunk.iter().chain(heads).map(Linear::multiplications).sum()
     }
 
-    /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
+    /// Computes the part of the evaluation that does not depend on time, for Gaussians at the stored positions
+    /// `position` (`[3, N]`).
     pub fn prepare(&self, position: &AttributeValues) -> Prepared {
         Prepared {
             rows: position.len(),
@@ -189,11 +198,12 @@ impl Field {
         }
     }
 
-    /// Computes deltas and masks of the prepared block at `time`, for the active attributes among `want`. Other
-    /// attributes of `out` stay unchanged. `time` is used without mapping; the planes clamp it to [−1, 1].
+    /// Computes into `out` the deltas and masks of the prepared block at `time`, for the attributes in `want` that the
+    /// field changes. Other attributes of `out` stay unchanged. `time` is passed to the field unscaled; the feature
+    /// planes clamp it to [−1, 1].
     ///
     /// # Errors
-    /// `time` is not finite, or `out` has another SH degree than the field.
+    /// Fails if `time` is not finite, or if `out` has another SH degree than the field.
     pub fn deltas(
         &self,
         prepared: &Prepared,
@@ -244,7 +254,7 @@ impl Field {
         Ok(())
     }
 
-    /// [`Field::evaluate`] compiled for AVX2 and FMA.
+    /// Calls [`Field::evaluate`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
     fn evaluate_fma(
@@ -258,8 +268,8 @@ impl Field {
         self.evaluate::<true>(prepared, time, lines, scratch, out);
     }
 
-    /// Evaluates the field group by group of [`LANES`] Gaussians into `out`. Inlined with all callees into one copy per
-    /// instruction set.
+    /// Evaluates the field into `out`, in groups of [`LANES`] Gaussians. The compiler inlines this function and its
+    /// callees into one copy per instruction set; `FMA` says whether fused multiply-adds are used.
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &self,
@@ -303,7 +313,8 @@ impl Field {
     }
 }
 
-/// Writes the input `[x, y, z, t]` of the trunk of a field without planes. `positions` holds one slice per axis.
+/// Writes the input `[x, y, z, t]` of the trunk (first MLP) of a field without planes into `features`. `positions`
+/// holds one slice per axis, with one value per Gaussian of a group.
 #[inline(always)]
 pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features: &mut Vec<CacheLine>) {
     features.clear();
@@ -313,7 +324,8 @@ pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features
     }
 }
 
-/// Runs the trunk on `input` and returns its output after ReLU, the input of every head.
+/// Evaluates the layers of the trunk (the MLP shared by all attributes) for `input`. Returns the output of the last
+/// layer after ReLU, which every head (MLP of one attribute) reads.
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
     layers: &[Linear],
@@ -327,7 +339,7 @@ fn run_trunk<'a, const FMA: bool>(
     last
 }
 
-/// Appends sin(p·f) and cos(p·f) to features f.
+/// Appends sin(p·f) and cos(p·f) to the features f in `features`.
 pub(super) fn add_frequencies(features: &mut Vec<CacheLine>, p: f32) {
     let plain = features.clone();
     for function in [f32::sin, f32::cos] {

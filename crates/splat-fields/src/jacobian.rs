@@ -1,10 +1,12 @@
-//! Derivative of the state with respect to raw parameters.
+//! Derivative of the state (the attributes at one time) with respect to the raw parameters (the stored attributes) of a
+//! deformation field.
 //!
-//! state = raw + delta(position, time), so ∂state/∂raw of a position is the identity plus ∂delta/∂position. The latter
-//! is computed for each of the three components by a backward pass through head and trunk, with the masks of their
-//! ReLUs, and then through the planes. Derivatives through the deltas of other attributes are neglected: they are worth
-//! less than 0.1 dB of a refinement and cost most of the time of the field. Input: raw positions and rotations. Output:
-//! a [`Jacobian`]. Memory: the Jacobian and one group of [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
+//! state = raw + delta(position, time), so ∂state/∂raw of a position is the identity plus ∂delta/∂position. For each of
+//! the three components, ∂delta/∂position is computed by a backward pass through the head (MLP of the position), the
+//! trunk (MLP shared by all attributes) and the feature planes. Derivatives through the deltas of other attributes are
+//! neglected: they would raise the quality of refined models by less than 0.1 dB, and take most of the time. Input: raw
+//! positions and rotations. Output: a [`Jacobian`]. Memory: the Jacobian, and the values of all layers for one group of
+//! [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
 use super::field::{Field, Head, Mask, Scratch, add_frequencies, position_time_features};
@@ -12,32 +14,32 @@ use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Activations and derivatives of one group of Gaussians.
+/// Outputs of all layers, and derivatives, for one group of Gaussians.
 #[derive(Default)]
 struct JacobianGroup {
     features: Vec<CacheLine>,
-    /// Derivatives of the plane features with respect to position, by axis.
+    /// Derivatives of the plane features with respect to x, y and z.
     slopes: [Vec<CacheLine>; 3],
-    /// Activations of every trunk layer after ReLU.
+    /// Output of every layer of the trunk (the MLP shared by all attributes) after ReLU.
     trunk: Vec<Vec<CacheLine>>,
     hidden: Vec<CacheLine>,
-    /// Derivatives with respect to the input of the layer that the backward pass has reached.
+    /// Derivatives of one position component with respect to the input of the layer that the backward pass has reached.
     gradient: Vec<CacheLine>,
     spare: Vec<CacheLine>,
 }
 
 impl Field {
-    /// Computes the derivative of the state at `time` with respect to raw parameters, for the attributes `want` of a
-    /// block of Gaussians.
+    /// Computes the derivative ∂state/∂raw at `time`, for the attributes `want` of a block of Gaussians. The state is
+    /// the attributes at that time; `raw` are the stored ones.
     ///
-    /// `raw` has rows in position, and in rotation if `want` contains it. A value that is not finite becomes 0; for a
-    /// position only its part through the delta becomes 0.
+    /// `raw` must contain positions, and rotations if `want` contains them. A derivative that is not finite becomes 0;
+    /// for a position this concerns only ∂delta/∂position, not the identity.
     ///
-    /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: the state of a position changes
-    /// by the mask times the change of the raw position.
+    /// If the field has a mask (option `static_mlp` or `empty_voxel`), masks and deltas count as constant: the position
+    /// at `time` then changes by the mask times the change of the stored position.
     ///
     /// # Errors
-    /// `time` is not finite.
+    /// Fails if `time` is not finite.
     pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Attributes) -> Result<Jacobian> {
         if !time.is_finite() {
             return Err(Error::internal(format!(
@@ -65,7 +67,8 @@ impl Field {
         Ok(found)
     }
 
-    /// Computes ∂state/∂raw of positions, `[9, N]`.
+    /// Computes the derivative of the positions at `time` with respect to the stored positions `position`. Plane `3·i +
+    /// j` of the result is ∂ component i / ∂ stored component j.
     fn position_jacobian(&self, head: &Head, position: &AttributeValues, time: f32) -> AttributeValues {
         let mut out = AttributeValues::zeros(9, position.len());
         #[cfg(target_arch = "x86_64")]
@@ -78,7 +81,7 @@ impl Field {
         out
     }
 
-    /// [`Field::position_jacobian_by_group`] compiled for AVX2 and FMA.
+    /// Calls [`Field::position_jacobian_by_group`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
     fn position_jacobian_by_group_fma(
@@ -91,8 +94,8 @@ impl Field {
         self.position_jacobian_by_group::<true>(head, position, time, out);
     }
 
-    /// Computes ∂state/∂raw of positions group by group into `out`. Inlined with all callees into one copy per
-    /// instruction set.
+    /// Computes the result of [`Field::position_jacobian`] into `out`, in groups of [`LANES`] Gaussians. The compiler
+    /// inlines this function and its callees into one copy per instruction set.
     #[inline(always)]
     fn position_jacobian_by_group<const FMA: bool>(
         &self,
@@ -138,7 +141,7 @@ impl Field {
 }
 
 impl JacobianGroup {
-    /// Computes the activations of trunk and head from the features.
+    /// Computes the outputs of all layers of the trunk and of the hidden layer of `head` from the features.
     #[inline(always)]
     fn forward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
         self.trunk.resize(field.trunk.len(), Vec::new());
@@ -150,7 +153,8 @@ impl JacobianGroup {
         head.hidden.activate::<FMA>(input, &mut self.hidden);
     }
 
-    /// Returns the derivative along one axis, given the derivatives with respect to the plane features.
+    /// Returns the derivative with respect to the position along `axis`, from the derivatives with respect to the plane
+    /// features in `gradient`.
     #[inline(always)]
     fn axis_derivative(&self, axis: usize) -> CacheLine {
         let mut sums = CacheLine([0.0; LANES]);
@@ -162,7 +166,8 @@ impl JacobianGroup {
         sums
     }
 
-    /// Computes the derivatives with respect to the features, given those with respect to the outputs of the head.
+    /// Converts `gradient` from the derivatives with respect to the outputs of `head` to those with respect to the
+    /// features, by passing backward through head and trunk.
     #[inline(always)]
     fn backward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
         let JacobianGroup { trunk, hidden, gradient, spare, .. } = self;
@@ -178,8 +183,8 @@ impl JacobianGroup {
     }
 }
 
-/// Computes the derivatives with respect to f, given those with respect to `features` = `[f, sin(p·f), cos(p·f)]`. The
-/// result is in the first third of `gradient`.
+/// Converts derivatives with respect to `features` = `[f, sin(p·f), cos(p·f)]` to derivatives with respect to f, which
+/// are then in the first third of `gradient`.
 fn frequencies_backward(features: &[CacheLine], p: f32, gradient: &mut [CacheLine]) {
     let n = features.len() / 3;
     for c in 0..n {

@@ -1,10 +1,12 @@
-//! Deformation fields of dynamic Gaussian-splatting models, evaluated in blocks of Gaussians.
+//! Deformation fields of dynamic Gaussian-splatting models: networks that compute how Gaussians change with time. They
+//! are evaluated for blocks of Gaussians.
 //!
-//! [`Field`] is the field of a 4DGaussians model: HexPlane features followed by MLP heads. [`Network`] is the deep MLP
-//! of position and time that Deformable-3D-Gaussians trains. Both also compute derivatives with respect to the stored
-//! Gaussians.
+//! [`Field`] is the field of a 4DGaussians model: HexPlane features, followed by an MLP (the trunk) and one small MLP
+//! (a head) per attribute. [`Network`] is the deep MLP of position and time that Deformable-3D-Gaussians trains. Both
+//! also compute derivatives of their results with respect to the stored Gaussians.
 //!
-//! [`oracle`] evaluates a [`Field`] in f64. [`synthetic`] makes fields with random weights for tests.
+//! [`oracle`] is a slow, independent evaluation of a [`Field`] in f64. [`synthetic`] makes fields with random weights.
+//! Both serve tests.
 //!
 //! ```
 //! use std::path::Path;
@@ -46,7 +48,7 @@ pub use network::{Encoded, Network, PredictedMotion};
 pub use planes::{Box3, Tap, tap, unread_rows};
 pub use tensors::{Tensor, Tensors};
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

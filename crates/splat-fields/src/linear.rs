@@ -1,38 +1,39 @@
-//! Fully connected layers over [`LANES`] Gaussians side by side.
+//! Fully connected layers, evaluated for [`LANES`] Gaussians side by side.
 //!
-//! Weights are packed once, on loading, into panels of four outputs. The sums of a panel take eight of the sixteen AVX2
-//! registers, enough to hide the latency of the multiply-adds. The other operands are one input of all lanes and one
-//! weight, so layers with few outputs are not slower per output. A library that packs its operands in every call spends
-//! a seventh of its time on packing matrices as small as these.
+//! Weights are stored in panels of four outputs each; this order is made once, on loading. The sums of a panel take
+//! eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. The remaining operands are one
+//! input for all Gaussians and one weight, so layers with few outputs are not slower per output. A matrix library that
+//! reorders its operands in every call would spend a seventh of its time on that for matrices as small as these.
 
 use splat_core::error::Result;
 
 use super::tensors::Lookup;
 
-/// Number of Gaussians evaluated side by side.
+/// Number of Gaussians that are evaluated side by side, one per lane of the vectors.
 pub(super) const LANES: usize = 16;
-/// One value per lane, aligned to a cache line: loading a register from two lines takes twice the time.
+/// One value for each of [`LANES`] Gaussians, aligned to a cache line: loading a register from two lines takes twice
+/// the time.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct CacheLine(pub(super) [f32; LANES]);
 
-/// Number of outputs whose sums are computed together.
+/// Number of outputs of a layer whose sums are computed together (a panel).
 const PANEL: usize = 4;
 
-/// Fully connected layer `y = W·x + b`.
+/// Fully connected layer `y = W·x + b` with inputs x and outputs y.
 #[derive(Debug, Clone)]
 pub(super) struct Linear {
-    /// Weights `[panels, inputs, PANEL]`, zero beyond the last output.
+    /// Weights `[panels, inputs, PANEL]`, in panels of [`PANEL`] outputs. The last panel is filled up with zeros.
     weight: Vec<[f32; PANEL]>,
-    /// Biases `[panels, PANEL]`.
+    /// Biases `[panels, PANEL]`, in panels of [`PANEL`] outputs. The last panel is filled up with zeros.
     bias: Vec<[f32; PANEL]>,
     inputs: usize,
     pub(super) outputs: usize,
 }
 
 impl Linear {
-    /// Reads `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`. `None` for `outputs` accepts any
-    /// number.
+    /// Reads the layer from the tensors `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`. If `outputs`
+    /// is `None`, any number of outputs is accepted. Messages about malformed tensors show `why`.
     pub(super) fn load(
         lookup: Lookup<'_>,
         name: &str,
@@ -56,18 +57,18 @@ impl Linear {
         Ok(layer)
     }
 
-    /// Returns the number of outputs, rounded up to whole panels.
+    /// Returns the number of outputs of the layer, rounded up to a multiple of [`PANEL`].
     pub(super) fn padded_outputs(&self) -> usize {
         self.bias.len() * PANEL
     }
 
-    /// Returns the number of multiplications by weights per Gaussian.
+    /// Returns the number of multiplications by weights that one evaluation of one Gaussian takes.
     pub(super) fn multiplications(&self) -> usize {
         self.weight.len() * PANEL
     }
 
-    /// Computes ReLU(y) of `input` `[inputs, LANES]` into `out` `[outputs, LANES]`. NaN stays NaN, unlike with
-    /// `f32::max`.
+    /// Computes the outputs of the layer after ReLU for `input` `[inputs, LANES]`, into `out` `[outputs, LANES]`. A NaN
+    /// stays NaN, unlike with `f32::max`.
     #[inline(always)]
     pub(super) fn activate<const FMA: bool>(&self, input: &[CacheLine], out: &mut Vec<CacheLine>) {
         out.resize(self.padded_outputs(), CacheLine([0.0; LANES]));
@@ -82,10 +83,11 @@ impl Linear {
         }
     }
 
-    /// Computes the derivatives with respect to the inputs into `out`, given those with respect to the outputs.
+    /// Computes into `out` the derivatives of a value with respect to the inputs of the layer, from its derivatives
+    /// with respect to the outputs (`output_gradient`).
     ///
-    /// Both are in whole panels that are 0 beyond the last value. `activations` are the inputs if ReLU produced them;
-    /// the derivative is 0 where they are not positive.
+    /// Both arrays are filled up with zeros to whole panels ([`PANEL`] values). `activations` are the inputs of the
+    /// layer if they come out of a ReLU; where they are not positive, the derivative is set to 0.
     #[inline(always)]
     pub(super) fn backward<const FMA: bool>(
         &self,
@@ -114,7 +116,8 @@ impl Linear {
         }
     }
 
-    /// Writes the first `lanes` values of output o into `planes[o·len + start ..]`, without ReLU.
+    /// Computes the outputs of the layer without ReLU for `input`. Writes output o of the first `lanes` Gaussians to
+    /// `planes[o·len + start ..]`.
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
@@ -135,9 +138,9 @@ impl Linear {
     }
 }
 
-/// Computes the outputs of one panel. Each sum starts from its bias and adds the inputs in their order, so the result
-/// of a Gaussian does not depend on the other lanes. Uses fused multiply-adds only if the processor has them: otherwise
-/// each one would be a function call.
+/// Computes the outputs of one panel ([`PANEL`] outputs) of a layer. Each sum starts with the bias and adds the inputs
+/// in order, so the result for a Gaussian does not depend on the Gaussians beside it. `FMA` selects fused
+/// multiply-adds; on a processor without them each would be a function call.
 #[inline(always)]
 fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
     let mut sums = bias.map(|b| CacheLine([b; LANES]));

@@ -1,14 +1,17 @@
-//! Deep MLP that moves Gaussians: encoding of position and time, fully connected layers, linear heads.
+//! Deep MLP that computes the motion of Gaussians: encoding of position and time, fully connected layers, and one
+//! linear output layer (head) per attribute.
 //!
-//! The input is h = [e(x), e(t)] with the encoding e(v) = [v, sin(2⁰v), cos(2⁰v), sin(2¹v), cos(2¹v), …]; every entry
-//! has all components of v. Positions have ten octaves. In models with a time network, e(t) is the output of that
-//! network. Layers are linear, then ReLU. Layers with a skip connection read [e(x), e(t), h] instead of h. Heads are
-//! linear in the last h.
+//! The first layer reads h = [e(x), e(t)], where x is the stored position, t the time, and e(v) = [v, sin(2⁰v),
+//! cos(2⁰v), sin(2¹v), cos(2¹v), …]; every entry contains all components of v. Positions are encoded with ten octaves
+//! (powers of 2). In models with a time network, e(t) is the output of that network. Each layer computes its output h
+//! by a linear map and a ReLU from the h of the previous layer, or from [e(x), e(t), h] if it has a skip connection.
+//! Heads are linear maps of the last h.
 //!
-//! Input: tensors of a state dict, canonical positions, a time. Output: [`PredictedMotion`]. Memory: the tensors twice,
-//! [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB of activations per call. Sources: Yang et al.,
-//! "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024; Huang et al., "SC-GS:
-//! Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes", 2024; and their public code.
+//! Input: tensors of a state dict, stored positions, a time. Output: [`PredictedMotion`]. Memory: the tensors twice,
+//! [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB per call for the outputs of the layers.
+//! Sources: Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024;
+//! Huang et al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes", 2024; and their public
+//! code.
 
 use std::path::Path;
 
@@ -17,17 +20,19 @@ use super::tensors::{Lookup, Tensors};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes};
 
-/// Number of octaves in the encoding of a position.
+/// Number of octaves (frequencies 2⁰ to 2⁹) in the encoding of a position.
 const POSITION_OCTAVES: usize = 10;
-/// Number of values in the encoding of a position.
+/// Number of values in the encoding of a position: its 3 components, and their sines and cosines for each octave.
 const POSITION_INPUTS: usize = 3 + 6 * POSITION_OCTAVES;
 
-/// Deep MLP of position and time. The result of a Gaussian has the same bits in every block.
+/// Deep MLP of position and time that computes the motion of Gaussians. The result for a Gaussian has the same bits in
+/// every block.
 #[derive(Debug, Clone)]
 pub struct Network {
-    /// Number of octaves in the encoding of the time.
+    /// Number of octaves (frequencies 2⁰, 2¹, …) in the encoding of the time.
     octaves: usize,
-    /// Two layers of the time network, between the encoded time and the input of the first layer.
+    /// Two layers of the time network, which turn the encoded time into the time input of the first layer. `None`: the
+    /// first layer reads the encoded time.
     time: Option<[Linear; 2]>,
     layers: Vec<NetworkLayer>,
     heads: Vec<NetworkHead>,
@@ -41,44 +46,45 @@ struct NetworkLayer {
     has_skip: bool,
 }
 
-/// Linear output layer of one attribute, or of three of its components.
+/// Linear output layer (head) that computes the offset of one attribute, or of three of its components.
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Attributes,
-    /// Component of the attribute that the first output belongs to.
+    /// First component of the attribute that the layer computes.
     plane: usize,
     output: Linear,
 }
 
-/// Encoded positions of a block of Gaussians, valid for all times.
+/// Encoded positions of a block of Gaussians. They do not depend on time.
 #[derive(Debug, Clone, Default)]
 pub struct Encoded {
     rows: usize,
-    /// Encodings in groups of [`LANES`] Gaussians with [`POSITION_INPUTS`] values each; zero beyond the last Gaussian.
+    /// Encodings in groups of [`LANES`] Gaussians, [`POSITION_INPUTS`] values per Gaussian; zero after the last
+    /// Gaussian.
     values: Vec<CacheLine>,
 }
 
-/// Outputs of the heads for a block of Gaussians. A column has no rows if there is no such head or it was not
-/// requested.
+/// Motion that the network computes for a block of Gaussians: the outputs of its heads. Attributes for which the
+/// network has no head, or that were not requested, are empty.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
-    /// Position offset `[3]`, scene units. For networks that predict screw motions `[6]`: the screw parameters w, then
-    /// v.
+    /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
+    /// then the translation part v of the screw.
     pub warp: AttributeValues,
-    /// Quaternion offset `[4]`, wxyz.
+    /// Offset of the quaternion: 4 planes in the order w, x, y, z.
     pub rotation: AttributeValues,
-    /// Scale offset `[3]`, scene units.
+    /// Offset of the scales: 3 planes, scene units.
     pub scaling: AttributeValues,
-    /// Opacity offset `[1]`.
+    /// Offset of the opacity: 1 plane.
     pub opacity: AttributeValues,
-    /// Offset of the SH coefficients of degree 0, `[3]`.
+    /// Offset of the SH coefficients of degree 0 (the color): 3 planes.
     pub color: AttributeValues,
 }
 
-/// Activations of one group of Gaussians.
+/// Inputs and outputs of layers for one group of Gaussians.
 #[derive(Default)]
 struct NetworkScratch {
-    /// Encodings of position and time, followed by the output of the previous layer for a layer with a skip connection.
+    /// Encodings of position and time. If the layer has a skip connection, the output of the previous layer follows.
     input: Vec<CacheLine>,
     /// Output of the current layer.
     last: Vec<CacheLine>,
@@ -87,7 +93,7 @@ struct NetworkScratch {
 }
 
 impl PredictedMotion {
-    /// Returns the outputs of the head of an attribute.
+    /// Returns the motion of the attribute `which` for writing.
     fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
             Attributes::POSITION => &mut self.warp,
@@ -100,14 +106,15 @@ impl PredictedMotion {
 }
 
 impl Network {
-    /// Bytes per Gaussian in [`Encoded`].
+    /// Bytes of memory per Gaussian that [`Encoded`] takes.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * POSITION_INPUTS;
 
-    /// Builds the network from the tensors of `path` whose names begin with `prefix`. Depth, widths, octaves of the
-    /// time, skip connections and heads follow from the tensors.
+    /// Builds the network from the tensors of the file `path` whose names begin with `prefix`. The tensors give the
+    /// number and widths of the layers, the skip connections, the octaves of the encoded time, and the heads.
     ///
     /// # Errors
-    /// A tensor is missing, has the wrong shape, or is not finite. The message names the tensor.
+    /// Fails if a tensor is missing, has the wrong shape, or contains values that are not finite. The message names the
+    /// tensor.
     pub fn new(tensors: &Tensors, prefix: &str, path: &Path) -> Result<Network> {
         let lookup = Lookup { tensors, path };
         let name = |layer: &str| format!("{prefix}{layer}");
@@ -189,27 +196,28 @@ impl Network {
         Ok(Network { octaves, time, layers, heads })
     }
 
-    /// Returns the attributes that have a head.
+    /// Returns the attributes that the network changes, because it has a head (output layer) for them.
     pub fn active(&self) -> Attributes {
         self.heads.iter().map(|head| head.column).collect()
     }
 
-    /// Returns whether positions move by screw motions. [`PredictedMotion::warp`] then holds w and v.
+    /// Returns whether positions move by screw motions (a rotation and a translation). [`PredictedMotion::warp`] then
+    /// holds the screw parameters w and v.
     pub fn predicts_screw_motion(&self) -> bool {
         self.heads.iter().any(|head| head.plane > 0)
     }
 
-    /// Returns the number of multiplications by weights per Gaussian and time.
+    /// Returns the number of multiplications by weights that one evaluation of one Gaussian at one time takes.
     pub fn multiplications(&self) -> usize {
         let layers = self.layers.iter().map(|layer| &layer.linear);
         layers.chain(self.heads.iter().map(|head| &head.output)).map(Linear::multiplications).sum()
     }
 
-    /// Encodes canonical positions `[3, N]`.
+    /// Computes the encoding of the stored positions `position` (`[3, N]`).
     ///
-    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for the position and
-    /// doubled by the double-angle formulas. Each doubling doubles an error of 1e-16, which gives 1e-13 at the last
-    /// octave.
+    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for k = 0; the
+    /// double-angle formulas then give those for k + 1 from those for k. Each doubling doubles the error, from 1e-16 at
+    /// first to 1e-13 at the last octave.
     pub fn encode(&self, position: &AttributeValues) -> Encoded {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
@@ -223,11 +231,11 @@ impl Network {
         Encoded { rows, values }
     }
 
-    /// Computes the outputs of the heads of the attributes `want` at `time`. The time is rounded to f32 as in the
-    /// original code. Other columns of `out` stay unchanged.
+    /// Computes into `out` the motion of the attributes `want` at `time`. The time is rounded to f32, as in the code of
+    /// the trainers. Other attributes of `out` stay unchanged.
     ///
     /// # Errors
-    /// `time` is not finite.
+    /// Fails if `time` is not finite.
     pub fn motion(&self, encoded: &Encoded, time: f64, want: Attributes, out: &mut PredictedMotion) -> Result<()> {
         let time = checked_time(time)?;
         for head in self.heads.iter().filter(|head| want.contains(head.column)) {
@@ -248,11 +256,11 @@ impl Network {
         Ok(())
     }
 
-    /// Computes the derivatives of [`PredictedMotion::warp`] at `time` with respect to canonical `position` `[3, N]`.
-    /// Plane 3·o + a is ∂ output o / ∂ axis a.
+    /// Computes the derivatives of [`PredictedMotion::warp`] at `time` with respect to the stored positions `position`
+    /// (`[3, N]`). Plane 3·o + a of the result is ∂ output o / ∂ axis a.
     ///
     /// # Errors
-    /// `time` is not finite.
+    /// Fails if `time` is not finite.
     pub fn slopes(&self, position: &AttributeValues, time: f64) -> Result<AttributeValues> {
         let time = checked_time(time)?;
         let encoded = self.encode(position);
@@ -268,21 +276,22 @@ impl Network {
         Ok(out)
     }
 
-    /// [`Network::evaluate`] compiled for AVX2 and FMA.
+    /// Calls [`Network::evaluate`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
     fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
         self.evaluate::<true>(encoded, time, want, out);
     }
 
-    /// [`Network::differentiate`] compiled for AVX2 and FMA.
+    /// Calls [`Network::differentiate`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
     fn differentiate_fma(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
         self.differentiate::<true>(encoded, time, out);
     }
 
-    /// Evaluates the heads `want` into `out`. Inlined with all callees into one copy per instruction set.
+    /// Computes the motion of the attributes `want` into `out`. The compiler inlines this function and its callees into
+    /// one copy per instruction set; `FMA` says whether fused multiply-adds are used.
     #[inline(always)]
     fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
         let (encoded_time, mut scratch) = (self.encode_time::<FMA>(time), NetworkScratch::default());
@@ -308,7 +317,7 @@ impl Network {
         }
     }
 
-    /// Returns the encoded time that the layers read, equal in all lanes.
+    /// Returns the encoding of `time` that the layers read. The values are equal for all Gaussians of a group.
     #[inline(always)]
     fn encode_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
         let mut now: Vec<CacheLine> =
@@ -322,7 +331,8 @@ impl Network {
         now
     }
 
-    /// Computes the derivatives of the position heads into `out`: one forward pass, and one backward pass per output.
+    /// Computes the derivatives of the position outputs with respect to the position into `out`, by one forward pass
+    /// and one backward pass per output.
     #[inline(always)]
     fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
         let encoded_time = self.encode_time::<FMA>(time);
@@ -355,7 +365,7 @@ impl Network {
                 head.output.backward::<FMA>(&gradient, activations.last().map(Vec::as_slice), &mut spare);
                 std::mem::swap(&mut gradient, &mut spare);
                 for (k, layer) in self.layers.iter().enumerate().rev() {
-                    // The encodings that a layer with a skip connection reads first are not outputs of a ReLU.
+                    // A layer with a skip connection first reads the encodings, which do not come out of a ReLU.
                     let before = k.checked_sub(1).map(|before| &activations[before][..]);
                     layer.linear.backward::<FMA>(&gradient, before.filter(|_| !layer.has_skip), &mut spare);
                     std::mem::swap(&mut gradient, &mut spare);
@@ -378,7 +388,7 @@ impl Network {
     }
 }
 
-/// Returns the time in f32, the precision of the network.
+/// Returns `time` rounded to f32, the precision of the network. Fails if `time` is not finite.
 fn checked_time(time: f64) -> Result<f32> {
     match time.is_finite() {
         true => Ok(time as f32),
@@ -398,7 +408,7 @@ fn encode_scalar(value: f32, octaves: usize) -> Vec<f32> {
     all
 }
 
-/// Adds `terms` to `sums`.
+/// Adds each entry of `terms` to the entry of `sums` with the same index.
 #[inline(always)]
 fn add(terms: &[CacheLine], sums: &mut [CacheLine]) {
     for (sums, terms) in sums.iter_mut().zip(terms) {
@@ -406,7 +416,8 @@ fn add(terms: &[CacheLine], sums: &mut [CacheLine]) {
     }
 }
 
-/// Sets the gradient to 0 where the activation is not positive, the derivative of ReLU.
+/// Multiplies `gradient` by the derivative of ReLU: sets it to 0 where the output of the ReLU (`activations`) is not
+/// positive.
 #[inline(always)]
 fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
     for (gradient, activations) in gradient.iter_mut().zip(activations) {
@@ -416,7 +427,8 @@ fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
     }
 }
 
-/// Returns the derivative along one axis, given the derivatives with respect to the encoded position.
+/// Returns the derivative with respect to the position along `axis`, from the derivatives `gradient` with respect to
+/// the encoded position.
 #[inline(always)]
 fn axis_derivative(axis: usize, position_encoding: &[CacheLine], gradient: &[CacheLine]) -> CacheLine {
     let mut sum = gradient[axis];

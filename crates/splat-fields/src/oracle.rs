@@ -1,25 +1,26 @@
-//! Slow, independent evaluation of a field in f64, one Gaussian at a time, directly from the definition.
+//! Slow, independent reference evaluation (oracle) of a deformation field in f64, one Gaussian at a time, directly from
+//! the definition.
 
 use crate::{FieldConfig, Tensors};
 use splat_core::{AttributeValues, Attributes, Gaussians};
 
-/// Raw or deformed parameters of one Gaussian.
+/// Attributes of one Gaussian in f64, as stored or as deformed at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// Position, 3 values, scene units.
+    /// Position: 3 values, scene units.
     pub position: Vec<f64>,
-    /// Quaternion, 4 values in the order w, x, y, z.
+    /// Rotation: quaternion, 4 values in the order w, x, y, z.
     pub rotation: Vec<f64>,
-    /// Natural logarithm of the scales, 3 values.
+    /// Natural logarithm of the scales: 3 values; scales are in scene units.
     pub log_scale: Vec<f64>,
-    /// Logit of the opacity, 1 value.
+    /// Logit of the opacity: 1 value.
     pub opacity_logit: Vec<f64>,
-    /// SH coefficients, 3·(degree + 1)² values.
+    /// SH coefficients of the color: 3·(degree + 1)² values.
     pub sh: Vec<f64>,
 }
 
 impl Parameters {
-    /// Returns the parameters of Gaussian `i`.
+    /// Returns the attributes of Gaussian `i` of `raw`.
     pub fn from_row(raw: &Gaussians, i: usize) -> Parameters {
         let values = |column: &AttributeValues| (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect();
         Parameters {
@@ -31,42 +32,43 @@ impl Parameters {
         }
     }
 
-    /// Returns all values in one list, in the order of the fields.
+    /// Returns the values of all attributes in one list, in the order in which this type declares them.
     pub fn values(&self) -> Vec<f64> {
         [&self.position[..], &self.rotation, &self.log_scale, &self.opacity_logit, &self.sh].concat()
     }
 }
 
-/// Reference evaluation of the deformation field that a state dict defines.
+/// Slow f64 evaluation (oracle) of the deformation field that a state dict defines.
 #[derive(Debug)]
 pub struct Oracle<'a> {
     /// State dict of the field.
     pub tensors: &'a Tensors,
-    /// Hyper-parameters that the field was trained with.
+    /// Options with which the field was trained.
     pub config: &'a FieldConfig,
 }
 
 impl Oracle<'_> {
-    /// Returns shape and values of the tensor `deformation_net.{name}`.
+    /// Returns the shape and the values of the tensor `deformation_net.{name}`.
     fn tensor(&self, name: &str) -> (&[usize], Vec<f64>) {
         let tensor = &self.tensors[&format!("deformation_net.{name}")];
         (&tensor.shape, tensor.data.iter().map(|&x| f64::from(x)).collect())
     }
 
-    /// Returns W·x + b of the layer `name`.
+    /// Returns the output W·x + b of the fully connected layer `name` for the input `x`.
     fn linear(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let (shape, weight) = self.tensor(&format!("{name}.weight"));
         let (_, bias) = self.tensor(&format!("{name}.bias"));
         (0..shape[0]).map(|o| bias[o] + (0..shape[1]).map(|i| weight[o * shape[1] + i] * x[i]).sum::<f64>()).collect()
     }
 
-    /// Returns the output of the head `name`: ReLU, linear layer, ReLU, linear layer.
+    /// Returns the output of the head (small MLP of one attribute) `name` for the input `x`: ReLU, linear layer, ReLU,
+    /// linear layer.
     fn head(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let hidden = self.linear(&format!("{name}.1"), &relu(x));
         self.linear(&format!("{name}.3"), &relu(&hidden))
     }
 
-    /// Returns the HexPlane features at position `p` and `time`.
+    /// Returns the HexPlane features at position `p` (scene units) and `time`.
     fn plane_features(&self, p: &[f64], time: f64) -> Vec<f64> {
         let (_, aabb) = self.tensor("grid.aabb");
         let mut u: Vec<f64> = (0..3).map(|a| (p[a] - aabb[a]) * 2.0 / (aabb[3 + a] - aabb[a]) - 1.0).collect();
@@ -100,7 +102,8 @@ impl Oracle<'_> {
         unreachable!("the loop ends at the first absent level")
     }
 
-    /// Returns the mask of `empty_voxel` at position `p`.
+    /// Returns the mask (factor on stored attributes) that the voxel grid of the option `empty_voxel` gives at position
+    /// `p`.
     fn voxel_mask(&self, p: &[f64]) -> f64 {
         let (shape, grid) = self.tensor("empty_voxel.grid");
         let (_, low) = self.tensor("empty_voxel.xyz_min");
@@ -119,7 +122,7 @@ impl Oracle<'_> {
         sum
     }
 
-    /// Returns the state of the Gaussian `raw` at `time`.
+    /// Returns the attributes at `time` of the Gaussian whose stored attributes are `raw`.
     pub fn state(&self, raw: &Parameters, time: f64) -> Parameters {
         let config = self.config;
         let mut features = if config.no_grid {
@@ -173,7 +176,7 @@ impl Oracle<'_> {
     }
 }
 
-/// Returns the positive part of every value.
+/// Returns max(x, 0) of every value x.
 fn relu(x: &[f64]) -> Vec<f64> {
     x.iter().map(|x| x.max(0.0)).collect()
 }

@@ -1,12 +1,13 @@
-//! HexPlane features: six bilinear samples per level, multiplied elementwise.
+//! HexPlane features of positions and time. Six planes span the axis pairs of x, y, z and time at each of several
+//! resolutions (levels). A feature of a level is the product of bilinear samples of its six planes.
 //!
-//! Input: canonical positions `[3, N]`, a time. Output: features `[Σ channels, LANES]`. Memory: 4·Σ channels +
-//! 36·levels bytes per prepared Gaussian. Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting",
-//! 2024, section 4.2.
+//! Input: stored positions `[3, N]`, a time. Output: features `[Σ channels, LANES]`, the channels of all levels for a
+//! group of Gaussians. Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian. Source: Cao & Johnson, "HexPlane",
+//! 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
 //!
-//! The three spatial samples do not depend on time, so their product is prepared once per block. All Gaussians share
-//! the time of a frame, so each time plane is first interpolated along time into a line. A Gaussian then interpolates
-//! between two points of that line.
+//! The samples of the three planes without time do not depend on time, so their product is computed once per block of
+//! Gaussians. All Gaussians share the time of a frame, so each plane with time is first interpolated along time into a
+//! line. A Gaussian then interpolates between two points of that line.
 
 use splat_core::AttributeValues;
 use splat_core::error::Result;
@@ -17,14 +18,16 @@ use super::tensors::Lookup;
 const X: usize = 0;
 const Y: usize = 1;
 const Z: usize = 2;
-/// Prefix of the names of all planes in the state dict. Level and plane number follow.
+/// Prefix of the names of all planes in the state dict. In a name, the level and the number of the plane (0 to 5)
+/// follow.
 const GRIDS: &str = "deformation_net.grid.grids.";
-/// Axis pairs of the planes without time, as (plane number in the state dict, a, b).
+/// Planes without time: (number of the plane in the state dict, first axis a, second axis b).
 pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
-/// Plane numbers of (x,t), (y,t), (z,t) in the state dict.
+/// Numbers of the planes over (x, t), (y, t) and (z, t) in the state dict.
 const TEMPORAL: [usize; 3] = [2, 4, 5];
 
-/// Plane over the axes (a, b), stored as `[size_b, size_a, channels]` so that one sample is contiguous.
+/// Plane of features over the axes a and b, stored as `[size_b, size_a, channels]`, so that the channels of a texel are
+/// contiguous.
 #[derive(Debug, Clone)]
 pub(super) struct FeaturePlane {
     pub(super) size_a: usize,
@@ -32,7 +35,7 @@ pub(super) struct FeaturePlane {
     texels: Vec<f32>,
 }
 
-/// Six planes of one resolution level.
+/// Six planes of features of one level (one of several resolutions).
 #[derive(Debug, Clone)]
 pub(super) struct Level {
     pub(super) channels: usize,
@@ -40,21 +43,23 @@ pub(super) struct Level {
     pub(super) temporal: [FeaturePlane; 3],
 }
 
-/// Time planes of a level interpolated at one time, by axis: `[size_a, channels]` each.
+/// The planes over (x, t), (y, t) and (z, t) of a level, interpolated at one time: one line `[size_a, channels]` for
+/// each of the axes x, y, z.
 pub(super) type TimeLines = [Vec<f32>; 3];
 
-/// Box that the planes cover.
+/// Box in space that the feature planes cover.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Box3 {
-    /// Corner mapped to −1. The model stores the MAX corner here.
+    /// Corner of the box that is mapped to the normalized coordinates −1, scene units. In trained models this is the
+    /// corner with the largest coordinates.
     pub(super) origin: [f32; 3],
-    /// Scale per axis: 2 / (other corner − origin).
+    /// Factor from scene units to normalized coordinates per axis: 2 / (other corner − `origin`).
     pub(super) factor: [f32; 3],
 }
 
 impl Box3 {
-    /// Creates the box between two corners, given as the values of `deformation_net.grid.aabb`. Returns `None` unless
-    /// the corners differ along every axis.
+    /// Creates the box between two corners, given as the six values of the tensor `deformation_net.grid.aabb`. Returns
+    /// `None` unless the corners differ along every axis.
     pub fn new(corners: &[f32]) -> Option<Box3> {
         let &[x0, y0, z0, x1, y1, z1] = corners else { return None };
         let origin = [x0, y0, z0];
@@ -62,42 +67,42 @@ impl Box3 {
         factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
     }
 
-    /// Maps `p` to normalized coordinates, −1 to 1 inside the box.
+    /// Converts a position `p` in scene units to normalized coordinates, which are −1 to 1 inside the box.
     #[inline(always)]
     pub fn normalized(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
     }
 }
 
-/// Planes of all levels and the box they cover.
+/// Feature planes of all levels (resolutions), and the box in space that they cover.
 #[derive(Debug, Clone)]
 pub(super) struct Planes {
     pub(super) space: Box3,
     pub(super) levels: Vec<Level>,
 }
 
-/// Interpolation between the texels `low` and `high` that a coordinate falls between.
+/// Linear interpolation at a coordinate between the two nearest texels along one axis.
 #[derive(Debug, Clone, Copy)]
 pub struct Tap {
-    /// Texel at or below the coordinate.
+    /// Index of the texel at or below the coordinate.
     pub low: u32,
-    /// Next texel, or `low` if that is the last one.
+    /// Index of the next texel, or `low` if there is no next one.
     pub high: u32,
-    /// Weight of `high`.
+    /// Weight of the texel `high`; the texel `low` has the weight 1 − `fraction`.
     pub fraction: f32,
 }
 
-/// Time-independent part of the features of a block.
+/// The part of the HexPlane features of a block of Gaussians that does not depend on time.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
-    /// Product of the spatial samples, `[rows, width]`.
+    /// Products of the samples of the three planes without time, `[rows, width]`.
     product: Vec<f32>,
-    /// Interpolation of x, y, z on the time lines of each level, `[rows, levels, 3]`.
+    /// Where to interpolate on the lines of the three planes with time, `[rows, levels, 3]` for x, y, z.
     taps: Vec<Tap>,
 }
 
 impl FeaturePlane {
-    /// Reads a plane. Returns it with its number of channels.
+    /// Reads a plane from the tensor `name`. Returns the plane and its number of channels.
     fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
         let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
         let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
@@ -111,13 +116,14 @@ impl FeaturePlane {
         Ok((FeaturePlane { size_a, size_b, texels }, channels))
     }
 
-    /// Returns the channels of one texel.
+    /// Returns the channels of the texel at index `a` along the first and `b` along the second axis.
     pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
         let start = (b as usize * self.size_a + a as usize) * channels;
         &self.texels[start..start + channels]
     }
 
-    /// Computes the bilinear sample at taps `a`, `b` into `out`, one value per channel.
+    /// Computes the bilinear sample of the plane into `out`, one value per channel. `a` and `b` say where to
+    /// interpolate along the two axes.
     fn sample(&self, a: Tap, b: Tap, out: &mut [f32]) {
         let channels = out.len();
         let corner = |ia, ib| self.texel(ia, ib, channels);
@@ -135,8 +141,9 @@ impl FeaturePlane {
     }
 }
 
-/// Returns the interpolation of normalized coordinate `u` on `size` texels, with `align_corners` and border padding. A
-/// NaN coordinate gives a NaN fraction, hence NaN features.
+/// Returns between which of `size` texels the normalized coordinate `u` lies. The first and last texel lie at −1 and 1
+/// (`align_corners`), and coordinates beyond them are clamped. A NaN coordinate gives a NaN fraction, hence NaN
+/// features.
 pub fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
@@ -144,10 +151,11 @@ pub fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// Returns the number of leading rows of a time plane that no time ≥ 0 reads.
+/// Returns the number of leading rows of a plane over an axis and time that no time ≥ 0 reads, so that they need not be
+/// stored.
 ///
-/// Rows are counted along the third extent of the tensor `name` of shape `shape`. Returns 0 for tensors that are not
-/// time planes. Time is not mapped to [−1, 1], so about half of each time plane is never read.
+/// `name` and `shape` are those of the tensor; rows are its third extent. Returns 0 for tensors that are not planes
+/// with time. Rows span the times −1 to 1, but models use times from 0 on, so about half of each plane is never read.
 pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
@@ -156,7 +164,7 @@ pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
     }
 }
 
-/// Returns the two texels of a line that a tap lies between, and the weight of the second one.
+/// Returns the channels of the two texels of `line` that `tap` lies between, and the weight of the second texel.
 #[inline(always)]
 pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
     let texel = |at: u32| &line[at as usize * channels..][..channels];
@@ -164,7 +172,7 @@ pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f
 }
 
 impl Planes {
-    /// Reads `deformation_net.grid.*`.
+    /// Reads all planes and their box from the tensors `deformation_net.grid.*`.
     pub(super) fn load(lookup: Lookup<'_>) -> Result<Self> {
         const AABB: &str = "deformation_net.grid.aabb";
         let aabb = &lookup.get_shaped(AABB, &[Some(2), Some(3)], "the two corners of the field's box")?.data;
@@ -186,23 +194,25 @@ impl Planes {
         Ok(Planes { space, levels })
     }
 
-    /// Returns the number of features per Gaussian: the channels of all levels.
+    /// Returns the number of features per Gaussian, which is the number of channels summed over all levels.
     pub(super) fn width(&self) -> usize {
         self.levels.iter().map(|level| level.channels).sum()
     }
 
-    /// Returns the bytes per Gaussian in [`PreparedPlanes`].
+    /// Returns the bytes of memory per Gaussian that [`PreparedPlanes`] takes.
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         4 * self.width() + 3 * self.levels.len() * size_of::<Tap>()
     }
 
-    /// Returns the corners of the box: (corner mapped to −1, corner mapped to +1).
+    /// Returns two corners of the box in scene units: the one mapped to normalized coordinates −1, then the one mapped
+    /// to +1.
     pub(super) fn corners(&self) -> ([f32; 3], [f32; 3]) {
         let Box3 { origin, factor } = self.space;
         (origin, std::array::from_fn(|axis| origin[axis] + 2.0 / factor[axis]))
     }
 
-    /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
+    /// Computes the part of the features that does not depend on time, for Gaussians at the stored positions `position`
+    /// (`[3, N]`).
     pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
         let rows = position.len();
         let width = self.width();
@@ -226,7 +236,7 @@ impl Planes {
         prepared
     }
 
-    /// Interpolates the time planes of every level at `time`.
+    /// Interpolates the planes with time at `time`. Returns one line per axis for every level.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
@@ -237,8 +247,9 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// Writes the features of `lanes` Gaussians of the prepared block, from `start` on, into `out` `[width, LANES]`.
-    /// Other lanes are 0.
+    /// Writes the features of `lanes` Gaussians of the prepared block, beginning with Gaussian `start`, into `out`
+    /// `[width, LANES]`. `lines` are the planes with time, interpolated at the wanted time. Values of unused lanes are
+    /// 0.
     #[inline(always)]
     pub(super) fn features(
         &self,
@@ -262,7 +273,8 @@ impl Planes {
                 let ([x0, x1], x) = texels(x, taps[0], n);
                 let ([y0, y1], y) = texels(y, taps[1], n);
                 let ([z0, z1], z) = texels(z, taps[2], n);
-                // Multiplies all three samples in one pass: separate passes would read and write the row three times.
+                // Multiplies the samples of all three axes in one loop: separate loops would read and write the row
+                // three times.
                 for c in 0..n {
                     let along_x = x0[c] * (1.0 - x) + x1[c] * x;
                     let along_y = y0[c] * (1.0 - y) + y1[c] * y;

@@ -1,22 +1,23 @@
-//! HexPlane features with their derivatives with respect to position.
+//! HexPlane features (products of samples of six feature planes) and their derivatives with respect to position.
 //!
-//! Input: canonical positions of a group, the time planes interpolated at one time. Output: features `[Σ channels,
-//! LANES]`, and as many derivatives for each axis. A feature is a product of six samples, so each derivative multiplies
-//! the derivative of one sample by the other five. Coordinates outside the box are clamped, so their derivative is 0.
-//! Memory: the stack.
+//! Input: stored positions of a group of Gaussians, and the planes with time, interpolated at one time. Output:
+//! features `[Σ channels, LANES]`, and for each axis as many derivatives. A feature is a product of six samples, so
+//! each derivative multiplies the derivative of one sample by the other five. Coordinates outside the box are clamped,
+//! so their derivative is 0. Allocates nothing beyond the output.
 
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, tap, texels};
 
-/// Returns the texels per unit of normalized coordinate `u` on `size` texels. Returns 0 where [`tap`] clamps `u`.
+/// Returns the derivative of the texel coordinate with respect to the normalized coordinate `u`, for `size` texels.
+/// Returns 0 where [`tap`] clamps `u`.
 fn texels_per_unit(u: f32, size: usize) -> f32 {
     if u.abs() <= 1.0 { (size - 1) as f32 / 2.0 } else { 0.0 }
 }
 
-/// Number of channels whose derivatives are computed together.
+/// Number of channels of a feature plane whose derivatives are computed together.
 const CHANNEL_CHUNK: usize = 8;
 
-/// Returns the channels of one sample from `first` on, 0 beyond the last.
+/// Returns [`CHANNEL_CHUNK`] channels from index `first` on, filled up with zeros if fewer are left.
 #[inline(always)]
 fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
     let rest = &channels[first..];
@@ -30,13 +31,14 @@ fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
     }
 }
 
-/// Four texels that two taps lie between.
+/// Four texels of a feature plane around a point, with the data for bilinear interpolation between them.
 struct BilinearPatch<'a> {
-    /// Texels at low b, then at high b; each pair at low a, then at high a.
+    /// Channels of the texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b are the
+    /// axes of the plane.
     corners: [&'a [f32]; 4],
-    /// Weights of the high texels along a and b.
+    /// Weights of the high texels along the axes a and b.
     fractions: [f32; 2],
-    /// Texels per unit of normalized coordinate along a and b.
+    /// Texels per unit of normalized coordinate along the axes a and b; 0 where coordinates are clamped.
     per_unit: [f32; 2],
 }
 
@@ -54,8 +56,8 @@ impl<'a> BilinearPatch<'a> {
         }
     }
 
-    /// Returns the channels from `first` on of the bilinear sample, and of its derivatives with respect to both
-    /// normalized coordinates.
+    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the bilinear sample and its derivatives with respect to
+    /// the normalized coordinates along a and b.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 3] {
         let [ll, hl] = [channel_chunk(self.corners[0], first), channel_chunk(self.corners[1], first)];
@@ -72,7 +74,8 @@ impl<'a> BilinearPatch<'a> {
     }
 }
 
-/// Two texels of a time line that a tap lies between.
+/// Two texels around a point on a line (a plane with time, interpolated at one time), with the data for linear
+/// interpolation between them.
 struct TimeLineSegment<'a> {
     ends: [&'a [f32]; 2],
     fraction: f32,
@@ -80,8 +83,8 @@ struct TimeLineSegment<'a> {
 }
 
 impl TimeLineSegment<'_> {
-    /// Returns the channels from `first` on of the sample, and of its derivative with respect to the normalized
-    /// coordinate.
+    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the interpolated sample and its derivative with respect
+    /// to the normalized coordinate.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 2] {
         let [low, high] = [channel_chunk(self.ends[0], first), channel_chunk(self.ends[1], first)];
@@ -95,8 +98,9 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
-    /// Writes features and derivatives (by axis) of the Gaussians at `[x, y, z]`, slices of at most [`LANES`] values.
-    /// Other lanes are unspecified.
+    /// Computes the features of up to [`LANES`] Gaussians at the positions `x`, `y`, `z` (scene units) into `features`,
+    /// and their derivatives with respect to x, y and z into `slopes`. `lines` are the planes with time, interpolated
+    /// at the wanted time. Values of unused lanes are unspecified.
     #[inline(always)]
     pub(super) fn features_with_slopes(
         &self,

@@ -1,15 +1,16 @@
-//! Fields with random weights for tests, the same on every run.
+//! Deformation fields with random weights for tests. The weights are the same on every run.
 
 pub mod deep;
 
 use crate::{FieldConfig, Tensor, Tensors};
 use splat_core::Attributes;
 
-/// Pseudo-random values in [−1, 1): the upper bits of a linear congruential generator with the given state.
+/// Generator of pseudo-random values in [−1, 1), which are the upper bits of a linear congruential generator. Its state
+/// is the field of this type.
 pub struct Noise(pub u64);
 
 impl Noise {
-    /// Returns the next value.
+    /// Returns the next pseudo-random value in [−1, 1).
     #[allow(clippy::should_implement_trait)]
     pub fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -17,12 +18,13 @@ impl Noise {
     }
 }
 
-/// Width of the hidden layers. Not a multiple of the number of outputs that are summed together.
+/// Number of outputs of the hidden layers. Deliberately not a multiple of the number of outputs that a layer sums
+/// together.
 const WIDTH: usize = 22;
-/// Number of feature channels per plane.
+/// Number of channels of each feature plane.
 const CHANNELS: usize = 5;
 
-/// Returns a configuration in which every attribute deforms and all options are off.
+/// Returns options of a field in which every attribute is deformed and every other option is off.
 pub fn plain() -> FieldConfig {
     FieldConfig {
         active: Attributes::all(),
@@ -34,8 +36,9 @@ pub fn plain() -> FieldConfig {
     }
 }
 
-/// Returns a random state dict for `config` with `depth` trunk layers and SH degree 3. Resolutions differ along every
-/// axis, so that a test fails if axes are swapped.
+/// Returns a state dict with random weights for a field with the options `config`, `depth` layers in its trunk (the MLP
+/// shared by all attributes), and SH degree 3. Feature planes have a different resolution along each axis, so that a
+/// test fails if axes are swapped.
 pub fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
     let mut noise = Noise(7);
     let mut tensors = Tensors::new();

@@ -1,4 +1,4 @@
-//! Named tensors of a state dict, looked up one by one with an expected shape.
+//! Named tensors of a state dict (the saved parameters of a network), looked up one by one with an expected shape.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,16 +8,16 @@ use splat_core::error::{Error, Result};
 /// Dense tensor, row-major (last index fastest).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Extents, outermost first. Empty for a scalar.
+    /// Number of elements along each index, outermost index first. Empty for a scalar.
     pub shape: Vec<usize>,
-    /// Values; their number is the product of `shape`.
+    /// Values of all elements; their number is the product of `shape`.
     pub data: Vec<f32>,
 }
 
-/// State dict: tensors by dotted name.
+/// State dict (saved parameters of a network): tensors by dotted name.
 pub type Tensors = BTreeMap<String, Tensor>;
 
-/// Access to the state dict of the file `path`. Every error names the tensor.
+/// State dict that was read from the file `path`, for looking up tensors. Every error names the file and the tensor.
 #[derive(Clone, Copy)]
 pub(super) struct Lookup<'a> {
     pub(super) tensors: &'a Tensors,
@@ -25,7 +25,8 @@ pub(super) struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    /// Returns the tensor `name`, whose values must be finite. `why` is shown in errors: the use of the tensor.
+    /// Returns the tensor `name`. Fails if the tensor is missing or a value is not finite. `why` says in errors what
+    /// the tensor is used for.
     pub(super) fn get(&self, name: &str, why: &str) -> Result<&'a Tensor> {
         let tensor = self.tensors.get(name).ok_or_else(|| {
             Error::input(self.path, format!("tensor {name}"), format!("a tensor of this name ({why})"), "none")
@@ -37,7 +38,8 @@ impl<'a> Lookup<'a> {
         Ok(tensor)
     }
 
-    /// Returns the tensor `name`, which must be finite and of shape `shape`. `None` in `shape` accepts any extent.
+    /// Returns the tensor `name`. Fails if the tensor is missing, a value is not finite, or its shape differs from
+    /// `shape`, in which `None` accepts any extent. `why` says in errors what the tensor is used for.
     pub(super) fn get_shaped(&self, name: &str, shape: &[Option<usize>], why: &str) -> Result<&'a Tensor> {
         let tensor = self.get(name, why)?;
         let fits = tensor.shape.len() == shape.len()
@@ -49,7 +51,8 @@ impl<'a> Lookup<'a> {
         Err(self.mismatch(name, format!("shape [{}] ({why})", want.join(", ")), format!("{:?}", tensor.shape)))
     }
 
-    /// Returns the number of outputs and inputs of the matrix `name`. `why` is shown in errors: the use of the matrix.
+    /// Returns the numbers of outputs (rows) and inputs (columns) of the weight matrix `name`. `why` says in errors
+    /// what the matrix is used for.
     pub(super) fn matrix(&self, name: &str, why: &str) -> Result<[usize; 2]> {
         let shape = &self.get_shaped(name, &[None, None], why)?.shape;
         Ok([shape[0], shape[1]])
@@ -60,7 +63,7 @@ impl<'a> Lookup<'a> {
         self.tensors.contains_key(name)
     }
 
-    /// Returns the error of a tensor with unexpected content.
+    /// Creates the error of a tensor `name` whose shape or values are not as expected.
     pub(super) fn mismatch(&self, name: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("tensor {name}"), expected, found)
     }

@@ -5,7 +5,7 @@ use crate::oracle::{Oracle, Parameters};
 use crate::synthetic::{Noise, plain, tensors};
 use splat_core::{AttributeValues, Attributes, Gaussians, Gradients};
 
-/// Returns random raw Gaussians, some of them outside the box of the field.
+/// Returns random stored Gaussians, some of them outside the box that the feature planes cover.
 fn random_gaussians(len: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut gaussians = Gaussians::zeros(len, 3);
@@ -15,7 +15,8 @@ fn random_gaussians(len: usize) -> Gaussians {
     gaussians
 }
 
-/// Returns state and deltas of `raw` at `time` in the attributes `want`.
+/// Returns the attributes of the Gaussians `raw` at `time`, and the deltas that lead to them, for the attributes
+/// `want`.
 fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
     field.deltas(&field.prepare(&raw.position), time, want, &mut Scratch::default(), &mut deltas).unwrap();
@@ -24,17 +25,18 @@ fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gauss
     (state, deltas)
 }
 
-/// Builds a field with random weights.
+/// Builds a deformation field with random weights and `depth` layers in its trunk.
 fn build(config: &FieldConfig, depth: usize) -> Field {
     Field::new(&tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
 }
 
-/// Returns all components of Gaussian `i`.
+/// Returns all components of an attribute of Gaussian `i`.
 fn values(column: &AttributeValues, i: usize) -> Vec<f64> {
     (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect()
 }
 
-/// Asserts that states of random Gaussians match the f64 oracle. `what` names the case in failures.
+/// Asserts that the attributes that a field computes for random Gaussians match the f64 reference (oracle). `what`
+/// names the tested case in failures.
 fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
     let tensors = tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
@@ -52,7 +54,8 @@ fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
                 (&state.sh, &expected.sh),
             ] {
                 for (got, expected) in values(column, i).into_iter().zip(expected) {
-                    // About 60 f32 roundings of numbers of this size. A wrong axis or order causes an error of 0.1.
+                    // Allows for about 60 f32 roundings of numbers of this size. A wrong axis or order causes an error
+                    // of 0.1.
                     let tolerance = 2e-5 * (1.0 + expected.abs());
                     assert!(
                         (got - expected).abs() <= tolerance,
@@ -195,14 +198,14 @@ fn an_empty_block_is_empty() {
     assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Attributes::all()).0.is_empty());
 }
 
-/// Returns the error message of a field built from changed tensors.
+/// Returns the error message of building a field from tensors that `change` has altered.
 fn field_error(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
     let mut tensors = tensors(&config, 1);
     change(&mut tensors);
     Field::new(&tensors, config, 3, Path::new("synthetic.pth")).expect_err("must be refused").to_string()
 }
 
-/// Asserts that a message contains all `parts`.
+/// Asserts that `message` contains all texts in `parts`.
 fn assert_contains(message: &str, parts: &[&str]) {
     for part in parts {
         assert!(message.contains(part), "expected {part:?} in: {message}");
@@ -267,7 +270,7 @@ fn times_that_are_not_finite_are_refused() {
     assert_contains(&error.to_string(), &["NaN"]);
 }
 
-/// Returns the values of an attribute for writing.
+/// Returns the values of the attribute `column` for writing.
 fn column_mut(parameters: &mut Parameters, column: Attributes) -> &mut Vec<f64> {
     match column {
         Attributes::POSITION => &mut parameters.position,
@@ -278,7 +281,8 @@ fn column_mut(parameters: &mut Parameters, column: Attributes) -> &mut Vec<f64> 
     }
 }
 
-/// Returns derivatives with respect to the state that are random in `columns` and 0 in other attributes.
+/// Returns derivatives ∂L/∂state of a loss for `len` Gaussians, random for the attributes `columns` and 0 for the
+/// others.
 fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
     let mut noise = Noise(5);
     let mut gradients = Gradients::new(len, Attributes::all(), 3);
@@ -288,15 +292,16 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
     gradients
 }
 
-/// Returns derivatives with respect to raw parameters, given those with respect to the state.
+/// Converts `gradients` from derivatives with respect to the attributes at `time` to derivatives with respect to the
+/// stored attributes `raw`.
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
     field.jacobian(raw, time, gradients.columns()).unwrap().pull_back(&mut pulled);
     pulled
 }
 
-/// Asserts that the derivatives of each attribute's state with respect to its own raw values match finite differences
-/// of the oracle.
+/// Asserts that the derivatives of each attribute at a time with respect to its own stored values match finite
+/// differences of the f64 reference (oracle), for the attributes `columns`.
 fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Attributes) {
     let tensors = tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
@@ -317,8 +322,9 @@ fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize
                 let step = 1e-7;
                 let expected = (value(step) - value(-step)) / (2.0 * step);
                 let got = f64::from(by_raw.column(column).plane(c)[i]);
-                // f32 rounding over about a hundred sums. A wrong axis, mask or order causes an error of 0.1. A kink of
-                // a ReLU or plane within the step would also fail; the fixed random data has none.
+                // Allows for f32 rounding in about a hundred sums. A wrong axis, mask or order causes an error of 0.1.
+                // A kink of a ReLU or of a plane within the step of the finite difference would also fail; the fixed
+                // random data has none.
                 let tolerance = 1e-4 * (1.0 + expected.abs());
                 assert!(
                     (got - expected).abs() <= tolerance,
@@ -344,7 +350,8 @@ fn derivatives_match_finite_differences_for_every_flag() {
     assert_derivatives_match_oracle("apply_rotation", FieldConfig { apply_rotation: true, ..plain() }, 1, all);
     let fixed = FieldConfig { active: all.difference(Attributes::POSITION | Attributes::SH), ..plain() };
     assert_derivatives_match_oracle("without two heads", fixed, 1, all);
-    // Under a mask the Jacobian of positions neglects the field.
+    // If the field has a mask, the Jacobian of positions neglects the derivative of the deltas, so positions are not
+    // tested.
     let masked = all.difference(Attributes::POSITION);
     assert_derivatives_match_oracle(
         "static_mlp",

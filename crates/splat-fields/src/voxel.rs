@@ -1,24 +1,26 @@
-//! Mask of `empty_voxel`: a scalar grid over the box of the scene, sampled at canonical positions.
+//! Mask of a deformation field with the option `empty_voxel`: a grid of factors over the box of the scene, interpolated
+//! at the stored positions of the Gaussians.
 
 use splat_core::AttributeValues;
 use splat_core::error::{Error, Result};
 
 use super::tensors::Lookup;
 
-/// Grid of mask values `[1, 1, X, Y, Z]` between two corners.
+/// Grid of mask values (factors on stored attributes), of shape `[1, 1, X, Y, Z]`, between two corners in space.
 #[derive(Debug, Clone)]
 pub(super) struct VoxelMask {
-    /// Position of the first grid point, scene units.
+    /// Position of the first grid point of each axis, scene units.
     low: [f32; 3],
-    /// Position of the last grid point, scene units.
+    /// Position of the last grid point of each axis, scene units.
     high: [f32; 3],
     size: [usize; 3],
     values: Vec<f32>,
 }
 
 impl VoxelMask {
-    /// Reads `deformation_net.empty_voxel.*`. Only some versions save the corners of the grid. Without them `corners`,
-    /// the (max, min) corners of the planes' box, are used, because training sets both to the same box.
+    /// Reads the grid from the tensors `deformation_net.empty_voxel.*`. Only some versions of the trainer save the
+    /// corners of the grid. If they are missing, `corners` is used, the (maximum, minimum) corners of the box of the
+    /// feature planes, because training sets both boxes to the same values.
     pub(super) fn load(lookup: Lookup<'_>, corners: Option<([f32; 3], [f32; 3])>) -> Result<Self> {
         let name = |part: &str| format!("deformation_net.empty_voxel.{part}");
         let grid = lookup.get_shaped(&name("grid"), &[Some(1), Some(1), None, None, None], "empty_voxel=True")?;
@@ -37,12 +39,13 @@ impl VoxelMask {
         Ok(VoxelMask { low, high, size: [grid.shape[2], grid.shape[3], grid.shape[4]], values: grid.data.clone() })
     }
 
-    /// Returns the mask of every Gaussian: trilinear interpolation, corners aligned, zero outside the box.
+    /// Returns the mask of every Gaussian at `position` (`[3, N]`): the grid interpolated trilinearly, with grid points
+    /// on the corners of the box, and 0 outside the box.
     pub(super) fn sample(&self, position: &AttributeValues) -> Vec<f32> {
         (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
     }
 
-    /// Returns the mask at position `p`.
+    /// Returns the mask at position `p` (scene units) by trilinear interpolation.
     fn sample_one(&self, p: [f32; 3]) -> f32 {
         let at: [f32; 3] = std::array::from_fn(|axis| {
             let u = (p[axis] - self.low[axis]) / (self.high[axis] - self.low[axis]) * 2.0 - 1.0;

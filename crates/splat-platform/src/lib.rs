@@ -1,7 +1,8 @@
-//! Code that differs between Linux, macOS and Windows: files, folders, signals and memory limits.
+//! Code that differs between Linux, macOS and Windows: files, folders, signals, memory maps, and memory limits.
 //!
-//! Other crates of the workspace contain no code for one operating system. Each function below exists on all three
-//! systems with the same signature. **Only Linux is tested.** The code for macOS and Windows is type-checked.
+//! Other crates of the workspace contain no code for one operating system. Each function of this table exists on all
+//! three systems with the same signature; the columns say how it works there. **Only Linux is tested.** The code for
+//! macOS and Windows is type-checked.
 //!
 //! | | Linux | macOS | Windows |
 //! |---|---|---|---|
@@ -24,8 +25,8 @@
 //!
 //! File locks are those of [`std::fs::File`]: `flock` on Linux and macOS, `LockFileEx` on Windows.
 //!
-//! The crate `sysinfo` was considered for memory limits. It reads only the limit at the root of the control groups. It
-//! misses the limits of the process's own group and of its parent groups, `memory.high`, and groups that are mounted
+//! The crate `sysinfo` was considered for memory limits. It reads only the limit of the root control group, and misses
+//! `memory.high`, the limits of the group of the process and of its parent groups, and groups that are mounted
 //! elsewhere. This crate therefore reads the limits itself ([`memory_limits`]).
 //!
 //! ```
@@ -76,7 +77,7 @@ pub use windows::{
     release_pages, report_cut_short_maps, reset_peak_memory, sync_file, sync_folder,
 };
 
-/// Identity of a file or folder. Two paths have equal identities exactly if both lead to the same file or folder.
+/// Identity of a file or folder. Two paths have the same identity if and only if both lead to the same file or folder.
 ///
 /// The identity consists of device and inode on Linux and macOS, and of volume serial number and file index on Windows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -85,30 +86,30 @@ pub struct FileIdentity {
     number: u64,
 }
 
-/// Identity and length of a file.
+/// Status of a file: its identity and length.
 ///
-/// Constructors: `from_file` for an open file, and `from_path`, which follows links.
+/// Create it with `from_file` for an open file, or with `from_path`, which follows links, for a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FileStatus {
-    /// Identity, which differs if another file takes the name of this one.
+    /// Identity of the file. Differs after another file has replaced this one under the same path.
     pub identity: FileIdentity,
-    /// Length in bytes.
+    /// Length of the file in bytes.
     pub length: u64,
 }
 
-/// Identity, owner and permissions of a folder.
+/// Status of a folder: its identity, owner and permissions.
 #[derive(Debug, Clone, Copy)]
 pub struct FolderStatus {
-    /// Identity, which differs if another folder takes the name of this one.
+    /// Identity of the folder. Differs after another folder has replaced this one under the same path.
     pub identity: FileIdentity,
-    /// Whether the folder belongs to the user of this process. False if the system does not tell, as on Windows.
+    /// Whether the folder belongs to the user of this process. False if the system gives no answer, as on Windows.
     pub is_own: bool,
-    /// Whether group and others may neither read nor write the folder. False if the system does not tell, as on
+    /// Whether all users but the owner are denied access to the folder. False if the system gives no answer, as on
     /// Windows.
     pub is_private: bool,
 }
 
-/// Kind of a folder entry. Windows distinguishes only files, folders, links and others.
+/// Kind of an entry of a folder. On Windows, only the kinds file, folder, link and other occur.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
     /// Regular file.
@@ -125,12 +126,12 @@ pub enum FileKind {
     CharacterDevice,
     /// Device that is read or written in blocks, such as a disk.
     BlockDevice,
-    /// Kind that no other variant covers.
+    /// Any kind of entry that is not listed above.
     Other,
 }
 
 impl FileKind {
-    /// Returns the kind of a file type of the standard library.
+    /// Converts a file type of the standard library.
     pub fn from_type(found: FileType) -> FileKind {
         match found {
             found if found.is_file() => FileKind::File,
@@ -144,10 +145,10 @@ impl FileKind {
     }
 }
 
-/// Limit of the memory that this process may use.
+/// Limit of the memory that this process may use, and where it was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MemoryLimit {
-    /// Limit in bytes, as the system states it: 0 and numbers from [`UNLIMITED_BYTES`] on mean no limit.
+    /// Limit in bytes, as the system reports it: 0 and numbers from [`UNLIMITED_BYTES`] on mean no limit.
     pub bytes: u64,
     /// Part of the system that sets the limit.
     pub source: LimitSource,
@@ -158,7 +159,7 @@ pub struct MemoryLimit {
 pub enum LimitSource {
     /// Physical memory of the machine.
     Machine,
-    /// Linux control group, with the file that holds the limit.
+    /// Linux control group. Contains the path of the file that holds the limit.
     ControlGroup(PathBuf),
     /// Windows job object.
     JobObject,
@@ -168,32 +169,33 @@ pub enum LimitSource {
     DataSize,
 }
 
-/// Memory limits that the system states.
+/// All memory limits that the system reports for this process.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MemoryLimits {
-    /// Limits outside the process: of the machine, then of control groups or job objects.
+    /// Limits that apply to more than this process: the physical memory of the machine first, then control groups or
+    /// job objects.
     pub around: Vec<MemoryLimit>,
-    /// Limits of the process itself.
+    /// Limits of this process alone.
     pub own: Vec<MemoryLimit>,
 }
 
-/// Smallest number of bytes that means "no limit". Version 1 control groups without a limit state a number of this
-/// size.
+/// Smallest number of bytes that means "no limit". Control groups of version 1 without a limit report a number of this
+/// size or more.
 pub const UNLIMITED_BYTES: u64 = 1 << 62;
 
-/// Text that the process writes to standard error before it ends because a mapped file was truncated: `before`, the
-/// path, `after`.
+/// Message that the process writes to standard error before it ends because a file that it had mapped to memory was
+/// truncated. It consists of `before`, the path of the file, and `after`.
 #[derive(Debug, Clone, Copy)]
 pub struct TruncatedMapMessage {
-    /// Text before the path.
+    /// Text before the path of the file.
     pub before: &'static str,
-    /// Text in place of a path that is unknown.
+    /// Text instead of the path if the path is unknown.
     pub unknown_path: &'static str,
-    /// Text after the path, including its line break.
+    /// Text after the path of the file. Must end with a line break.
     pub after: &'static str,
 }
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

@@ -1,4 +1,4 @@
-//! macOS: memory limits, and functions without a macOS equivalent. Type-checked only.
+//! Implementation for macOS: memory limits, and functions that can do nothing there. Type-checked only.
 
 use std::fs::File;
 use std::mem::{MaybeUninit, size_of};
@@ -7,12 +7,13 @@ use rustix::process::{Resource, getrlimit};
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits, TruncatedMapMessage};
 
-/// Returns `None`: macOS does not tell whether reading the byte at `offset` needs disk access.
+/// Returns `None`: macOS gives no answer to whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
     None
 }
 
-/// Does nothing. macOS does not tell a process which file a page belongs to, so SIGBUS ends the process.
+/// Does nothing. macOS gives a process no information on the file that a page belongs to, so the signal SIGBUS, sent
+/// after a mapped file was truncated, ends the process.
 pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
 
 /// Returns the physical memory of the machine and the limits that `ulimit` sets for the process.
@@ -26,7 +27,7 @@ pub fn memory_limits() -> MemoryLimits {
     MemoryLimits { around: machine.into_iter().collect(), own: own.collect() }
 }
 
-/// Returns the physical memory of the machine in bytes.
+/// Returns the physical memory of the machine in bytes, or `None` if the system gives no answer.
 fn machine_bytes() -> Option<u64> {
     let mut bytes = 0u64;
     let mut size = size_of::<u64>();
@@ -37,7 +38,8 @@ fn machine_bytes() -> Option<u64> {
     (code == 0 && size == size_of::<u64>()).then_some(bytes)
 }
 
-/// Returns the largest resident memory of this process so far in bytes, including mapped pages.
+/// Returns the largest resident memory (in physical memory, mapped files included) that this process has had so far, in
+/// bytes. Returns `None` if the system gives no answer.
 pub fn peak_memory_bytes() -> Option<u64> {
     let mut usage = MaybeUninit::<libc::rusage>::uninit();
     // SAFETY: the call writes to `usage`, which has the expected size and alignment. `usage` is read only if the call

@@ -1,42 +1,46 @@
-//! Assignment of splats to tiles, front to back.
+//! Assignment of splats (image footprints of Gaussians) to tiles, in the order from front to back.
 //!
-//! One radix sort orders all splats of a render by depth. A counting sort then assigns them to tiles and keeps that
-//! order. It handles one strip of tiles at a time: the total number of pairs depends on the view, the number in memory
-//! does not. Memory: 16 bytes per splat, 4 bytes per pair of a splat and a tile of the strip.
+//! One radix sort orders all splats of a render by depth. A counting sort then lists the splats of each tile in this
+//! order. The lists, of (splat, tile) pairs, are in memory only for one strip of tiles at a time, so their memory is
+//! limited in every view. Memory: 16 bytes per splat, and 4 bytes per pair of the strip.
 
 use std::ops::Range;
 
 use super::project::{Splats, TileRect};
 
-/// Maximum number of pairs in a strip, unless a single tile has more.
+/// Maximum number of (splat, tile) pairs in a strip of tiles, unless a single tile has more.
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
 
-/// Number of splats whose tiles are read together. Read one by one, each would wait for memory alone.
+/// Number of splats whose tile rectangles are read together, so that the reads wait for memory at the same time.
 const PREFETCHED: usize = 64;
 
-/// Indices of splats, grouped by tile, nearest first.
+/// Lists of the splats of each tile, nearest splat first.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Bins {
-    /// Sort key of every splat, sorted: (ordered depth bits, splat index).
+    /// Sorted sort keys of all splats. The upper half of a key is the depth as ordered bits, the lower half the index
+    /// of the splat.
     keys: Vec<u64>,
     /// Buffer for sorting.
     spare: Vec<u64>,
     /// Number of tiles per row.
     tiles_across: usize,
-    /// End of each tile's pairs among the pairs of the whole render. Tile t begins where tile t − 1 ends.
+    /// For each tile, the number of (splat, tile) pairs up to and including this tile, over the whole render. The pairs
+    /// of a tile begin where those of the previous tile end.
     ends: Vec<usize>,
-    /// First tile that has not been returned yet.
+    /// First tile that [`Bins::next_strip`] has not returned yet.
     next_tile: usize,
-    /// Tiles whose pairs are in memory.
+    /// Tiles whose (splat, tile) pairs are in memory.
     strip: Range<usize>,
-    /// Splat indices of the strip, tile after tile.
+    /// Splat of every (splat, tile) pair of the strip, tile after tile.
     pairs: Vec<u32>,
-    /// Index in `pairs` for the next pair of each tile of the strip, then the end of all pairs.
+    /// For each tile of the strip, the index in `pairs` at which its next splat is written; at the end, the number of
+    /// all pairs.
     next_slots: Vec<u32>,
 }
 
 impl Bins {
-    /// Sorts `splats` and counts their pairs with `tiles` = (across, down) tiles. No pairs are in memory yet.
+    /// Sorts `splats` by depth and counts the splats of each tile, in an image of `tiles` = (across, down) tiles. No
+    /// (splat, tile) pairs are in memory yet.
     pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2]) {
         self.keys.clear();
         self.keys.reserve_exact(splats.splats.len());
@@ -65,15 +69,17 @@ impl Bins {
         self.next_tile = 0;
     }
 
-    /// Restarts [`Bins::next_strip`] at the first tile. If one strip held all tiles, its pairs are kept.
+    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are kept in
+    /// memory.
     pub(super) fn rewind(&mut self) {
         self.next_tile = 0;
     }
 
-    /// Computes the pairs of the next strip of tiles and returns its tiles, or `None` after the last tile.
+    /// Computes the (splat, tile) pairs of the next strip of tiles. Returns the tiles of the strip, or `None` after the
+    /// last tile.
     ///
-    /// A strip consists of whole rows of tiles with at most `max_pairs` pairs, else of a part of a row, else of one
-    /// tile. `splats` are those of [`Bins::begin`].
+    /// A strip is as many whole rows of tiles as have at most `max_pairs` pairs; if one row has more, it is a part of a
+    /// row, and at least one tile. `splats` must be those given to [`Bins::begin`].
     pub(super) fn next_strip(&mut self, splats: &Splats, max_pairs: usize) -> Option<Range<usize>> {
         if self.is_last_strip() {
             return None;
@@ -114,8 +120,8 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Returns the first part of the non-empty `tiles`: whole rows with at most `max_pairs` pairs, else a part of a
-    /// row, else one tile.
+    /// Returns the first tiles of the non-empty range `tiles` that have at most `max_pairs` (splat, tile) pairs: whole
+    /// rows of tiles if possible, else a part of a row, and at least one tile.
     fn first_part(&self, tiles: Range<usize>, max_pairs: usize) -> Range<usize> {
         let Range { start: first, end: last } = tiles;
         let before = self.start(first);
@@ -125,7 +131,8 @@ impl Bins {
         first..if whole_rows > first && end < last { whole_rows } else { end }
     }
 
-    /// Splits `tiles` into parts of at most `max_pairs` pairs, or of one tile.
+    /// Splits `tiles` into parts with at most `max_pairs` (splat, tile) pairs each. A tile with more pairs is a part of
+    /// its own.
     pub(super) fn parts(&self, mut tiles: Range<usize>, max_pairs: usize) -> impl Iterator<Item = Range<usize>> {
         std::iter::from_fn(move || {
             let part = (!tiles.is_empty()).then(|| self.first_part(tiles.clone(), max_pairs))?;
@@ -134,18 +141,19 @@ impl Bins {
         })
     }
 
-    /// Returns whether all tiles have been returned.
+    /// Returns whether [`Bins::next_strip`] has returned all tiles.
     pub(super) fn is_last_strip(&self) -> bool {
         self.next_tile == self.ends.len()
     }
 
-    /// Returns the splats of every (splat, tile) pair of `tiles` of the strip, tile after tile.
+    /// Returns the splat of every (splat, tile) pair of `tiles`, tile after tile. The tiles must lie in the strip.
     pub(super) fn pairs(&self, tiles: Range<usize>) -> &[u32] {
         let before = self.start(self.strip.start);
         &self.pairs[self.start(tiles.start) - before..self.start(tiles.end) - before]
     }
 
-    /// Iterates over the tile rows that `tiles` touches: the row, and the tiles of that row as a range of x.
+    /// Iterates over the rows of tiles that `tiles` touches. Yields the index of the row, and the columns of the tiles
+    /// in that row.
     pub(super) fn rows(&self, tiles: Range<usize>) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
         let tiles_across = self.tiles_across;
         (tiles.start / tiles_across.max(1)..tiles.end.div_ceil(tiles_across.max(1))).map(move |y| {
@@ -154,22 +162,22 @@ impl Bins {
         })
     }
 
-    /// Returns the splats of the tiles `x` of row `y`, which must lie in the strip.
+    /// Returns the splats of the tiles in row `y` and columns `x`, tile after tile. The tiles must lie in the strip.
     pub(super) fn pairs_in_row(&self, y: usize, x: Range<usize>) -> &[u32] {
         self.pairs(y * self.tiles_across + x.start..y * self.tiles_across + x.end)
     }
 
-    /// Returns the index of the first pair of a tile among the pairs of the whole render.
+    /// Returns the number of (splat, tile) pairs before those of `tile`, over the whole render.
     fn start(&self, tile: usize) -> usize {
         tile.checked_sub(1).map_or(0, |before| self.ends[before])
     }
 }
 
-/// Number of bits of a radix sort digit. The counts of one digit stay in the first-level cache.
+/// Number of bits of a digit of the radix sort. The counts of all values of a digit fit in the first-level cache.
 const DIGIT_BITS: u32 = 11;
 
-/// Sorts keys by their upper halves. Ties keep their order, so the lower halves must increase at the start. `spare` is
-/// a buffer.
+/// Sorts `keys` by their upper halves. Keys with equal upper halves keep their order, so their lower halves must
+/// increase beforehand. `spare` is a buffer.
 fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     spare.clear();
     spare.resize(keys.len(), 0);
@@ -192,8 +200,8 @@ fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     }
 }
 
-/// Returns bits that are ordered like the f32 values. Negative values occur, because rounding far from the origin can
-/// give a visible Gaussian a negative f32 depth.
+/// Returns bits that, as integers, have the same order as the f32 values. Negative depths occur, because rounding far
+/// from the origin can give a visible Gaussian a negative f32 depth.
 fn ordered_bits(x: f32) -> u32 {
     let bits = x.to_bits();
     if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }

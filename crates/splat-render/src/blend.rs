@@ -1,9 +1,9 @@
-//! Front-to-back blending of one tile, in groups of eight pixels.
+//! Front-to-back blending of the splats (image footprints of Gaussians) of one tile, in groups of eight pixels.
 //!
 //! Input: the splats of the tile, nearest first. Output: the transmittance of each pixel, and the result of a
-//! [`BlendSink`], which receives the weights alpha · transmittance. Memory: the pixels of a tile and the footprints of
-//! [`LOOKAHEAD`] splats, in the first-level cache. `benches/render.rs` measures the distance from the time of the
-//! arithmetic alone.
+//! [`BlendSink`], which receives the weight alpha · transmittance of each splat in each pixel. Memory: the pixels of a
+//! tile and the footprints of [`LOOKAHEAD`] splats, in the first-level cache. `benches/render.rs` compares the time
+//! with that of the arithmetic alone.
 
 use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 use super::lanes::{Aligned, LANES, Lanes, Portable, Sums};
@@ -11,32 +11,32 @@ use super::project::Splat;
 
 /// Side of a tile in pixels.
 const SIDE: usize = TILE as usize;
-/// Number of groups of eight pixels in a tile. Group `row + 16 · column` covers eight neighbors of one row.
+/// Number of groups of eight pixels in a tile. Group `row + 16 · half` is the left (0) or right (1) half of a row.
 pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 
-/// Bits of the groups in even rows.
+/// Bit set of the groups of pixels in even rows of a tile.
 const EVEN_ROWS: u32 = 0x5555_5555;
 
-/// One f32 per sampled pixel of a tile.
+/// One f32 for each sampled pixel of a tile, by group of eight pixels.
 pub(super) type TilePlane = Aligned<[[f32; LANES]; GROUPS]>;
 
-/// One f32 per row or column of a tile.
+/// One f32 for each sampled row, or each sampled column, of a tile.
 type TileLine = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
-/// Sampled pixels of a tile: every `stride`-th pixel of the image in both directions.
+/// Sampled pixels of a tile: every `stride`-th pixel of the image in both directions. With stride 1, all pixels.
 ///
-/// Samples are packed toward the corner of the tile, so that a larger stride leaves fewer groups and no half-empty
-/// ones.
+/// The samples are stored next to each other, so that a larger stride leaves fewer groups of eight pixels instead of
+/// partly filled ones.
 pub(super) struct SampledPixels {
-    /// Left edge of the tile, pixels.
+    /// Left edge of the tile in the image, pixels.
     x0: f64,
-    /// Upper edge of the tile, pixels.
+    /// Upper edge of the tile in the image, pixels.
     y0: f64,
-    /// Offsets of the sampled columns from the left edge, pixels.
+    /// Offset of each sampled column from the left edge of the tile, pixels.
     xs: TileLine,
-    /// Offsets of the sampled rows from the upper edge, pixels.
+    /// Offset of each sampled row from the upper edge of the tile, pixels.
     ys: TileLine,
-    /// First and last sampled offset of each half of `xs`.
+    /// First and last offset in each half (eight columns) of `xs`.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of sampled columns.
     across: usize,
@@ -45,7 +45,8 @@ pub(super) struct SampledPixels {
 }
 
 impl SampledPixels {
-    /// Creates the samples of tile (`tile[0]`, `tile[1]`) in an image of `size` = (width, height).
+    /// Computes the sampled pixels of the tile in column `tile[0]` and row `tile[1]` of an image of `size` = (width,
+    /// height) pixels.
     pub(super) fn new(tile: [u32; 2], size: [u32; 2], stride: u32) -> Self {
         let (xs, across) = samples(tile[0] * TILE, size[0], stride);
         let (ys, down) = samples(tile[1] * TILE, size[1], stride);
@@ -57,13 +58,14 @@ impl SampledPixels {
         SampledPixels { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
     }
 
-    /// Returns the bits of the groups that hold a sampled pixel.
+    /// Returns the set of groups that contain a sampled pixel, one bit per group.
     fn groups(&self) -> u32 {
         let rows = ((1u64 << self.down) - 1) as u32;
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance before any splat: 1 for sampled pixels, negative (ended) for others.
+    /// Returns the transmittance of each pixel before any splat: 1 for sampled pixels, negative (which means ended) for
+    /// others.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -71,7 +73,8 @@ impl SampledPixels {
     }
 }
 
-/// Returns the offsets from `start` of the samples among the pixels of the tile, and their number.
+/// Returns the offsets of the sampled pixels along one axis of a tile that begins at pixel `start`, and their number.
+/// `size` is the image size along this axis.
 fn samples(start: u32, size: u32, stride: u32) -> (TileLine, usize) {
     let mut offsets = TileLine::default();
     let mut count = 0;
@@ -84,48 +87,51 @@ fn samples(start: u32, size: u32, stride: u32) -> (TileLine, usize) {
     (offsets, count)
 }
 
-/// One splat in one vector of pixels.
+/// Values of one splat at the pixels of one vector.
 #[derive(Clone, Copy)]
 pub(super) struct Fragment<V: Lanes> {
-    /// Alpha, at most 0.99.
+    /// Alpha (opacity of the splat at the pixel), at most 0.99.
     pub(super) alpha: V,
     /// Mask of the pixels in which the splat is blended.
     pub(super) blended: V::Mask,
-    /// alpha · transmittance; 0 where the splat is not blended.
+    /// Weight of the splat in the pixel, alpha · transmittance; 0 where the splat is not blended.
     pub(super) weight: V,
     /// Transmittance behind the splat, never 0. May be negative where the weight is 0.
     pub(super) transmittance_after: V,
-    /// Offset from the maximum of the splat in this row, pixels: dx − shear·dy of [`Splat`].
+    /// Offset along x of the pixel from the largest alpha of the splat in this row, pixels: dx − shear·dy of [`Splat`].
     pub(super) offset_x: V,
-    /// Offset of the row from the center of the splat, pixels: dy of [`Splat`].
+    /// Offset along y of the pixel from the center of the splat, pixels: dy of [`Splat`].
     pub(super) offset_y: V,
 }
 
-/// Consumer of the weights alpha · transmittance.
+/// Receiver of the weights alpha · transmittance of each splat while a tile is blended.
 pub(super) trait BlendSink {
-    /// State of one splat while it is blended.
+    /// Values that are accumulated for one splat while it is blended.
     type Accumulator<V: Lanes>: Copy;
-    /// Starts the next splat.
+    /// Returns the initial accumulator for the next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Adds the fragment of `group` and, for vectors of several groups, of the following groups.
+    /// Adds the values of the splat at the pixels of group `group` (and of the following groups, if a vector has
+    /// several groups) to the accumulator.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether all even groups come before the odd ones, with [`BlendSink::swap_even_odd`] after each half.
+    /// Whether a splat is blended first in all groups with even index and then in those with odd index.
+    /// [`BlendSink::swap_even_odd`] is called after each half.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps even and odd sums. Called after the even groups and after the odd ones if vectors have one group.
+    /// Swaps the sums over even and over odd groups in the accumulator. Called after the even groups and after the odd
+    /// groups if vectors have one group.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
     }
-    /// Finishes the splat, which is pair `pair` of the tile.
+    /// Receives the final accumulator of the splat with index `pair` in the list of splats of the tile.
     fn end<V: Lanes>(&mut self, accumulator: Self::Accumulator<V>, pair: usize);
 }
 
-/// Accumulates color in three planes.
+/// Accumulates the colors of the pixels of a tile, one plane per channel.
 pub(super) struct ColorSink {
     pub(super) planes: [TilePlane; 3],
 }
@@ -147,22 +153,22 @@ impl BlendSink for ColorSink {
     fn end<V: Lanes>(&mut self, _: [V; 3], _: usize) {}
 }
 
-/// Weight of one splat in one tile.
+/// Weights alpha · transmittance of one splat in one tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Weight {
-    /// Sum over sampled pixels; f32 rounding of at most 256 terms in a fixed order.
+    /// Sum of the weights over the sampled pixels: at most 256 terms, added in f32 in a fixed order.
     pub(super) sum: f32,
-    /// Largest weight of a pixel.
+    /// Largest weight in any sampled pixel.
     pub(super) max: f32,
 }
 
-/// Accumulates weights per pair of the tile. All are zero at the start.
+/// Stores the weights of each splat of the tile in `pairs`, whose entries must all be zero at the start.
 pub(super) struct WeightSink<'a> {
     pub(super) pairs: &'a mut [Weight],
 }
 
 impl BlendSink for WeightSink<'_> {
-    /// Sum and largest weight.
+    /// Sum of the weights of the splat so far, and the largest of them.
     type Accumulator<V: Lanes> = (V::Sums, V);
     #[inline(always)]
     fn begin<V: Lanes>(&self, _: &Splat) -> (V::Sums, V) {
@@ -178,7 +184,7 @@ impl BlendSink for WeightSink<'_> {
     }
 }
 
-/// Instruction set to blend with. All give the same bits.
+/// Instruction set with which tiles are blended. All of them give the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BlendKernel {
     Portable,
@@ -189,7 +195,7 @@ pub(super) enum BlendKernel {
 }
 
 impl BlendKernel {
-    /// Returns all instruction sets of this machine, the fastest one last.
+    /// Returns all instruction sets that this machine supports, the fastest one last.
     pub(super) fn all() -> Vec<Self> {
         let mut all = vec![BlendKernel::Portable];
         #[cfg(target_arch = "x86_64")]
@@ -205,12 +211,12 @@ impl BlendKernel {
         all
     }
 
-    /// Returns the fastest instruction set of this machine.
+    /// Returns the fastest instruction set that this machine supports.
     pub(super) fn fastest() -> Self {
         Self::all().pop().unwrap_or(BlendKernel::Portable)
     }
 
-    /// Returns the name of the instruction set.
+    /// Returns the name of the instruction set for messages.
     pub(super) fn name(self) -> &'static str {
         match self {
             BlendKernel::Portable => "portable",
@@ -221,8 +227,8 @@ impl BlendKernel {
         }
     }
 
-    /// Blends the splats `pairs` front to back over the sampled pixels. Returns the remaining transmittance, with the
-    /// sign bit set where the pixel ended early.
+    /// Blends the splats with the indices `pairs`, which are ordered from front to back, over the sampled pixels of a
+    /// tile. Returns the remaining transmittance of each pixel, with the sign bit set if the pixel ended early.
     pub(super) fn tile(
         self,
         splats: &[Splat],
@@ -264,30 +270,31 @@ impl BlendKernel {
     }
 }
 
-/// Number of splats whose footprints are computed together, before any of them is blended.
+/// Number of splats whose footprints in the tile are computed together, before any of them is blended.
 ///
-/// The groups that a splat touches are known late. Computed directly before blending, every mispredicted end of the
-/// group loop would wait for the footprint, and the footprint for memory.
+/// The groups of pixels that a splat touches follow from its footprint. If it were computed directly before blending,
+/// every mispredicted end of the loop over groups would wait for it and for the memory it reads.
 const LOOKAHEAD: usize = 16;
 
-/// Footprint of one splat in the rows of a tile. In each row the exponent of alpha is `level − falloff_x·(x −
-/// middle)²`.
+/// Footprint of one splat in the rows of a tile. In each row, alpha is the opacity times 2 to the power of `level −
+/// falloff_x·(x − middle)²`.
 #[derive(Clone, Copy, Default)]
 struct TileFootprint {
-    /// Index among the pairs of the tile.
+    /// Index of the splat in the list of splats of the tile.
     pair: usize,
-    /// Bits of the groups in which the splat may be visible.
+    /// Set of the groups of pixels in which the splat may be visible, one bit per group.
     groups: u32,
-    /// Vertical position of the center relative to the upper edge of the tile, pixels.
+    /// Position of the center of the splat along y, relative to the upper edge of the tile, pixels.
     v: f32,
-    /// Horizontal position of the maximum in each row, pixels.
+    /// Position of the largest alpha along x in each row, relative to the left edge of the tile, pixels.
     middles: TileLine,
-    /// Exponent of alpha at the maximum of each row, in powers of two.
+    /// Exponent (of 2) of the largest alpha in each row.
     levels: TileLine,
 }
 
 impl TileFootprint {
-    /// Computes the footprint of `splat`.
+    /// Computes the footprint of `splat` in the tile `sampled`. `pair` is the index of the splat in the list of splats
+    /// of the tile.
     #[inline(always)]
     fn new<V: Lanes>(splat: &Splat, pair: usize, sampled: &SampledPixels) -> Self {
         // Relative to the corner of the tile, f32 has a precision of a millionth of a pixel wherever the tile lies.
@@ -300,8 +307,9 @@ impl TileFootprint {
             let level = zero.sub(V::splat(splat.falloff_y).mul(dy.mul(dy)));
             middle.store(&mut footprint.middles, first);
             level.store(&mut footprint.levels, first);
-            // A group holds no visible pixel if its point nearest to `middle` lies below the floor: f32 subtraction and
-            // multiplication are monotone, so evaluating its pixels one by one would give alpha < 1/255 for each.
+            // A group of pixels contains no visible one if the exponent at its point nearest to `middle` is below
+            // `floor`: f32 subtraction and multiplication are monotone, so evaluating its pixels one by one would give
+            // alpha < 1/255 for each.
             for (column, [start, end]) in sampled.spans.iter().enumerate() {
                 let gap = V::splat(*start).sub(middle).max(middle.sub(V::splat(*end))).max(zero);
                 let nearest = level.sub(falloff_x.mul(gap.mul(gap)));
@@ -312,11 +320,11 @@ impl TileFootprint {
     }
 }
 
-/// Blends a tile with vectors of type `V`.
+/// Does the work of [`BlendKernel::tile`] with vectors of type `V`.
 #[inline(always)]
 fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &SampledPixels, sink: &mut I) -> TilePlane {
     let xs = sampled.xs.each_ref().map(V::repeat);
-    // Combines the groups that share a vector. A vector is identified by its first group.
+    // Combines the bits of the groups that share a vector into the bit of its first group.
     let vectors =
         |groups: u32| (0..V::GROUPS).fold(0, |all, k| all | groups >> k) & (u32::MAX / ((1 << V::GROUPS) - 1));
     let mut transmittance = sampled.clear();
@@ -338,8 +346,8 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
             let groups = footprint.groups & live;
             let (falloff_x, opacity) = (V::splat(splat.falloff_x), V::splat(splat.opacity));
             let mut accumulator = sink.begin::<V>(splat);
-            // First the alphas, which depend only on the splat and can overlap. Then the pixels, which depend on one
-            // another.
+            // Computes first the alphas of all groups, which are independent and can overlap in the processor, and then
+            // the pixels, which depend on earlier splats.
             let mut rest = groups;
             while rest != 0 {
                 let group = rest.trailing_zeros() as usize % GROUPS;
@@ -392,10 +400,10 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     transmittance
 }
 
-/// Returns `live` without the vectors `ended`.
+/// Returns the set `live` of vectors of pixels without the vectors `ended`, in which all pixels have ended.
 ///
-/// A separate cold function, so that the processor branches to it. Computed for every splat, the groups of the next
-/// splat would wait for the pixels of this one.
+/// This is a separate cold function, so that the processor predicts a branch around it. If the difference were computed
+/// for every splat, the groups of the next splat would wait for the pixels of this one.
 #[cold]
 #[inline(never)]
 fn remove_ended(live: u32, ended: u32) -> u32 {

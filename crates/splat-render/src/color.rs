@@ -1,18 +1,20 @@
-//! View-dependent color of Gaussians: real spherical harmonics up to degree 3.
+//! View-dependent color of Gaussians by real spherical harmonics (SH) up to degree 3.
 //!
-//! Input: SH planes of a block and the camera center. Output: rgb, not clamped above. The basis has the signs of Kerbl
-//! et al. 2023 and the constants of Sloan, "Stupid Spherical Harmonics Tricks", 2008.
+//! Input: SH coefficients and positions of a block of Gaussians, and the camera center. Output: red, green and blue, at
+//! least 0, without an upper limit. The basis has the signs of Kerbl et al. 2023 and the constants of Sloan, "Stupid
+//! Spherical Harmonics Tricks", 2008.
 
 use std::ops::Range;
 
 use super::convention::BLOCK;
 use splat_core::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
 
-/// Red, green and blue of one block.
+/// Red, green and blue of the Gaussians of one block.
 pub(super) type Colors = [[f32; BLOCK]; 3];
 
-/// Computes the colors of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`, at least 0
-/// (NaN becomes 0). SH coefficients above degree 3, or of an incomplete degree, are not read.
+/// Computes into `out` the colors of the Gaussians `ids` (at most [`BLOCK`]), seen from the camera position `center`:
+/// `0.5 + Σ Y_k c_k` with SH basis functions Y_k and coefficients c_k. Negative values and NaN become 0. SH
+/// coefficients above degree 3, or of an incomplete degree, are ignored.
 #[inline(always)]
 pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colors) {
     let n = ids.len().min(BLOCK);
@@ -42,30 +44,30 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
     }
 }
 
-/// Returns the number of SH coefficients per channel that are read.
+/// Returns the number of SH coefficients per color channel that are used: those of all complete degrees up to 3.
 pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
     let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
     (0..=MAX_SH_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
 }
 
-/// Returns the unit vector from `center` to `position`, and one over their distance.
+/// Returns the unit vector from `center` to `position`, and the reciprocal of their distance.
 #[inline(always)]
 pub(super) fn direction(position: [f32; 3], center: [f64; 3]) -> ([f32; 3], f64) {
-    // Differences in f64: with f32, rounding would destroy the direction far from the origin.
+    // Differences are computed in f64: in f32, rounding would destroy the direction far from the origin.
     let d =
         [f64::from(position[0]) - center[0], f64::from(position[1]) - center[1], f64::from(position[2]) - center[2]];
     let inverse = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
     ([(d[0] * inverse) as f32, (d[1] * inverse) as f32, (d[2] * inverse) as f32], inverse)
 }
 
-/// Constant of the polynomials of degree 1.
+/// Factor of the SH basis functions of degree 1, which are polynomials in x, y, z.
 const C1: f32 = 0.488_602_5;
-/// Constants of the polynomials of degree 2. Several polynomials share one.
+/// Factors of the SH basis functions of degree 2. Several functions share a factor.
 const C2: [f32; 3] = [1.092_548_5, 0.315_391_57, 0.546_274_2];
-/// Constants of the polynomials of degree 3. Several polynomials share one.
+/// Factors of the SH basis functions of degree 3. Several functions share a factor.
 const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445_305_7];
 
-/// Returns the SH basis functions Y_k of a unit vector.
+/// Returns the values of the SH basis functions Y_k for the unit vector `[x, y, z]`.
 #[inline(always)]
 pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -89,7 +91,7 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     ]
 }
 
-/// Returns the derivatives of the polynomials of [`basis`] with respect to x, y and z.
+/// Returns the derivatives of the SH basis functions (see [`basis`]), as polynomials, with respect to x, y and z.
 #[inline(always)]
 pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);

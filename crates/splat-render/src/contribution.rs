@@ -1,24 +1,27 @@
-//! Visible contribution of every Gaussian to renders.
+//! Visible contribution of every Gaussian to renders: how much of the pixels it makes up.
 
 use serde::{Deserialize, Serialize};
 
-/// Visible contribution of N Gaussians over any number of views (docs/method.md, section 1: C `visible`, and W).
+/// Visible contribution of N Gaussians, summed over any number of views (docs/method.md, section 1: C `visible`, and W).
+/// The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it.
 ///
-/// Both figures do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
+/// The values do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Contribution {
-    /// Contribution `[N]`: Σ over pixels of alpha · transmittance, in units of 2⁻²⁸ pixel ([`Contribution::UNIT`]).
+    /// Contribution of each Gaussian: its weight alpha · transmittance summed over all pixels, in units of 2⁻²⁸ pixel
+    /// ([`Contribution::UNIT`]).
     ///
-    /// The part of a view is summed per 16×16 tile in f32, in a fixed order, and rounded to a unit: relative error
-    /// below 3e-6 and absolute error below 2e-9 per tile. A sum saturates at 2⁶⁴ units (7e10 fully covered pixels).
+    /// Within a view, weights are summed per 16×16 tile in f32, in a fixed order, and each tile sum is rounded to a
+    /// unit: relative error below 3e-6, absolute error below 2e-9 pixels per tile. A sum stops growing at 2⁶⁴ units
+    /// (7e10 fully covered pixels).
     pub sum: Vec<u64>,
-    /// Largest alpha · transmittance of any pixel `[N]`, in [0, 0.99].
+    /// Largest weight alpha · transmittance of each Gaussian in any pixel, from 0 to 0.99.
     pub max: Vec<f32>,
 }
 
 impl Contribution {
-    /// Pixels per unit of [`Contribution::sum`]: 2⁻²⁸. The smallest weight of a pixel, 1e-4 / 255, is 105 units. The
-    /// sum can hold 800,000 fully covered images of 320×256.
+    /// Unit of [`Contribution::sum`]: 2⁻²⁸ pixels. The smallest weight in a pixel, 1e-4 / 255, is 105 units. A sum can
+    /// hold 800,000 fully covered images of 320×256.
     pub const UNIT: f64 = 1.0 / (1u64 << 28) as f64;
 
     /// Creates zero contributions of `len` Gaussians.
@@ -36,15 +39,15 @@ impl Contribution {
         self.sum.is_empty()
     }
 
-    /// Returns Σ alpha · transmittance of Gaussian `i`, in pixels.
+    /// Returns the contribution of Gaussian `i`, alpha · transmittance summed over all pixels, in pixels.
     pub fn pixels(&self, i: usize) -> f64 {
         self.sum[i] as f64 * Self::UNIT
     }
 
-    /// Adds the contributions of the same Gaussians in other views.
+    /// Adds `other`, the contributions of the same Gaussians in other views.
     ///
     /// # Panics
-    /// If the lengths differ.
+    /// Panics if the numbers of Gaussians differ.
     pub fn merge(&mut self, other: &Contribution) {
         assert_eq!(self.len(), other.len(), "expected contributions of equally many Gaussians");
         for (sum, other) in self.sum.iter_mut().zip(&other.sum) {
@@ -55,7 +58,8 @@ impl Contribution {
         }
     }
 
-    /// Adds the sum and the largest weight of Gaussian `i` in one tile.
+    /// Adds the contribution of Gaussian `i` in one tile: the `sum` of its weights over the pixels, and their largest,
+    /// `max`.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
         let units = (f64::from(sum) * (1.0 / Self::UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);

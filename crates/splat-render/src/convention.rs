@@ -1,12 +1,13 @@
-//! Constants of the original rasterizer that decide pixel values, and the block size of the projection.
+//! Constants of the original CUDA rasterizer that determine pixel values, and the block size of the projection.
 
-/// Side of a tile in pixels. Part of the result, because a Gaussian affects whole tiles.
+/// Side of a tile in pixels. It affects pixel values, because a Gaussian is drawn in whole tiles.
 pub(super) const TILE: u32 = 16;
-/// Smallest alpha that is blended.
+/// Smallest alpha (opacity of a Gaussian at a pixel) that is blended. Smaller ones are skipped.
 pub(super) const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// Largest alpha. Larger values are clamped to it.
+/// Largest alpha (opacity of a Gaussian at a pixel). Larger ones are reduced to this value.
 pub(super) const MAX_ALPHA: f32 = 0.99;
-/// Smallest transmittance of a pixel. A Gaussian that would leave less ends the pixel and is not blended.
+/// Smallest transmittance of a pixel. A Gaussian that would lower the transmittance below this value is not blended,
+/// and neither is any Gaussian behind it: the pixel has ended.
 pub(super) const MIN_TRANSMITTANCE: f32 = 1e-4;
-/// Number of Gaussians projected together. The arrays of one block stay in the first-level cache.
+/// Number of Gaussians that are projected together (a block). Their arrays fit in the first-level cache.
 pub(super) const BLOCK: usize = 128;

@@ -1,19 +1,21 @@
-//! Blending of feature vectors of Gaussians in place of colors.
+//! Blending of feature vectors of Gaussians instead of colors.
 //!
-//! Input: a frame state, planes of features of any sign. Output: blended features per pixel. Blending is linear, so
-//! three features at a time are rendered as colors. Features are shifted and scaled to 0 … 1, because colors are
-//! clamped at 0. The shift is undone with the opacity, which is the render of constant 1.
+//! Input: Gaussians at one frame, and features, each with a value of any sign per Gaussian. Output: blended features
+//! per pixel. Blending is linear, so three features at a time are rendered as colors. Features are shifted and scaled
+//! to 0 … 1, because colors are clamped at 0. The shift is undone with the opacity of each pixel, which is the render
+//! of a feature that is 1 everywhere.
 
 use super::render;
 use splat_core::{AttributeValues, Camera, Gaussians, harmonic};
 
-/// Computes Σ w·f over the Gaussians of each pixel, where w is the weight with which colors are blended.
+/// Computes for each pixel the sum Σ w·f over the Gaussians, where f is a feature value of a Gaussian and w its weight
+/// in the pixel, as in the blending of colors.
 ///
-/// Returns `[height, width, planes]` for the planes of `features`. Accuracy: about 1e-6 of the range of values of a
-/// feature. A feature value that is not finite counts as the smallest finite one.
+/// Returns `[height, width, features]`, with one value per feature (plane of `features`). Accuracy: about 1e-6 of the
+/// range of values of a feature. A value that is not finite counts as the smallest finite value of its feature.
 ///
 /// # Panics
-/// If the numbers of features and Gaussians differ.
+/// Panics if `features` is not of as many Gaussians as `gaussians`.
 pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera: &Camera) -> Vec<f32> {
     let (planes, pixels) = (features.width(), camera.width as usize * camera.height as usize);
     assert_eq!(features.len(), gaussians.len(), "expected as many features as Gaussians");
@@ -43,8 +45,8 @@ pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera:
     blended
 }
 
-/// Returns the smallest finite value, and the difference of the largest and the smallest one (1 if there is no positive
-/// difference).
+/// Returns the smallest finite value, and the difference between the largest and the smallest finite value (1 if they
+/// are equal or there are none).
 fn span(values: &[f32]) -> [f64; 2] {
     let finite = || values.iter().copied().filter(|x| x.is_finite()).map(f64::from);
     let (least, most) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));
@@ -73,14 +75,14 @@ mod tests {
         (filled, Camera::look_at(DVec3::new(0.3, -2.0, 0.4), DVec3::ZERO, 0.8, (33, 20)))
     }
 
-    /// Returns feature planes with values in [−3, 3).
+    /// Returns `planes` features with values in [−3, 3).
     fn features(planes: usize) -> AttributeValues {
         let mut filled = AttributeValues::zeros(planes, 40);
         filled.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = 6.0 * ((k as f32 * 0.618_034).fract() - 0.5));
         filled
     }
 
-    /// Returns the largest absolute difference.
+    /// Returns the largest absolute difference between corresponding values of `a` and `b`.
     fn largest_difference(a: &[f32], b: impl Iterator<Item = f32>) -> f32 {
         a.iter().zip(b).fold(0.0, |most, (a, b)| most.max((a - b).abs()))
     }

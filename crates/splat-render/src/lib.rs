@@ -1,18 +1,20 @@
 //! Rasterizer: renders the Gaussians of one frame from one camera by EWA splatting on the CPU.
 //!
-//! The modules form a pipeline: `project` (footprints, with `color`), `bin` (tiles, front to back), `blend` (pixels),
-//! and `backward` (gradients). Input: [`Gaussians`](splat_core::Gaussians) in stored encoding and a
-//! [`Camera`](splat_core::Camera). Output: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every Gaussian,
-//! or the [`Gradients`](splat_core::Gradients) of a loss.
+//! The modules form a pipeline: `project` computes the splat (image footprint) of each Gaussian and `color` its color,
+//! `bin` assigns splats to tiles of 16×16 pixels from front to back, `blend` computes pixels, and `backward` computes
+//! gradients. Input: [`Gaussians`](splat_core::Gaussians) at one frame and a [`Camera`](splat_core::Camera). Output: an
+//! [`Image`], or the [`Contribution`] or [`RemovalError`] of every Gaussian, or the
+//! [`Gradients`](splat_core::Gradients) of a loss.
 //!
-//! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for the pairs of a Gaussian and a
-//! 16×16 tile that it can change. Tiles are processed in strips whose pairs fit this limit. A single tile with more
-//! pairs than the limit takes 12 bytes per pair.
+//! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for pairs of a Gaussian and a tile
+//! that it can change. Tiles are processed in strips whose pairs fit into these bytes. Only if a single tile has more
+//! pairs, they take more: 12 bytes per pair.
 //!
 //! All conventions are those of the original CUDA rasterizer (Kerbl et al., "3D Gaussian Splatting", 2023), in every
-//! detail, because each deviation costs tens of dB. Skipping Gaussians by the bound alpha ≥ 1/255 changes no pixel.
-//! Pixels have the same bits for any number of threads and any instruction set. Gaussians with a NaN or infinite
-//! position, rotation, scale or opacity are not drawn.
+//! detail, because each deviation lowers the PSNR against its renders by tens of dB. Gaussians are skipped where their
+//! alpha is below 1/255, where that rasterizer does not draw them either. Pixels have the same bits for any number of
+//! threads and any instruction set. Gaussians with a NaN or infinite position, rotation, scale or opacity are not
+//! drawn.
 //!
 //! ```
 //! use splat_core::{Camera, Gaussians, harmonic};
@@ -63,12 +65,12 @@ pub use features::blend_features;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 
-/// Returns the name of the instruction set that renders on this machine.
+/// Returns the name of the instruction set with which this machine renders, such as "AVX2".
 pub fn instructions() -> &'static str {
     blend::BlendKernel::fastest().name()
 }
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

@@ -1,9 +1,10 @@
-//! Projection of Gaussians to image footprints: EWA splatting of one block, in f64.
+//! Projection of Gaussians to image footprints (splats) by EWA splatting: one block at a time, in f64.
 //!
-//! f64 is needed for two reasons. A radius is rounded up to whole pixels and decides which tiles a Gaussian affects.
-//! The 2-D covariance of a long, thin Gaussian cancels in f32. Input: planes of one frame's states and a camera.
-//! Output: one [`Splat`] for every Gaussian that can change a pixel. Memory: a few stack arrays of [`BLOCK`] entries.
-//! Source: Zwicker et al., "EWA Splatting", 2002, with the constants of Kerbl et al., "3D Gaussian Splatting", 2023.
+//! f64 is needed for two reasons. The radius of a footprint, rounded up to whole pixels, decides which tiles a Gaussian
+//! affects. The determinant of the 2-D covariance of a long, thin Gaussian loses all digits in f32. Input: the
+//! Gaussians at one frame and a camera. Output: one [`Splat`] for every Gaussian that can change a pixel. Memory: a few
+//! stack arrays of [`BLOCK`] entries. Source: Zwicker et al., "EWA Splatting", 2002, with the constants of Kerbl et
+//! al., "3D Gaussian Splatting", 2023.
 
 use std::f64::consts::{LN_2, LOG2_E};
 use std::ops::Range;
@@ -13,16 +14,18 @@ use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use splat_core::functions::exp;
 use splat_core::{Camera, Gaussians};
 
-/// Variance added to the diagonal of every 2-D covariance, pixels².
+/// Dilation: variance in pixels² that is added to the diagonal of every 2-D covariance, as in the original rasterizer.
 const DILATION: f64 = 0.3;
-/// Limit of the directions at which the Jacobian is evaluated, in half fields of view. Directions further out are
-/// clamped.
+/// Largest slope (x / depth or y / depth) at which the Jacobian of the projection is evaluated, as a multiple of the
+/// slope at the image edge. Gaussians further out use the Jacobian at this slope.
 const FOV_MARGIN: f64 = 1.3;
-/// Limit of |log scale| and |logit|. Values are clamped, so that fourth powers of scales stay finite in f64.
+/// Limit of the absolute value of a log scale and of an opacity logit. Values are clamped, so that fourth powers of
+/// scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
-/// Logit below which the opacity, 0.0025, is less than [`MIN_ALPHA`].
+/// Opacity logit below which the opacity is below 0.0025, hence less than [`MIN_ALPHA`].
 const MIN_LOGIT: f32 = -6.0;
-/// Slack of the alpha bound in powers of two: thousands of times the rounding error of the exponent in the blend.
+/// Margin of the test alpha ≥ 1/255 in powers of two, so that rounding never removes a visible pixel: thousands of
+/// times the rounding error of the exponent of alpha.
 const CUTOFF_SLACK: f64 = 1e-3;
 
 /// Camera parameters in the form that the projection needs.
@@ -33,22 +36,23 @@ pub(super) struct CameraTerms {
     translation: [f64; 3],
     /// Focal lengths along x and y, pixels.
     pub(super) focal: [f64; 2],
-    /// Principal point if pixel centers lie at integers.
+    /// Principal point in pixels, in coordinates in which pixel centers lie at integers.
     principal: [f64; 2],
-    /// Limits of |x / depth| and |y / depth| at which the Jacobian is evaluated.
+    /// Largest |x / depth| and |y / depth| at which the Jacobian of the projection is evaluated.
     pub(super) slope_limit: [f64; 2],
-    /// Position of the camera in the world.
+    /// Position of the camera in world coordinates, scene units.
     pub(super) center: [f64; 3],
     /// Image width and height, pixels.
     pub(super) size: [u32; 2],
-    /// Number of tiles across and down.
+    /// Numbers of tiles across and down the image.
     pub(super) tiles: [u32; 2],
-    /// Largest view depth that is not drawn; rounded to f32 as in the reference kernel.
+    /// Largest depth, in scene units, at which Gaussians are not drawn; rounded to f32 as in the original CUDA
+    /// rasterizer.
     near: f64,
 }
 
 impl CameraTerms {
-    /// Converts a camera.
+    /// Computes the parameters of the projection from a camera.
     pub(super) fn new(camera: &Camera) -> Self {
         let rows = camera.rotation.transpose();
         CameraTerms {
@@ -68,40 +72,41 @@ impl CameraTerms {
     }
 }
 
-/// Footprint of one Gaussian in one view.
+/// Footprint of one Gaussian in one view, which gives its alpha at every pixel.
 ///
-/// At pixel offset (dx, dy) from the center, the exponent of alpha in powers of two is `−falloff_x·(dx − shear·dy)² −
-/// falloff_y·dy²`: the quadratic form of the inverse covariance with the square completed over x. This form has no
-/// cancellation and is never positive.
+/// At pixel offset (dx, dy) from the center of the splat, alpha is the opacity times 2 to the power of `−falloff_x·(dx
+/// − shear·dy)² − falloff_y·dy²`. The exponent is the quadratic form of the inverse 2-D covariance, written as squares,
+/// so it is never positive and loses no digits.
 ///
-/// Aligned to a cache line, because splats are not read in the order of memory.
+/// Aligned to a cache line, because splats are read in an order other than that in memory.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Splat {
     /// Center along x in pixels; pixel centers lie at integers.
     pub(super) u: f64,
-    /// Center along y in pixels.
+    /// Center along y in pixels; pixel centers lie at integers.
     pub(super) v: f64,
-    /// Coefficient of (dx − shear·dy)², 1/pixels².
+    /// Coefficient of (dx − shear·dy)² in the exponent of alpha, 1/pixels².
     pub(super) falloff_x: f32,
-    /// Shift in x of the row maximum per row.
+    /// Shift along x of the position of the largest alpha from one pixel row to the next, pixels.
     pub(super) shear: f32,
-    /// Coefficient of dy², 1/pixels².
+    /// Coefficient of dy² in the exponent of alpha, 1/pixels².
     pub(super) falloff_y: f32,
-    /// Exponents below `−cutoff` give an alpha that is skipped.
+    /// Pixels at which the exponent of alpha is below `−cutoff` are skipped, because alpha is below 1/255 there.
     pub(super) cutoff: f32,
-    /// Opacity in [0, 1].
+    /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
-    /// View depth in scene units, summed in f32 like in the reference kernel. Its rounding decides which of two almost
-    /// equally deep Gaussians is in front (81 instead of 116 dB on one reference render).
+    /// Depth in scene units, computed in f32 like in the original CUDA rasterizer. Its rounding decides which of two
+    /// almost equally deep Gaussians is in front (without this rounding, one render agreed with the original to 81 dB
+    /// instead of 116 dB).
     pub(super) sort_depth: f32,
-    /// Color, red, green and blue.
+    /// Color of the Gaussian in this view: red, green and blue.
     pub(super) color: [f32; 3],
-    /// Index of the Gaussian.
+    /// Index of the Gaussian in the frame.
     pub(super) id: u32,
 }
 
-/// Tiles [x0, x1) × [y0, y1) in which a splat can change a pixel.
+/// Rectangle of tiles [x0, x1) × [y0, y1) in which a splat can change a pixel.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct TileRect {
     pub(super) x0: u32,
@@ -110,7 +115,8 @@ pub(super) struct TileRect {
     pub(super) y1: u32,
 }
 
-/// Footprints of the visible Gaussians of a range, by increasing id. Entry i of both lists belongs to one Gaussian.
+/// Footprints (splats) of the visible Gaussians of a range, by increasing index. Entry i of both lists belongs to the
+/// same Gaussian.
 #[derive(Debug, Default)]
 pub(super) struct Splats {
     pub(super) splats: Vec<Splat>,
@@ -118,27 +124,27 @@ pub(super) struct Splats {
 }
 
 impl Splats {
-    /// Removes all footprints.
+    /// Removes all splats.
     pub(super) fn clear(&mut self) {
         self.splats.clear();
         self.rects.clear();
     }
 
-    /// Appends the footprints of Gaussians with higher ids.
+    /// Appends the splats in `next`, whose Gaussians have higher indices.
     pub(super) fn append(&mut self, mut next: Splats) {
         self.splats.append(&mut next.splats);
         self.rects.append(&mut next.rects);
     }
 }
 
-/// Appends the footprints of the visible Gaussians of `ids` to `out`. Computes their colors if `colored`; otherwise the
-/// colors are black.
+/// Appends the splats of those Gaussians of `ids` that are visible in `view` to `out`. If `colored`, their colors are
+/// computed, otherwise they are black.
 ///
-/// A Gaussian with a value that is not finite is not visible.
+/// A Gaussian with a position, rotation, scale or opacity that is not finite is not visible.
 pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// Runs [`project_blocks`] compiled for AVX2. Arithmetic is not fused, so results have the same bits.
+        /// Calls [`project_blocks`], compiled for AVX2. Operations are not fused, so results have the same bits.
         #[target_feature(enable = "avx2")]
         fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
             project_blocks(gaussians, ids, view, colored, out);
@@ -151,10 +157,11 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTer
     project_blocks(gaussians, ids, view, colored, out);
 }
 
-/// Projects `ids` in blocks of [`BLOCK`] Gaussians.
+/// Does the work of [`project`], in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
-    // Reserves the maximum at once: growing would copy, and reserved memory that is never written is not used.
+    // Reserves the maximum at once, because growing would copy. Reserved memory that is never written takes no physical
+    // memory.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
     let mut footprints = ProjectedSplats::default();
@@ -183,21 +190,21 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
     }
 }
 
-/// Projected quantities of one block.
+/// Projected quantities of the Gaussians of one block, one array per quantity.
 struct ProjectedSplats {
     depth: [f64; BLOCK],
     sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Coefficients of the exponent of alpha, see [`Splat`].
+    /// Coefficients of the exponent of alpha, see the fields of [`Splat`].
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Half the width of the ellipse on which alpha is half its maximum, pixels.
+    /// Half the width in pixels of the ellipse on which alpha is half its maximum.
     half_u: [f64; BLOCK],
-    /// Half the height of that ellipse, pixels.
+    /// Half the height in pixels of the ellipse on which alpha is half its maximum.
     half_v: [f64; BLOCK],
-    /// Three standard deviations of the longest axis, rounded up, pixels.
+    /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
 }
@@ -222,7 +229,7 @@ impl Default for ProjectedSplats {
 }
 
 impl ProjectedSplats {
-    /// Projects every Gaussian of the block, visible or not. Without branches the loop is vectorized.
+    /// Projects every Gaussian of the block, visible or not. The loop has no branches, so the compiler vectorizes it.
     #[inline(always)]
     fn fill(&mut self, gaussians: &Gaussians, block: Range<usize>, view: &CameraTerms) {
         let n = block.len().min(BLOCK);
@@ -238,7 +245,7 @@ impl ProjectedSplats {
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()];
             let shape = ProjectedShape::new(p, q, [log_scale[0][i], log_scale[1][i], log_scale[2][i]], view);
             let Covariance { xx, xy, yy, det } = shape.covariance();
-            // m² − det of the dilated covariance, written as a sum of squares.
+            // Squared half difference of the two eigenvalues of the covariance, written as a sum of squares.
             let spread = 0.25 * (xx - yy) * (xx - yy) + xy * xy;
             let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
             self.depth[i] = shape.depth;
@@ -255,7 +262,8 @@ impl ProjectedSplats {
         }
     }
 
-    /// Returns the footprint of Gaussian `i` of the block, or `None` if it cannot change any pixel.
+    /// Returns the splat of Gaussian `i` of the block and the tiles that it can change, or `None` if it cannot change
+    /// any pixel. `id` is the index of the Gaussian in the frame.
     #[inline(always)]
     fn splat(&self, i: usize, id: u32, view: &CameraTerms) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
@@ -264,7 +272,8 @@ impl ProjectedSplats {
             return None;
         }
         let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
-        // The square of tiles of the reference kernel, reduced to the tiles that the ellipse alpha ≥ 1/255 can touch.
+        // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255 can
+        // touch.
         let root = cutoff.sqrt();
         let (x0, x1) = tile_range(u, self.radius[i], root * self.half_u[i], view.tiles[0]);
         let (y0, y1) = tile_range(v, self.radius[i], root * self.half_v[i], view.tiles[1]);
@@ -287,24 +296,24 @@ impl ProjectedSplats {
     }
 }
 
-/// Axes of one Gaussian, projected to the image.
+/// Principal axes of one Gaussian, projected to the image.
 pub(super) struct ProjectedShape {
-    /// View depth, scene units.
+    /// Depth from the camera, scene units.
     pub(super) depth: f64,
-    /// x / depth and y / depth in camera axes.
+    /// Position in camera coordinates as slopes: x / depth and y / depth.
     pub(super) slopes: [f64; 2],
-    /// Derivatives of u and v with respect to the world position, pixels per scene unit: rows of the Jacobian times the
-    /// rotation of the camera.
+    /// Derivatives of the image coordinates u and v with respect to the world position, pixels per scene unit: the rows
+    /// of the Jacobian of the projection times the rotation of the camera.
     pub(super) to_pixels: [[f64; 3]; 2],
-    /// Columns of the Gaussian's rotation.
+    /// Directions of the axes of the Gaussian in the world: the columns of its rotation matrix.
     pub(super) axes: [[f64; 3]; 3],
-    /// Scales, scene units.
+    /// Scales (standard deviations along the axes), scene units.
     pub(super) scale: [f64; 3],
-    /// Standard deviations of the axes in u and v, pixels: `to_pixels` · axes · scale.
+    /// Extents of the three axes along u and along v in pixels, as standard deviations: `to_pixels` · axes · scale.
     pub(super) spread: [[f64; 3]; 2],
 }
 
-/// Dilated 2-D covariance, pixels², and its determinant.
+/// 2-D covariance of a footprint after dilation (adding [`DILATION`] to the diagonal), pixels², and its determinant.
 pub(super) struct Covariance {
     pub(super) xx: f64,
     pub(super) xy: f64,
@@ -313,7 +322,7 @@ pub(super) struct Covariance {
 }
 
 impl ProjectedShape {
-    /// Projects a Gaussian at `p` with wxyz quaternion `q`.
+    /// Projects a Gaussian at the world position `p` with the quaternion `q` (w, x, y, z).
     #[inline(always)]
     pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &CameraTerms) -> Self {
         let [r0, r1, r2] = view.rotation;
@@ -339,7 +348,7 @@ impl ProjectedShape {
         ProjectedShape { depth: z, slopes, to_pixels: [to_u, to_v], axes, scale: s, spread }
     }
 
-    /// Returns the dilated 2-D covariance.
+    /// Returns the 2-D covariance of the footprint after dilation (adding [`DILATION`] to the diagonal).
     #[inline(always)]
     pub(super) fn covariance(&self) -> Covariance {
         let [a, b] = self.spread;
@@ -360,8 +369,9 @@ pub(super) fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Returns the range of tiles along one axis: those that the reference kernel counts for `at ± radius`, without those
-/// whose pixels all lie further than `half` from `at`.
+/// Returns the range of tiles along one axis that a splat centered at `at` (pixels) can change: the tiles that the
+/// original CUDA rasterizer counts for `at ± radius`, without those whose pixels are all further than `half` from `at`.
+/// `tiles` is the number of tiles of the image.
 #[inline(always)]
 fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let tile = f64::from(TILE);
@@ -373,33 +383,35 @@ fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
 
 /// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
 ///
-/// The bits of a float read as an integer are its logarithm except for the mantissa, and log₂(1 + m) ≤ m + 0.0861.
+/// The bits of a float, read as an integer and scaled by 2⁻⁵², are its biased logarithm except for the mantissa m, for
+/// which log₂(1 + m) ≤ m + 0.0861.
 #[inline(always)]
 fn log2_bound(x: f64) -> f64 {
     x.to_bits() as i64 as f64 * (1.0 / (1u64 << 52) as f64) - (1023.0 - 0.0861)
 }
 
-/// Returns `x` clamped to ± `bound`. NaN stays NaN, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
-/// from being vectorized.)
+/// Returns `x` limited to −`bound` … `bound`. NaN stays NaN, so that the Gaussian counts as not finite. (`f64::clamp`
+/// may panic, which keeps a loop from being vectorized.)
 #[inline(always)]
 fn clamp_to(x: f64, bound: f64) -> f64 {
     let x = if x > bound { bound } else { x };
     if x < -bound { -bound } else { x }
 }
 
-/// Returns the scalar product.
+/// Returns the scalar product of `a` and `b`.
 #[inline(always)]
 pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Returns the cross product.
+/// Returns the cross product `a` × `b`.
 #[inline(always)]
 pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Returns the columns of the rotation of a wxyz quaternion of any length; the identity for zero.
+/// Returns the columns of the rotation matrix of a quaternion (w, x, y, z) of any length. A zero quaternion gives the
+/// identity.
 #[inline(always)]
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     // The factor 2/|q|² replaces normalization. Its floor keeps 0 · s = 0 for a zero quaternion.

@@ -1,9 +1,10 @@
-//! Error that removing a Gaussian causes in a render.
+//! Error that the removal of a Gaussian causes in a render.
 //!
-//! A Gaussian of color c and weight w = alpha · transmittance hides a background of color b. Without the Gaussian the
-//! pixel changes by exactly w·(c − b), so a Gaussian that looks like its background is worth nothing however large its
-//! contribution is. If N Gaussians are removed at once, the changes add up, and b changes too. Therefore c − b has a
-//! floor, and Gaussians are ranked in pruning rounds.
+//! In a pixel, a Gaussian of color c has the weight w = alpha · transmittance and hides what is behind it, which has
+//! the color b. Without the Gaussian the pixel changes by exactly w·(c − b), so a Gaussian of the same color as what is
+//! behind it can be removed without error, even if its weight is large. If several Gaussians are removed at once, the
+//! changes add up, and b changes too. Therefore ‖c − b‖ gets a minimum (the floor), and Gaussians are removed in
+//! several rounds with new errors.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,26 +12,29 @@ use super::blend::{BlendSink, Fragment, TilePlane};
 use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
-/// Removal error of N Gaussians over any number of views: Σ over pixels of w²·(‖c − b‖² + floor²).
+/// Removal error of N Gaussians, summed over any number of views: Σ over pixels of w²·(‖c − b‖² + floor²), where w is
+/// the weight of the Gaussian in the pixel, c its color, and b the color behind it.
 ///
-/// With a floor of 0 it is the squared error of the render without that Gaussian, except for alphas clamped at 0.99 and
-/// pixels that end early. It does not depend on the order of views or the number of threads. Memory: 8 bytes per
+/// With a floor of 0 this is the squared error of renders without that Gaussian, except for alphas clamped at 0.99 and
+/// pixels that end early. Errors do not depend on the order of views or the number of threads. Memory: 8 bytes per
 /// Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
-    /// Removal error `[N]` in units of 2⁻³⁶ ([`RemovalError::UNIT`]). The part of a view is summed per 16×16 tile in
-    /// f32, in a fixed order. A sum saturates at 2⁶⁴.
+    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::UNIT`]). Within a view, errors are summed per
+    /// 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
-    /// Minimum color difference between a Gaussian and its background that is counted, as a norm over RGB.
+    /// Floor: color difference (norm over red, green, blue) whose square is added to the squared difference between a
+    /// Gaussian and what is behind it.
     pub contrast_floor: f32,
 }
 
 impl RemovalError {
-    /// Squared error per unit of [`RemovalError::sum`]: 2⁻³⁶. The sum can hold 3000 completely changed renders of
-    /// 320×256.
+    /// Unit of [`RemovalError::sum`]: a squared error of 2⁻³⁶. A sum can hold 3000 completely changed renders of
+    /// 320×256 pixels.
     pub const UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Creates zero removal errors of `len` Gaussians.
+    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. `contrast_floor` is the field of
+    /// this name.
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
@@ -45,8 +49,8 @@ impl RemovalError {
         self.sum.is_empty()
     }
 
-    /// Returns the indices of `count` Gaussians, increasing: first those that are `fixed`, then those with the largest
-    /// removal error. Ties go to the lower index.
+    /// Returns the indices of the `count` Gaussians to keep, in increasing order: first those for which `fixed` is
+    /// true, then those with the largest removal error. Of equal errors, the lower index is preferred.
     pub fn top_by_error(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
         let mut ids: Vec<u32> = (0..self.len() as u32).collect();
         // A stable sort keeps ties in index order.
@@ -56,16 +60,16 @@ impl RemovalError {
         ids
     }
 
-    /// Adds the removal errors of the same Gaussians in other views.
+    /// Adds `other`, the removal errors of the same Gaussians in other views.
     ///
     /// # Panics
-    /// If the lengths differ.
+    /// Panics if the numbers of Gaussians differ.
     pub fn merge(&mut self, other: &RemovalError) {
         assert_eq!(self.len(), other.len(), "expected removal errors of equally many Gaussians");
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds the removal errors of `other`, whose Gaussian k is Gaussian `rows[k]` of `self`.
+    /// Adds the removal errors in `other`. Gaussian k of `other` is Gaussian `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -73,25 +77,26 @@ impl RemovalError {
         }
     }
 
-    /// Adds the removal error of Gaussian `i` in one tile.
+    /// Adds `error`, the removal error of Gaussian `i` in one tile of a view.
     pub(super) fn add(&mut self, i: usize, error: f32) {
         let units = (f64::from(error) * (1.0 / Self::UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
     }
 }
 
-/// Sums squared pixel changes of every Gaussian in a tile.
+/// Computes the removal error of every splat of a tile while the tile is blended.
 pub(super) struct RemovalSink<'a> {
-    /// Colors of the pixels without the contributions of the splats blended so far, by channel.
+    /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
+    /// them times the transmittance.
     pub(super) behind: [TilePlane; 3],
-    /// Minimum color difference, as in [`RemovalError::contrast_floor`].
+    /// Floor of the color difference, see [`RemovalError::contrast_floor`].
     pub(super) contrast_floor: f32,
-    /// Removal error per pair of the tile.
+    /// Removal error of each splat of the tile.
     pub(super) pairs: &'a mut [f32],
 }
 
 impl BlendSink for RemovalSink<'_> {
-    /// Color, and sum of squared changes.
+    /// Color of a splat, and the sum of squared pixel changes so far.
     type Accumulator<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
@@ -105,7 +110,8 @@ impl BlendSink for RemovalSink<'_> {
         fragment: Fragment<V>,
     ) -> ([V; 3], V::Sums) {
         let Fragment { weight, transmittance_after, .. } = fragment;
-        // The background has transmittance `transmittance_after`, and `weight` more without this splat.
+        // What is behind this splat is drawn with `transmittance_after`; without the splat it would be drawn with
+        // `transmittance_after + weight`.
         let gain = weight.div(transmittance_after);
         let floor = weight.mul(V::splat(self.contrast_floor));
         let mut squares = floor.mul(floor);
@@ -134,7 +140,7 @@ mod tests {
 
     const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.9];
 
-    /// Returns translucent overlapping Gaussians of many colors.
+    /// Returns `count` translucent overlapping Gaussians of many colors.
     fn scene(count: usize) -> Gaussians {
         let mut scene = Gaussians::zeros(count, 0);
         for i in 0..count {
@@ -148,12 +154,12 @@ mod tests {
         scene
     }
 
-    /// Returns a camera in front of the scene.
+    /// Returns a camera that sees the test scene.
     fn camera() -> Camera {
         Camera::look_at(DVec3::new(1.0, -3.0, 0.4), DVec3::ZERO, 0.6, (45, 37))
     }
 
-    /// Returns the removal errors of all Gaussians.
+    /// Returns the removal errors of all Gaussians of `scene` with the contrast floor `floor`.
     fn errors(scene: &Gaussians, floor: f32) -> Vec<f64> {
         let mut found = RemovalError::new(scene.len(), floor);
         Renderer::new().removal_error(scene, &camera(), BACKGROUND, &mut found);

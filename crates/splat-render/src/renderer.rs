@@ -1,4 +1,5 @@
-//! Renders, contributions and removal errors of one frame from one camera: runs the parts of the rasterizer in order.
+//! Renderer: computes renders, contributions and removal errors of one frame from one camera by running the parts of
+//! the rasterizer in order.
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -15,15 +16,16 @@ use super::project::{CameraTerms, Splat, Splats, TileRect, project};
 use super::removal::{RemovalError, RemovalSink};
 use splat_core::{Camera, Gaussians};
 
-/// Number of Gaussians projected by one task: enough to outweigh the overhead of a task.
+/// Number of Gaussians that one parallel task projects: enough to outweigh the overhead of a task.
 const SPAN: usize = 32 * BLOCK;
 
-/// Bytes per visible Gaussian during a render: footprint, tile rectangle, and depth sort key with the sort buffer.
+/// Bytes of memory per visible Gaussian during a render: footprint, tile rectangle, and two copies of the depth sort
+/// key.
 pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + 2 * size_of::<u64>();
-/// Bytes for the pairs of Gaussians and tiles of a strip, with the sums of each pair.
+/// Bytes of memory for the (Gaussian, tile) pairs of a strip of tiles during a render, and for the sums of each pair.
 pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
-/// Image with red, green, blue per pixel, row by row from the top; 1 is white; values are not clamped.
+/// Image with red, green and blue per pixel, row by row from the top. White is 1. Values are not clamped.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Image {
     /// Width in pixels.
@@ -35,7 +37,8 @@ pub struct Image {
 }
 
 impl Image {
-    /// Returns the pixels of one tile, row by row; 0 outside the image.
+    /// Returns the pixels of the tile in column `tile[0]` and row `tile[1]`, row by row; pixels outside the image are
+    /// 0.
     pub(super) fn tile(&self, tile: [u32; 2]) -> [[[f32; 3]; TILE as usize]; TILE as usize] {
         let mut pixels = [[[0.0; 3]; TILE as usize]; TILE as usize];
         let [x, y] = tile.map(|t| (t * TILE) as usize);
@@ -48,33 +51,33 @@ impl Image {
     }
 }
 
-/// Renders `gaussians` from `camera` over the color `background`, on all threads of the pool.
+/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool.
 ///
-/// A camera without pixels gives an empty image. No Gaussians give the background. Scales are clamped to e^±80. A zero
-/// quaternion counts as the identity; a NaN color counts as 0.
+/// An image without pixels stays empty, and without Gaussians every pixel is `background`. Scales are clamped to e^±80.
+/// A zero quaternion counts as the identity; a NaN color counts as 0.
 ///
 /// # Panics
-/// If the attributes of `gaussians` have different lengths.
+/// Panics if the attributes of `gaussians` have different lengths.
 pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
     Renderer::on_all_threads().render(gaussians, camera, background)
 }
 
-/// Adds the visible contribution of each Gaussian in the view of `camera` to `seen`, on all threads of the pool. Reads
-/// no color.
+/// Adds the visible contribution of each Gaussian in the view of `camera` (alpha · transmittance, summed over pixels)
+/// to `seen`, on all threads of the rayon pool. SH coefficients are not read.
 ///
-/// Only every `stride`-th pixel in both directions is sampled (coordinates whose remainder modulo `stride` is `stride /
-/// 2`), with footprints at full resolution. The sums are over the sampled pixels, so a stride of s gives about 1/s² of
-/// the full sums.
+/// Only every `stride`-th pixel in both directions is sampled: those whose coordinates have the remainder `stride / 2`
+/// modulo `stride`. Footprints are those of the full image. The sums are over the sampled pixels, so a stride of s
+/// gives about 1/s² of the full sums.
 ///
 /// # Panics
-/// If `seen` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
+/// Panics if `seen` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
 pub fn contribution(gaussians: &Gaussians, camera: &Camera, stride: NonZeroU32, seen: &mut Contribution) {
     Renderer::on_all_threads().contribution(gaussians, camera, stride, seen);
 }
 
-/// Renderer that keeps its buffers between views.
+/// Renderer that keeps its buffers between views, so that they are not allocated for each view.
 ///
-/// Gives the same bits as [`render`] and [`contribution`].
+/// Its results have the same bits as those of the functions [`render`] and [`contribution`].
 #[derive(Debug)]
 pub struct Renderer {
     pub(super) parallel: bool,
@@ -83,7 +86,7 @@ pub struct Renderer {
     pub(super) bins: Bins,
     weights: Vec<Weight>,
     pub(super) gradient_sums: ImageGradientSums,
-    /// Maximum number of pairs of splats and tiles in memory.
+    /// Maximum number of (splat, tile) pairs in memory.
     pub(super) strip_pairs: usize,
 }
 
@@ -94,17 +97,17 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// Creates a renderer that uses only the calling thread, for loops that render views in parallel.
+    /// Creates a renderer that uses only the calling thread. Suits loops that render several views in parallel.
     pub fn new() -> Self {
         Renderer::with_parallel(false)
     }
 
-    /// Creates a renderer that uses all threads of the pool, for views that must be rendered one after another.
+    /// Creates a renderer that uses all threads of the rayon pool. Suits views that must be rendered one after another.
     pub fn on_all_threads() -> Self {
         Renderer::with_parallel(true)
     }
 
-    /// Creates a renderer that uses all threads of the pool if `parallel`.
+    /// Creates a renderer that uses all threads of the rayon pool if `parallel`, otherwise only the calling thread.
     fn with_parallel(parallel: bool) -> Self {
         Renderer {
             parallel,
@@ -117,14 +120,14 @@ impl Renderer {
         }
     }
 
-    /// Renders like the function [`render`].
+    /// Renders `gaussians` from `camera` over the color `background`, like the function [`render`].
     pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
         let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
         self.render_prepared(&view, background)
     }
 
-    /// Blends the view that [`Renderer::prepare`] has projected.
+    /// Blends the splats that [`Renderer::prepare`] has projected, and returns the image.
     pub(super) fn render_prepared(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
         let [width, height] = view.size;
         let row_len = width as usize * 3;
@@ -161,10 +164,11 @@ impl Renderer {
         Image { width, height, data }
     }
 
-    /// Adds contributions like the function [`contribution`].
+    /// Adds the visible contribution of each Gaussian in the view of `camera` to `seen`, like the function
+    /// [`contribution`].
     ///
     /// # Panics
-    /// If `seen` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
+    /// Panics if `seen` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
     pub fn contribution(
         &mut self,
         gaussians: &Gaussians,
@@ -189,10 +193,11 @@ impl Renderer {
         }
     }
 
-    /// Adds the removal error of each Gaussian in the view of `camera` to `errors`, on the calling thread.
+    /// Adds the removal error of each Gaussian in the view of `camera` (the error of a render without this Gaussian) to
+    /// `errors`, on the calling thread.
     ///
     /// # Panics
-    /// If `errors` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
+    /// Panics if `errors` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
     pub fn removal_error(
         &mut self,
         gaussians: &Gaussians,
@@ -221,7 +226,7 @@ impl Renderer {
         }
     }
 
-    /// Projects the Gaussians and sorts their splats by depth. Computes colors if `colored`.
+    /// Projects the Gaussians to splats and sorts these by depth. Computes colors only if `colored`.
     pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
         let count = gaussians.len();
         self.splats.clear();
@@ -242,8 +247,9 @@ impl Renderer {
     }
 }
 
-/// Resets `sums` to one default value per pair of `tiles` of the strip, and calls `fill_tile` for each tile with its
-/// position, its pairs and their sums. Tiles run in parallel if `parallel`.
+/// Computes one value for each (splat, tile) pair of `tiles`, which must lie in the strip in memory. Resizes `sums` to
+/// default values, then calls `fill_tile` for each tile with its column and row, its splats, and their part of `sums`.
+/// Tiles run in parallel if `parallel`.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,
@@ -275,7 +281,8 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
     }
 }
 
-/// Returns the colors of the sampled pixels of one tile.
+/// Returns the colors of the sampled pixels of one tile, one plane per channel. `pairs` are the splats of the tile,
+/// nearest first.
 fn blend_colors(
     blend: BlendKernel,
     splats: &[Splat],
@@ -300,11 +307,11 @@ mod tests {
     use super::*;
     use splat_core::{Attributes, Gradients};
 
-    /// Returns 3000 Gaussians of all sizes, and a camera among them whose image does not end at a tile edge.
+    /// Returns 3000 Gaussians of many sizes, and a camera among them. The image does not end at a tile edge.
     fn scene() -> (Gaussians, Camera) {
         let mut scene = Gaussians::zeros(3000, 0);
         for i in 0..scene.len() {
-            // Low-discrepancy steps give every Gaussian another position, size and opacity.
+            // A low-discrepancy sequence gives every Gaussian another position, size and opacity.
             let step = |k: f64| (i as f64 * k).fract() as f32;
             scene.position.set_row(i, [2.0 * step(0.618_034) - 1.0, 2.0 * step(0.754_878) - 1.0, 1.5 + step(0.569_84)]);
             scene.rotation.set_row(i, [1.0, step(0.819_173), step(0.671_044), step(0.549_701)]);
@@ -326,7 +333,7 @@ mod tests {
         (scene, camera)
     }
 
-    /// Returns all results that a renderer can compute for the scene.
+    /// Returns everything that `renderer` can compute for the test scene.
     fn all_results(mut renderer: Renderer) -> (Image, Contribution, RemovalError, Gradients) {
         let (scene, camera) = scene();
         let mut seen = Contribution::new(scene.len());

@@ -38,7 +38,7 @@ fn decode_frames(decoder: &mut TileDecoder, plane: usize, frames: impl Iterator<
         .collect()
 }
 
-/// Returns a decoder of `values` filtered with `order`, without compression.
+/// Returns a decoder of `values`, which are filtered with prediction order `order` but not compressed.
 fn loaded(values: &[u32], plane: usize, order: u8) -> TileDecoder {
     let shuffled = filter(values, plane, order);
     TileDecoder { order, shuffled, recent: [vec![0; plane], vec![0; plane]], ..TileDecoder::default() }

@@ -1,4 +1,4 @@
-//! Reading of one tile frame by frame.
+//! Reads the frames of one tile one by one.
 
 use std::ops::Range;
 use std::sync::atomic::Ordering;
@@ -14,29 +14,31 @@ use crate::record::TileRecord;
 /// Frames of one tile, decoded one at a time, fastest in increasing order; see [`Reader::load`].
 ///
 /// Memory: a compressed tile takes 4 bytes per value of all its frames and 8 bytes per value of one frame. A raw tile
-/// takes no memory except its touched pages, if it is read in place, until they are released.
+/// (plain f32) takes no memory; if it is read in place from the memory map, the pages that were read count as memory
+/// until they are released.
 #[derive(Debug, Default)]
 pub struct TileFrames {
     tile: Option<TileRecord>,
     decoder: TileDecoder,
-    /// Whether a raw tile is read in place, from the map.
+    /// Whether a raw tile is read in place, from the memory map.
     in_place: bool,
-    /// Part of a raw tile that has been counted in [`Reader::tiles_read`].
+    /// How much of a raw tile has been counted in [`Reader::tiles_read`].
     counted: Counted,
 }
 
-/// Part of a raw tile that has been counted as read.
+/// How much of a raw tile (plain f32) has been counted as read.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
 enum Counted {
     #[default]
     Nothing,
-    /// Frame that was read last.
+    /// The frame that was read last has been counted.
     Frame(usize),
-    /// Whole tile, counted when its checksum was verified.
+    /// The whole tile has been counted, when its checksum was checked.
     Tile,
 }
 
-/// Byte ranges of tiles that were read in place and whose pages wait for [`Reader::release`].
+/// Byte ranges of tiles that were read in place from the memory map and whose pages have not been released by
+/// [`Reader::release`] yet.
 #[derive(Debug, Default)]
 pub struct TouchedPages {
     ranges: Vec<Range<u64>>,
@@ -44,13 +46,15 @@ pub struct TouchedPages {
 }
 
 impl Reader {
-    /// Prepares `frames` to return the frames of a tile: decompresses a compressed tile; verifies the checksum of a raw
-    /// tile if it has not been verified before. `buffer` holds no values of the tile afterwards.
+    /// Loads the tile `at` into `frames`, which then returns its frames. Decompresses a compressed tile; checks the
+    /// checksum of a raw tile (plain f32) if this was not done before. `buffer` is used while loading and holds no
+    /// values of the tile afterwards.
     ///
-    /// With `touched`, stored bytes are read in place from the map under the conditions of [`Reader::tile`], and their
-    /// range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released after this
-    /// call, those of a raw tile after its last frame was read. Without `touched`, bytes are read by system calls as in
-    /// [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is read before its pages are released.
+    /// With `touched`, stored bytes are read in place from the memory map, under the conditions of [`Reader::tile`],
+    /// and their range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released
+    /// after this call, those of a raw tile after its last frame was read. Without `touched`, bytes are read by system
+    /// calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is read before its pages are
+    /// released.
     pub fn load(
         &self,
         at: TileId,
@@ -59,7 +63,7 @@ impl Reader {
         touched: Option<&mut TouchedPages>,
     ) -> Result<()> {
         let (index, tile) = self.record(at)?;
-        // Set at the end: after an error `frames` holds no tile.
+        // Set at the end, so that `frames` holds no tile after an error.
         frames.tile = None;
         frames.in_place = touched.is_some();
         frames.counted = Counted::Nothing;
@@ -102,7 +106,7 @@ impl Reader {
     }
 
     /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`. Of a raw tile only
-    /// these bytes are read from the file, or copied from the map if the tile was loaded in place.
+    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place.
     ///
     /// # Panics
     /// Panics if `out` has another size, if no tile was loaded into `frames` by this reader, or if the tile has no such
@@ -128,8 +132,8 @@ impl Reader {
         Ok(())
     }
 
-    /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the map if the
-    /// tile is raw and was loaded in place, otherwise in `buffer`.
+    /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the memory map
+    /// if the tile is raw and was loaded in place, otherwise in `buffer`.
     ///
     /// # Panics
     /// Panics if no tile was loaded into `frames` by this reader, or if the tile has no such frame.
@@ -148,8 +152,8 @@ impl Reader {
         Ok(buffer)
     }
 
-    /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; one frame for a
-    /// constant tile.
+    /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; only one frame if all
+    /// frames of the tile are equal.
     ///
     /// # Panics
     /// Panics if `out` has another size, or no tile was loaded.
@@ -160,7 +164,8 @@ impl Reader {
         planes.into_iter().try_for_each(|(frame, out)| self.read_frame(frames, frame, out))
     }
 
-    /// Releases the pages of tiles that were read in place, so that they no longer count as memory of this process.
+    /// Gives the pages of `touched`, which were read in place, back to the operating system, so that they no longer
+    /// count as memory of this process.
     pub fn release(&self, touched: &mut TouchedPages) {
         touched.bytes = 0;
         touched.ranges.sort_unstable_by_key(|range| range.start);
@@ -175,14 +180,15 @@ impl Reader {
         self.file.release(merged);
     }
 
-    /// Returns the loaded tile and the number of the stored frame for `frame` (0 for constant tiles).
+    /// Returns the loaded tile and the number of the stored frame that holds its frame `frame`: 0 if all frames are
+    /// equal.
     fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
         let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
         assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
         (tile, if tile.constant { 0 } else { frame })
     }
 
-    /// Counts the bytes of one frame of a raw tile, unless they have been counted.
+    /// Counts the `bytes` bytes of one frame of a raw tile as read, unless they were counted before.
     fn count_frame(&self, frames: &mut TileFrames, frame: usize, bytes: usize) {
         if frames.counted != Counted::Tile && frames.counted != Counted::Frame(frame) {
             frames.counted = Counted::Frame(frame);
@@ -190,8 +196,8 @@ impl Reader {
         }
     }
 
-    /// Verifies the checksum of a raw tile by reading it in chunks through `chunk`, unless that was done before.
-    /// Returns whether it was verified now.
+    /// Checks the checksum of a raw tile, which is read in chunks into the buffer `chunk`, unless this was done before.
+    /// Returns whether it was checked now.
     fn verify_raw(&self, index: usize, tile: &TileRecord, chunk: &mut Vec<u8>) -> Result<bool> {
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(false);
@@ -208,37 +214,37 @@ impl Reader {
 }
 
 impl TileFrames {
-    /// Returns the memory held, in bytes.
+    /// Returns the bytes of memory that the loaded tile takes.
     pub fn memory(&self) -> usize {
         self.decoder.memory()
     }
 
-    /// Returns whether the loaded tile is raw and read in place, from the map.
+    /// Returns whether the loaded tile is raw (plain f32) and is read in place, from the memory map.
     pub fn is_in_place(&self) -> bool {
         self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::Raw)
     }
 }
 
 impl TouchedPages {
-    /// Returns the number of bytes of the map that wait to be released.
+    /// Returns the number of bytes in the memory map that were read in place and have not been released.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Moves all ranges of `other` to this list.
+    /// Moves all byte ranges of `other` to this list.
     pub fn append(&mut self, other: &mut TouchedPages) {
         self.ranges.append(&mut other.ranges);
         self.bytes += std::mem::take(&mut other.bytes);
     }
 
-    /// Adds the stored bytes of a tile.
+    /// Adds the range of the stored bytes of a tile.
     fn add(&mut self, tile: &TileRecord) {
         self.bytes += u64::from(tile.stored_bytes);
         self.ranges.push(tile.offset..tile.offset + u64::from(tile.stored_bytes));
     }
 }
 
-/// Returns the offset in the file of a frame of a raw tile.
+/// Returns the offset in the file of frame `frame` of a raw tile with `plane` values per frame.
 fn frame_offset(tile: &TileRecord, frame: usize, plane: usize) -> u64 {
     tile.offset + 4 * (frame * plane) as u64
 }

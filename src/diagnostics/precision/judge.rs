@@ -1,4 +1,5 @@
-//! Quality of a selection of Gaussians against the whole model, on views that were not used for ranking or fitting.
+//! Quality of a selection of Gaussians, compared with renders of the whole model from views that were not used for
+//! ranking or fitting.
 
 use rayon::prelude::*;
 
@@ -11,10 +12,10 @@ use crate::scene::Scene;
 use crate::scene::pictures::{ViewSet, pictures};
 use crate::source::Ids;
 
-/// Maximum number of views to judge by.
+/// Maximum number of views on which quality is measured.
 const PICTURES: usize = 24;
 
-/// Renders of the whole model to compare with.
+/// Renders of the whole model, with which renders of a selection of its Gaussians are compared.
 ///
 /// Memory: 12 bytes for every pixel of at most 24 views.
 pub(super) struct Judge {
@@ -22,18 +23,18 @@ pub(super) struct Judge {
     originals: Vec<Image>,
 }
 
-/// Quality of a result against the whole model.
+/// Quality of a selection of Gaussians, compared with the whole model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct JudgedQuality {
-    /// Root mean square error over all pixels, channels and views, of colors from 0 to 1.
+    /// Root mean square error over all pixels, channels and views; colors are from 0 to 1.
     pub(super) error: f64,
-    /// Mean PSNR in dB.
+    /// Mean PSNR over the views, in dB.
     pub(super) psnr: f64,
 }
 
 impl Judge {
-    /// Renders the held-out views of `scene`, or an even selection of them; if no views are held out, a selection of
-    /// all views.
+    /// Renders the held-out (test) views of `scene`, or an even selection of them if they are many. If no views are
+    /// held out, renders an even selection of all views.
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
@@ -46,17 +47,17 @@ impl Judge {
         Ok(Judge { pictures, originals })
     }
 
-    /// Returns the memory for views of `pixels` pixels, in bytes.
+    /// Returns the bytes of memory for the renders if a view has `pixels` pixels.
     pub(super) fn bytes(pixels: u64) -> u64 {
         12 * pixels * PICTURES as u64
     }
 
-    /// Returns the number of views.
+    /// Returns the number of views on which quality is measured.
     pub(super) fn pictures(&self) -> usize {
         self.pictures.len()
     }
 
-    /// Returns the quality of the Gaussians `kept` of `scene`.
+    /// Renders only the Gaussians `kept` of `scene` and returns their quality, compared with the whole model.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -72,7 +73,7 @@ impl Judge {
 }
 
 impl JudgedQuality {
-    /// Computes the quality from the PSNR of views of one size.
+    /// Computes the quality from the PSNR of each view; all views must have the same size.
     pub(super) fn from_psnr(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;
@@ -80,7 +81,7 @@ impl JudgedQuality {
     }
 }
 
-/// Renders `pictures` of `subject` and passes the images to `take` in order.
+/// Renders `subject` in the views `pictures` and passes the images to `take`, in order.
 fn render_views(
     scene: &Scene,
     subject: RenderedSource<'_>,
@@ -102,7 +103,7 @@ mod tests {
 
     #[test]
     fn squared_errors_and_decibels_are_averaged() {
-        // Errors of a tenth and a hundredth of the range.
+        // These PSNRs are root mean square errors of a tenth and of a hundredth of the range.
         let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&[20.0, 40.0]);
         assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
         assert_eq!((psnr, JudgedQuality::from_psnr(&[f64::INFINITY]).error), (30.0, 0.0));

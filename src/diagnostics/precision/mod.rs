@@ -1,12 +1,14 @@
-//! Work-precision diagrams: time, memory and error of a run for several values of each parameter, on a given model.
+//! Diagrams of work against precision: time, memory and error of the program for several values of each parameter, on a
+//! given model.
 //!
-//! Errors have three sources, which are measured separately. *Discretization*: views, pixels, frames, rounds and
-//! buckets are samples; the error of each setting is measured against the finest one of its kind, at an equal number of
-//! kept Gaussians. *Rounding*: sums in f32 and in f64 are compared with more accurate ones; threads and memory must
-//! change nothing. *Model*: fewer Gaussians replace more, merged or refined.
+//! Errors have three sources, which are measured separately. *Discretization*: only some views, pixels, frames, pruning
+//! rounds and histogram buckets are used. The error of each setting is measured against the finest setting of its kind,
+//! with equal numbers of kept Gaussians. *Rounding*: sums in f32 and in f64 are compared with more accurate ones; the
+//! number of threads and the memory limit must change nothing. *Model*: fewer Gaussians, merged or refined, replace
+//! more.
 //!
-//! Memory: that of `compress`, and in addition the scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every
-//! pixel of the views that results are judged by. Whole runs get the rest of the memory limit.
+//! Memory: that of `compress`, the scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every pixel of the views
+//! on which quality is measured. Runs of the whole program get the rest of the memory limit.
 
 mod judge;
 mod ranking;
@@ -40,31 +42,32 @@ use crate::statistics::score::Scores;
 use crate::statistics::score::sketch::MOST_BITS;
 use judge::Judge;
 
-/// Group of settings that is varied, called a knob.
+/// Group of settings that a diagram varies, called a knob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Knob {
-    /// First pass over the views: number of views, and strides of pixels, views and frames.
+    /// Settings of the first ranking by renders: the number of views, and the strides of pixels, views and frames.
     Look,
-    /// Pruning rounds: views per round, and the fraction that a round leaves.
+    /// Settings of the pruning rounds (rank, remove the lowest, repeat): views per round, and the fraction of the
+    /// Gaussians that a round keeps.
     Rounds,
-    /// Percentiles: bits of a sketch made in one pass.
+    /// Precision of percentiles that are found in one pass over the values: mantissa bits of the histogram.
     Percentiles,
-    /// Running sums: f32, compensated, f64.
+    /// Arithmetic of the sums of the scan: f32, f32 with compensation, or f64.
     Sums,
-    /// Merging: radius and passes.
+    /// Settings of merging: radius, and number of merging passes.
     Merging,
-    /// Refinement: steps and target views.
+    /// Settings of refinement: numbers of optimization steps and of target views.
     Refining,
-    /// Threads and memory.
+    /// Number of threads and memory limit, which must not change a result.
     Machine,
 }
 
 impl Knob {
-    /// Knobs in the order of the pipeline.
+    /// All knobs (groups of settings), in the order of the pipeline.
     pub const ALL: [Knob; 7] =
         [Knob::Look, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
 
-    /// Returns the name on the command line and in the results.
+    /// Returns the name of this knob on the command line and in the results.
     pub fn name(self) -> &'static str {
         match self {
             Knob::Look => "look",
@@ -77,7 +80,7 @@ impl Knob {
         }
     }
 
-    /// Returns the reason why the scene or the recipe may have no settings for this knob.
+    /// Returns the reason why a scene or recipe has no settings for this knob, if it has none.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
@@ -86,53 +89,54 @@ impl Knob {
         }
     }
 
-    /// Returns whether each setting of the knob is a whole run.
+    /// Returns whether every setting of this knob needs a complete run of the program.
     fn needs_whole_runs(self) -> bool {
         matches!(self, Knob::Merging | Knob::Refining | Knob::Machine)
     }
 }
 
-/// Options of a work-precision diagram.
+/// Options of a diagram of work against precision.
 #[derive(Debug, Clone)]
 pub struct PrecisionOptions {
-    /// Input and cameras; its split is ignored.
+    /// Input and cameras. The requested split into training and test views is ignored.
     pub input: InputOptions,
-    /// Recipe from which every setting starts.
+    /// Recipe that every setting starts from; a setting changes one of its parameters.
     pub recipe: Recipe,
-    /// Knobs to vary; `None`: all, but knobs with whole runs only if the model is short enough.
+    /// Knobs (groups of settings) to vary. `None`: all; those that need complete runs only if the model is small
+    /// enough.
     pub knobs: Option<Vec<Knob>>,
-    /// Number of Gaussians that every setting keeps.
+    /// Number or fraction of Gaussians that every setting keeps.
     pub target: Target,
-    /// Maximum number of frames whose views are used for ranking, evenly from first to last.
+    /// Maximum number of frames whose views are used for ranking, evenly spaced from the first frame to the last.
     pub max_frames: usize,
-    /// Maximum number of runs of every setting, at least 1; the median time is reported.
+    /// Maximum number of runs of every setting, at least 1. The median time is reported.
     pub runs: usize,
-    /// Folder for `precision.json`, `precision.csv` and the page.
+    /// Folder that gets `precision.json`, `precision.csv` and the page with the diagrams.
     pub output: PathBuf,
-    /// Policy if the folder exists.
+    /// Policy if the output folder already exists.
     pub overwrite: Replace,
 }
 
-/// Total seconds of a setting's runs after which it is not run again.
+/// Total time of a setting's runs, in seconds, after which the setting is not run again.
 const MAX_SETTING_SECONDS: f64 = 10.0;
 
-/// Maximum number of Gaussians times frames of a model for which whole runs are included by default.
+/// Largest size of a model, as Gaussians × frames, for which complete runs are included by default.
 const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
-/// Size of a sketch with the most bits, in bytes.
+/// Bytes of memory of the histogram for percentiles with the largest number of bits.
 const SKETCH_BYTES: u64 = 4 << (9 + MOST_BITS);
 
-/// Bytes per Gaussian held between settings: statistics twice, two contributions and two scores, and sets of kept
-/// Gaussians.
+/// Bytes per Gaussian that are kept in memory between settings: statistics twice, two contributions and two scores, and
+/// sets of kept Gaussians.
 const HELD_BYTES: u64 =
     (2 * Rows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
-/// Data shared by all settings.
+/// Scene and measurements that all settings share.
 struct Bench<'a> {
-    /// Scene with the training cameras, at a selection of its frames.
+    /// Scene with the training cameras, at some of its frames.
     scene: &'a Scene,
     input: &'a InputOptions,
-    /// Workload with all views.
+    /// Size of the input, with all views, for estimates of time and memory.
     work: Workload,
     recipe: &'a Recipe,
     scanned: ScanResult,
@@ -140,24 +144,24 @@ struct Bench<'a> {
     /// Number of Gaussians that every setting keeps.
     kept: usize,
     repeats: Repeats,
-    /// Path of the folder for results of whole runs; `name` is the name of a result in it.
+    /// Path of the folder for the results of complete runs; `name` is the file name of a result in it.
     scratch: &'a Path,
     name: &'a str,
     progress: Progress,
 }
 
 impl Bench<'_> {
-    /// Reports that another setting is done.
+    /// Advances the progress display by one setting.
     fn advance(&self) {
         self.progress.advance(1);
     }
 }
 
-/// Runs all settings of the knobs on a model and writes the results.
+/// Measures all settings of the chosen knobs on a model and writes the results to the output folder.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe, the options or the output are invalid, or if a run fails. No files
-/// remain then.
+/// remain in this case.
 pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     if options.input.is_stream() {
         return Err(Error::usage("precision reads its input many times: pack the stream first, then give the .gseq"));
@@ -205,7 +209,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     let measure = Measure::new(&options.recipe, true, UserOverrides::default());
     let scanned = measure.scan(&scene, &mut Journal::default())?;
     let judge = Judge::new(&scene)?;
-    // Progress of hundreds of stages would hide the current setting.
+    // The progress of hundreds of stages would hide which setting is being measured.
     scene.events = Events::IGNORED;
     let bench = Bench {
         scanned,
@@ -248,7 +252,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     Ok(found)
 }
 
-/// Opens the input.
+/// Opens the input, which must have cameras.
 ///
 /// # Errors
 /// Fails if the input cannot be opened or has no cameras.
@@ -263,8 +267,8 @@ fn open_with_cameras(input: &InputOptions) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Returns the requested knobs; by default all, but for a long model without those that need whole runs, which is added
-/// to `notes`.
+/// Returns the knobs to vary: those requested, else all. For a large model, knobs that need complete runs are left out,
+/// and `notes` gets a message about this.
 fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Knob> {
     let mut knobs = Knob::ALL.to_vec();
     knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
@@ -279,7 +283,7 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
     chosen
 }
 
-/// Writes the tables and the page of `found` to `folder`.
+/// Writes the tables and the page of the diagrams `found` to `folder`.
 fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
     let write = |name: &str, text: String| {
         let path = folder.join(name);
@@ -288,12 +292,12 @@ fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
     write("precision.csv", found.csv())?;
     write("precision.json", found.json())?;
     write(PAGE, page(found))?;
-    // With this file a later run recognizes the folder as one that it may replace.
+    // The marker file lets a later run recognize the folder as one that it may replace.
     write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))
 }
 
 impl Bench<'_> {
-    /// Runs all settings of a knob; `None` if the scene or the recipe has none.
+    /// Measures all settings of `knob`; returns `None` if the scene or the recipe has none.
     fn measure_knob(&self, knob: Knob) -> Result<Option<PrecisionKnob>> {
         match knob {
             Knob::Look => self.look(),
@@ -307,8 +311,8 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the schedule with the views of at most `most` (at least one) of the frames that have views, evenly from
-/// first to last.
+/// Returns the schedule (list of views per frame) with the views of some frames only: at most `most` (at least one) of
+/// those that have views, evenly spaced from first to last.
 fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let most = most.max(1);
@@ -326,8 +330,8 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     thinned
 }
 
-/// Returns the bytes of the schedule made by [`thin_frames`]: one run for each frame kept, and one for the frames up to
-/// the next.
+/// Returns the bytes of memory of a schedule made by [`thin_frames`]: one range for each frame kept, and one for the
+/// frames up to the next.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }
@@ -360,7 +364,7 @@ mod tests {
         let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Attributes::empty() };
         let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::for_tiles(1)) };
         assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));
-        // Two runs of 16 bytes, and a pair of 8 for every view.
+        // At least two ranges of 16 bytes, and a pair of 8 bytes for every view.
         assert!(thinned_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));
         assert!(thinned_bytes(&work, 0) > 0);
     }

@@ -1,4 +1,4 @@
-//! Settings of ranking: the views of the first pass, the pruning rounds, the percentiles of the scores.
+//! Settings of ranking: views of the first ranking by renders, pruning rounds, and percentiles of the scores.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
@@ -21,28 +21,29 @@ use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MOST_BITS;
 use crate::statistics::score::{PercentilePasses, Quantity, Scores, score_with_passes};
 
-/// Numbers of views of the first pass or a round that are tried, up to the number of existing views.
+/// Numbers of views that are tried, in the first ranking and in a pruning round. Numbers above that of the existing
+/// views are skipped.
 const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
-/// Maximum number of views of a round that is tried.
+/// Maximum number of views that is tried in a pruning round.
 const MOST_IN_ROUNDS: usize = 400;
-/// Strides that are tried.
+/// Strides of pixels, views and frames that are tried.
 const STRIDES: [u32; 4] = [16, 8, 4, 2];
-/// Fractions left by a round that are tried.
+/// Fractions of the Gaussians kept by a pruning round that are tried.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
-/// Numbers of mantissa bits of a sketch that are tried.
+/// Numbers of mantissa bits in the histogram for percentiles that are tried.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MOST_BITS];
 
-/// A ranking, its errors and its cost.
+/// Ranking by one setting: its errors, its cost, and the Gaussians that it keeps.
 struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
-    /// Errors that are known without the finest ranking.
+    /// Errors that can be computed without the ranking of the finest setting.
     errors: BTreeMap<String, f64>,
     kept: Vec<u32>,
 }
 
-/// A recipe to be tried, and its position on a curve.
+/// Recipe of one setting, and the position of the setting on its curve.
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -50,8 +51,8 @@ struct RankingVariant {
 }
 
 impl Bench<'_> {
-    /// Varies the first pass over the views: the number of views, and the strides of pixels, views and frames. Returns
-    /// `None` if the recipe has no such pass.
+    /// Varies the first ranking by renders: the number of views, and the strides of pixels, views and frames. Returns
+    /// `None` if the recipe does not rank by renders.
     pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
         let all = self.scene.schedule.pairs();
         let variant = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
@@ -96,19 +97,21 @@ impl Bench<'_> {
         }))
     }
 
-    /// Returns the contributions that the first pass with `recipe` measures; `None` if the recipe has no such pass.
+    /// Measures the contributions of all Gaussians to the views, with the settings of `recipe`. Returns `None` if the
+    /// recipe does not rank by renders.
     fn contributions(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
         let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
         let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
         measure.visible.as_ref().map(look).transpose()
     }
 
-    /// Returns the result of `contributions` and its cost.
+    /// Returns the result of `contributions`, and the time and memory it took.
     fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
         self.repeats.measure(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// Measures a curve of first passes that ends at the `finest` one.
+    /// Measures the rankings of `variants` as one curve, which ends at the finest setting. `finest`: contributions
+    /// measured with the finest setting, at position (`value`, `step`) of the curve. `own`: value of the recipe itself.
     fn pass_curve(
         &self,
         name: &str,
@@ -139,14 +142,14 @@ impl Bench<'_> {
         self.curve(name, "all pixels of all these views", tried, own, &[])
     }
 
-    /// Computes scores from the scan and the contributions `contributions`.
+    /// Computes scores and a selection from the statistics of the scan and from `contributions`.
     fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
         let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())
     }
 
-    /// Varies the pruning rounds: views per round, and the fraction that a round leaves. Returns `None` if the recipe
-    /// ranks by no views.
+    /// Varies the pruning rounds: views per round, and the fraction of the Gaussians that a round keeps. Returns `None`
+    /// if the recipe does not rank by renders.
     pub(super) fn rounds(&self) -> Result<Option<PrecisionKnob>> {
         let Some(contributions) = self.contributions(self.recipe)? else { return Ok(None) };
         let scored = self.scored(Some(contributions))?;
@@ -181,7 +184,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Ranks by the rounds of `select`, and measures the cost.
+    /// Ranks the Gaussians in pruning rounds with the settings `select`, and measures the cost. (`value`, `step`):
+    /// position of this setting on its curve.
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
@@ -195,7 +199,8 @@ impl Bench<'_> {
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
-    /// Compares percentiles from one pass over the values, with several numbers of bits, with exact ones.
+    /// Compares percentiles found in one pass over the values, by histograms with several numbers of mantissa bits,
+    /// with exact percentiles.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
@@ -222,7 +227,7 @@ impl Bench<'_> {
         let own = f64::from(MOST_BITS + 1);
         tried.push(measured(own, 0.0, &exact, cost)?);
         let against = "exact percentiles from two passes, as in every run (the last mark)";
-        // The error is half a bucket at most, and each bit halves the buckets.
+        // The error is at most half a bucket of the histogram, and each bit halves the buckets.
         let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILES, 1.0)])?;
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
@@ -232,7 +237,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Returns the curve of several rankings; the last one is the finest.
+    /// Returns the rankings `tried` as one curve. The last ranking is the finest, with which all others are compared.
     fn curve(
         &self,
         name: &str,
@@ -259,7 +264,7 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the values in increasing order, without duplicates.
+/// Returns the distinct values of `counts` in increasing order.
 fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     let mut counts: Vec<usize> = counts.collect();
     counts.sort_unstable();
@@ -267,13 +272,13 @@ fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     counts
 }
 
-/// Returns the relative error of a count.
+/// Returns the relative error of the number `count`, where `expected` is correct.
 fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// Returns the worst relative error of a percentile that scores are normalized by. Percentiles of combined scores are
-/// skipped, because their values differ themselves.
+/// Returns the largest relative error of the percentiles by which the terms of the scores are normalized. Percentiles
+/// of combined scores are skipped, because the values themselves differ there.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
     let pairs = pairs.filter(|(term, _)| !matches!(term.of, Quantity::Static | Quantity::Dynamic));

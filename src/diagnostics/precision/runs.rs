@@ -1,5 +1,5 @@
-//! Settings that need whole runs: the effect of merging and refinement at one size, and the effect of threads and
-//! memory.
+//! Settings that need complete runs of the program: the effect of merging and of refinement at a given number of
+//! Gaussians, and the effect of threads and memory.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,25 +17,25 @@ use crate::pipeline::{Only, Request, RunPlan, Target};
 use crate::recipe::{MergePass, Recipe};
 use crate::scene::{InputOptions, open_input};
 
-/// Merge radii, as multiples of the recipe's own.
+/// Merging radii that are tried, as multiples of the recipe's radius.
 const RADII: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
-/// Numbers of merge passes.
+/// Numbers of merging passes that are tried.
 const PASSES: [usize; 3] = [1, 2, 3];
-/// Numbers of refinement steps.
+/// Numbers of refinement steps that are tried.
 const STEPS: [u32; 6] = [100, 250, 500, 1000, 1500, 3000];
-/// Numbers of target views of refinement.
+/// Numbers of target views of refinement that are tried.
 const PICTURES_REFINED_BY: [usize; 5] = [32, 65, 130, 260, 520];
-/// Memory limits, as multiples of the smallest possible one.
+/// Memory limits that are tried, as multiples of the smallest possible one.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 
-/// Maximum number of frames on which results of whole runs are compared.
+/// Maximum number of frames at which the results of complete runs are compared with the whole model.
 const FRAMES_COMPARED: usize = 12;
 
-/// Reference of the errors of whole runs.
+/// Text for the results: what the results of complete runs are compared with.
 const WHOLE: &str = "renders of the whole model: every held-out view of up to 12 frames";
 
 impl Bench<'_> {
-    /// Measures merging after pruning, at one number of Gaussians.
+    /// Measures merging after pruning; all settings end at the same number of Gaussians.
     pub(super) fn merging(&self) -> Result<PrecisionKnob> {
         let plain = self.recipe.unrefined();
         let pass = plain.merge.passes.first().copied();
@@ -72,7 +72,8 @@ impl Bench<'_> {
         })
     }
 
-    /// Measures refinement at one number of Gaussians. Returns `None` for a recipe without refinement.
+    /// Measures refinement; all settings end at the same number of Gaussians. Returns `None` if the recipe does not
+    /// refine.
     pub(super) fn refining(&self) -> Result<Option<PrecisionKnob>> {
         let base = &self.recipe.refine;
         if base.refine.0.is_empty() || base.refine_steps == 0 {
@@ -103,7 +104,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Measures numbers of threads and memory limits, which must not change a byte of the result.
+    /// Measures the cost of several numbers of threads and memory limits, and checks that none changes a byte of the
+    /// result.
     pub(super) fn machine(&self) -> Result<PrecisionKnob> {
         let recipe = self.recipe.unrefined();
         let mut expected = None;
@@ -149,7 +151,8 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Runs `recipe` completely and measures quality and cost.
+    /// Runs the whole program with `recipe` and measures quality and cost. (`value`, `step`): position of this setting
+    /// on its curve.
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
@@ -163,7 +166,8 @@ impl Bench<'_> {
         })
     }
 
-    /// Runs `recipe` completely and compares the result's digest with `expected`, the digest of the first run.
+    /// Runs the whole program with `recipe` and compares the digest of the result with `expected`, the digest of the
+    /// first run, which is set if it is `None`. `value`: position of this setting on its curve.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

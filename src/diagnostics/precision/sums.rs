@@ -1,7 +1,8 @@
-//! Rounding errors of the running sums of a scan: in f32, in f32 with compensation, and in f64 as in the scan.
+//! Rounding errors of the sums that a scan accumulates over frames: in f32, in f32 with compensation, and in f64 as the
+//! program uses it.
 //!
-//! Some of the scene's trajectories are played forward and backward repeatedly, long enough for errors to grow visibly.
-//! The expected sums are in f64 with compensation.
+//! Some trajectories of the scene are played forward and backward again and again, until the errors are large enough to
+//! be seen. The expected sums are computed in f64 with compensation.
 
 use std::collections::BTreeMap;
 
@@ -16,26 +17,26 @@ use crate::recipe::{self, MotionParams, Recipe};
 use crate::source::{BlockReader, Ids, ReadPlan};
 use crate::statistics::{BlockScan, NEEDED, ScanPlan};
 
-/// Number of Gaussians whose sums are computed, spaced evenly over all.
+/// Number of Gaussians whose sums are computed, spaced evenly over all Gaussians.
 const GAUSSIANS: usize = 64;
-/// Maximum number of frames of the scene that are played, spaced evenly over all.
+/// Maximum number of different frames that are played, spaced evenly over all frames of the scene.
 const MOST_FRAMES: usize = 240;
-/// Numbers of frames for which they are played.
+/// Lengths of the played sequences, in frames.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
-/// Reference of the errors of sums.
+/// Text for the results: what the sums are compared with.
 const AGAINST: &str = "f64, compensated";
 
-/// A running sum.
+/// Sum of numbers of type `T` that are added one after the other.
 trait Sum<T: Float>: Default {
     fn add(&mut self, value: T);
     fn total(self) -> f64;
 }
 
-/// A plain sum, which loses what rounding loses.
+/// Plain sum, whose rounding errors are lost.
 struct Plain<T>(T);
 
-/// Kahan's compensated sum: the second number holds what rounding lost.
+/// Kahan's compensated sum: the second number holds what rounding removed from the first.
 struct Compensated<T>(T, T);
 
 impl<T: Float> Default for Plain<T> {
@@ -81,11 +82,12 @@ fn from_f64<T: Float>(value: f64) -> T {
     T::from(value).unwrap_or(T::nan())
 }
 
-/// D, κ and V of every Gaussian.
+/// Trajectory magnitude D, curvature κ and opacity variance V of every Gaussian.
 type SummedStatistics = [Vec<f64>; 3];
 
 impl Bench<'_> {
-    /// Measures the errors of sums over longer and longer sequences. Returns `None` for fewer than three frames.
+    /// Measures the errors of sums over longer and longer sequences. Returns `None` for scenes of fewer than three
+    /// frames.
     pub(super) fn sums(&self) -> Result<Option<PrecisionKnob>> {
         let source = self.scene.source();
         let info = source.info();
@@ -131,7 +133,7 @@ impl Bench<'_> {
         }))
     }
 
-    /// Returns a mark for every number of frames.
+    /// Measures the sums `sums` for each length in [`PLAYED`] and returns their errors against `expected`.
     fn measure_lengths(
         &self,
         expected: &[SummedStatistics],
@@ -152,14 +154,14 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the index, of `count` frames, of the `k`-th frame when frames are played forward and backward.
+/// Returns which of `count` frames is the `k`-th one if frames are played forward and backward again and again.
 fn ping_pong_index(k: usize, count: usize) -> usize {
     let turn = 2 * (count - 1);
     let at = k % turn;
     at.min(turn - at)
 }
 
-/// Values of one frame that the sums need.
+/// Positions and opacities of all Gaussians at one frame, which the sums need.
 struct Decoded {
     position: Vec<[f32; 3]>,
     opacity: Vec<f64>,
@@ -174,7 +176,8 @@ impl Decoded {
     }
 }
 
-/// Computes D, κ and V over `frames_played` frames of Gaussians that are always alive, in numbers T summed by S.
+/// Computes trajectory magnitude D, curvature κ and opacity variance V over `frames_played` frames, for Gaussians that
+/// are always alive. Numbers have the type `T` and are added by the sum `S`.
 fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize) -> SummedStatistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
@@ -209,7 +212,8 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
     std::array::from_fn(|statistic| found.iter().map(|values| values[statistic]).collect())
 }
 
-/// Computes D, κ and V with the scan itself; all Gaussians count as alive.
+/// Computes trajectory magnitude D, curvature κ and opacity variance V with the scan of the program. All Gaussians
+/// count as alive.
 fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = ViewSchedule::default();
@@ -235,11 +239,11 @@ mod tests {
 
     #[test]
     fn sums_of_a_steady_walk_equal_the_formula() {
-        // Moves a quarter per frame, forward and backward between 0 and 1; each reversal changes the step by one half.
-        // Opacities equal positions.
+        // The Gaussian moves by a quarter per frame, forward and backward between 0 and 1, so each reversal changes the
+        // step by one half. Its opacity equals its position.
         let at = |k: u32| Decoded { position: vec![[0.25 * k as f32, 0.0, 0.0]], opacity: vec![0.25 * f64::from(k)] };
         let states: Vec<Decoded> = (0..5).map(at).collect();
-        // One way takes 4 frames, so 17 frames are two round trips with reversals at frames 4, 8 and 12.
+        // One direction takes 4 frames, so 17 frames are two round trips, with reversals at frames 4, 8 and 12.
         let d = 0.25;
         let kappa = 3.0 * 0.5 / 15.0;
         let levels: Vec<f64> = (0..17).map(|k| 0.25 * ping_pong_index(k, 5) as f64).collect();

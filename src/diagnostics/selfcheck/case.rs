@@ -1,4 +1,4 @@
-//! Result of one case: a name, a bound, and the largest error found.
+//! Result of one case of the self-check: a name, a bound, and the largest error found.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -6,21 +6,21 @@ use serde::Serialize;
 
 use crate::error::Result;
 
-/// Result of one case.
+/// Result of one case of the self-check.
 #[derive(Debug, Serialize)]
 pub struct Case {
-    /// Short name of the case.
+    /// Short name of the self-check case.
     pub name: &'static str,
-    /// Values that are compared, and their reference.
+    /// Description of the values that are compared, and of what they are compared with.
     pub what: &'static str,
-    /// Largest error of a correct build. Errors are relative or in the unit that `what` names.
+    /// Largest error that a correct program may have. Errors are relative, or in the unit that `what` names.
     pub bound: f64,
-    /// Largest error found; infinite or NaN, which is JSON null, if a value is not a number or nothing could be
+    /// Largest error found. It is infinite or NaN (null in JSON) if a value is not a number or nothing could be
     /// measured.
     pub error: f64,
-    /// Whether the error is within the bound.
+    /// Whether the error found is at most the bound.
     pub pass: bool,
-    /// Reason why nothing could be measured.
+    /// Reason why nothing could be measured; `None` if the case ran.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub failure: Option<String>,
 }
@@ -42,7 +42,7 @@ impl Case {
     }
 }
 
-/// Largest error so far; NaN, which exceeds every bound, before any value was compared.
+/// Largest error of the values compared so far. It is NaN, which exceeds every bound, until a value is compared.
 #[derive(Debug)]
 pub(super) struct LargestError(pub(super) f64);
 
@@ -53,22 +53,22 @@ impl Default for LargestError {
 }
 
 impl LargestError {
-    /// Adds an error; NaN counts as infinite.
+    /// Adds the error of one value; NaN counts as infinite.
     pub(super) fn add(&mut self, error: f64) {
         self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
     }
 
-    /// Adds |got − expected| / `unit`, for a positive unit.
+    /// Adds the error |got − expected| / `unit`; `unit` must be positive.
     pub(super) fn near(&mut self, got: f64, expected: f64, unit: f64) {
         self.add((got - expected).abs() / unit);
     }
 
-    /// Adds |got − expected| / |expected|, or 0 if both are equal.
+    /// Adds the relative error |got − expected| / |expected|, or 0 if both are equal.
     pub(super) fn relative(&mut self, got: f64, expected: f64) {
         self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
     }
 
-    /// Adds 1 if values differ that must be equal, else 0.
+    /// Adds the error 1 if `got` differs from `expected`, else 0.
     pub(super) fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
         self.add(if got == expected { 0.0 } else { 1.0 });
     }

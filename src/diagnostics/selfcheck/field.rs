@@ -1,4 +1,4 @@
-//! Cases for the deformation field of a 4DGaussians model.
+//! Self-check cases for the deformation field of a 4DGaussians model.
 
 use std::path::Path;
 
@@ -8,7 +8,8 @@ use crate::deform::synthetic::{Noise, plain, tensors};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
 use crate::model::{Attributes, Gaussians};
 
-/// Compares states with the definition, relative to 1 + |value|; the bound allows some 60 roundings in f32.
+/// Compares states computed by the deformation field with its definition in f64. Errors are relative to 1 + |value|;
+/// the bound allows about 60 roundings in f32.
 pub(super) fn states() -> Case {
     Case::new("deformation field", "states: planes, layers in f64", 5e-6, || {
         let mut worst = LargestError::default();
@@ -39,8 +40,8 @@ pub(super) fn states() -> Case {
     })
 }
 
-/// Compares the Jacobian with differences of the definition over 2e-6, relative to 1 + |value|; derivatives in f32 of
-/// products of six samples.
+/// Compares the Jacobian of the deformation field with finite differences of its f64 definition over 2e-6. Errors are
+/// relative to 1 + |value|; the bound allows for f32 derivatives of products of six samples.
 pub(super) fn derivative() -> Case {
     Case::new("field's derivative", "of positions: differences in f64", 1e-5, || {
         let (config, time, step) = (plain(), 0.37, 1e-6);
@@ -69,7 +70,7 @@ pub(super) fn derivative() -> Case {
     })
 }
 
-/// Returns random Gaussians of SH degree 3, some outside the field's box.
+/// Returns `count` random Gaussians of SH degree 3, some of them outside the bounding box of the field.
 fn random_gaussians(count: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut random_gaussians = Gaussians::zeros(count, 3);

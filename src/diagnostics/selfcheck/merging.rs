@@ -1,4 +1,4 @@
-//! Cases for merging: properties of its members that a proxy conserves.
+//! Self-check cases for merging: what a proxy (Gaussian that replaces a cluster) must have in common with its members.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -11,7 +11,8 @@ use crate::merging::{Survivors, run};
 use crate::model::{Attributes, Gaussians};
 use crate::recipe::{MergeParams, Placement, ProxyOpacity, Recipe};
 
-/// Compares moments with Σ formed in f64, relative to its largest entry; a dozen parts lose some 1e-15.
+/// Compares the merged mean and covariance Σ of a mixture with Σ formed directly in f64. Errors are relative to the
+/// largest entry of Σ; a dozen Gaussians lose about 1e-15.
 pub(super) fn mixture() -> Case {
     Case::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
@@ -33,8 +34,8 @@ pub(super) fn mixture() -> Case {
     })
 }
 
-/// Merges a Gaussian with its copy, which must return the Gaussian: scales of 1 : 1e12 are exact to 1e-12 each. A
-/// covariance formed in f64 would lose the smallest scale entirely.
+/// Merges a Gaussian with its copy, which must return the same Gaussian. Its scales have the ratio 1 : 1e12 and must be
+/// exact to 1e-12 each; a covariance formed in f64 would lose the smallest scale entirely.
 pub(super) fn needle() -> Case {
     Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = LargestError::default();
@@ -48,8 +49,8 @@ pub(super) fn needle() -> Case {
     })
 }
 
-/// Compares like [`mixture`], for stored Gaussians 1000 units away, whose offsets lose 1e-13 there; the opacity is 1 −
-/// Π(1 − α).
+/// Compares the mean and covariance of a proxy as [`mixture`] does, for stored Gaussians at a distance of 1000 units,
+/// where their offsets lose 1e-13. Its opacity must be 1 − Π(1 − α), α being the opacities of the members.
 pub(super) fn proxy() -> Case {
     Case::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = scene(4, 5, 1);
@@ -81,7 +82,7 @@ pub(super) fn proxy() -> Case {
     })
 }
 
-/// Merges exact copies: the proxy has their parameters to the bit, and the opacity of the rule in f32.
+/// Merges exact copies. The proxy must have their parameters to the bit, and the opacity that the rule gives in f32.
 pub(super) fn duplicates() -> Case {
     Case::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = scene(6, 1, 0);
@@ -119,7 +120,7 @@ fn recipe(opacity: ProxyOpacity) -> Result<MergeParams> {
     Ok(MergeParams { opacity, ..Recipe::preset("default")?.merge })
 }
 
-/// Returns Gaussian `i` as a part of a mixture.
+/// Returns Gaussian `i` with the weight `weight`, as a part of a mixture.
 fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
     WeightedGaussian {
@@ -130,7 +131,8 @@ fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     }
 }
 
-/// Compares with mean and covariance by the textbook, forming Σ; errors are relative to the largest entry of Σ.
+/// Compares mean and covariance of `found` with those of `parts` by the textbook formula, which forms Σ. Errors are
+/// relative to the largest entry of Σ.
 fn compare_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
     let covariance = |rotation: DQuat, scales: DVec3| {
         let axes = DMat3::from_quat(rotation);

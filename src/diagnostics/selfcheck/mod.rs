@@ -1,12 +1,13 @@
-//! Self-check: compares numbers computed by this program on this machine with closed forms and slow oracles.
+//! Self-check: compares numbers that this program computes on this machine with exact formulas and with oracles (slow
+//! reference computations in f64).
 //!
 //! Input: none; every case generates its data, the same on every run. Output: a [`SelfcheckReport`], one line per case.
 //! Memory: a few sequences of at most 3000 Gaussians; on disk one sequence at a time, in a temporary folder that is
 //! deleted.
 //!
 //! A case runs the code that `compress` runs. The expected values share no code with it: they come from a formula, from
-//! integers, or from the definition in f64 over whole arrays ([`oracle`]). The error of a case is the largest error of
-//! all values compared.
+//! exact integer arithmetic, or from the definition written out in f64 over whole arrays ([`oracle`]). The error of a
+//! case is the largest error of all values it compares.
 
 mod case;
 mod field;
@@ -28,7 +29,7 @@ use crate::error::{Error, Result};
 
 pub use case::Case;
 
-/// Cases in the order of the pipeline.
+/// All cases, in the order of the pipeline.
 const CASES: [fn() -> Case; 28] = [
     statistics::motion,
     statistics::motion_far_away,
@@ -60,20 +61,20 @@ const CASES: [fn() -> Case; 28] = [
     threads::same_bytes,
 ];
 
-/// Results of all cases.
+/// Results of all cases of the self-check.
 #[derive(Debug, Serialize)]
 pub struct SelfcheckReport {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: &'static str,
     /// Whether every case passes.
     pub pass: bool,
-    /// Run time in seconds.
+    /// Time that all cases took, in seconds.
     pub seconds: f64,
-    /// Results of the cases, in the order of the pipeline.
+    /// Result of each case, in the order of the pipeline.
     pub cases: Vec<Case>,
 }
 
-/// Runs every case.
+/// Runs all cases of the self-check.
 pub fn run() -> SelfcheckReport {
     let start = Instant::now();
     let cases: Vec<Case> = CASES.iter().map(|case| case()).collect();

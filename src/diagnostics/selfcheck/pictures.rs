@@ -1,4 +1,4 @@
-//! Cases for renders, their derivatives with respect to the stored parameters, and image metrics.
+//! Self-check cases for renders, their derivatives with respect to the stored parameters, and image metrics.
 
 use std::f64::consts::TAU;
 use std::num::NonZeroU32;
@@ -14,8 +14,9 @@ use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// Compares with α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)). Values of 1 in f32 are off by 6e-8, an
-/// exponential by a little more.
+/// Compares the render of one Gaussian with color c and opacity o, scale s at distance z, with the formula α·c + (1 −
+/// α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)), r px from its center at focal length f. In f32, values of 1 have an
+/// error of 6e-8, and exponentials a little more.
 pub(super) fn one_gaussian() -> Case {
     Case::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
@@ -35,8 +36,9 @@ pub(super) fn one_gaussian() -> Case {
     })
 }
 
-/// Compares with sums in f64, pixel by pixel; a pixel adds some dozen values in f32. Pixels with a decision within 1e-4
-/// of a threshold, which are few, are skipped, because f32 may decide differently.
+/// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
+/// per pixel in f32. Pixels in which a comparison is within a fraction of 1e-4 of its threshold are skipped, because
+/// f32 may decide differently; they are few.
 pub(super) fn many_gaussians() -> Case {
     Case::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (scene(1, 300, 3), camera(67, 45));
@@ -52,7 +54,8 @@ pub(super) fn many_gaussians() -> Case {
     })
 }
 
-/// Compares Σ and maximum of α·T, relative to 1 + value; sums are in f32 over a tile of 256 pixels.
+/// Compares sum and maximum of alpha · transmittance of each Gaussian with f64 values. Errors are relative to 1 +
+/// value; the program sums in f32 over a tile of 256 pixels.
 pub(super) fn weights() -> Case {
     Case::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -68,8 +71,8 @@ pub(super) fn weights() -> Case {
     })
 }
 
-/// Compares with Σ‖render − render without the Gaussian‖², both in f64; the color behind a Gaussian results from a
-/// difference in f32.
+/// Compares removal errors with their definition Σ‖render − render without the Gaussian‖², both in f64. In the program,
+/// the color behind a Gaussian is a difference in f32.
 pub(super) fn removal() -> Case {
     Case::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -90,7 +93,8 @@ pub(super) fn removal() -> Case {
     })
 }
 
-/// Compares with K·P(cos θ)·cos mφ by recurrence; a color of 1 is off by some 1e-7 in f32.
+/// Compares spherical harmonics colors with K·P(cos θ)·cos mφ, the definition by angles, with the Legendre functions P
+/// by recurrence and the factor K. A color of 1 has an error of about 1e-7 in f32.
 pub(super) fn harmonics() -> Case {
     Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();
@@ -101,7 +105,7 @@ pub(super) fn harmonics() -> Case {
             wall.position.set_row(0, toward.to_array().map(|x| 4.0 * x as f32));
             wall.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
             wall.log_scale.set_row(0, [9.0; 3]);
-            // Opaque except for a hundredth, because alpha is clamped to 0.99.
+            // The wall lets through a hundredth of the light behind it, because alpha is clamped to 0.99.
             wall.opacity_logit.set_row(0, [9.0]);
             for (k, expected) in basis(toward).into_iter().enumerate() {
                 wall.sh.planes_mut().fill(0.0);
@@ -117,8 +121,8 @@ pub(super) fn harmonics() -> Case {
     })
 }
 
-/// Compares the largest gradients of every attribute with differences of f64 renders over 6e-5, relative to each; the
-/// gradients are sums in f32 with both signs.
+/// Compares the largest gradients of every attribute with finite differences of f64 renders over 6e-5. Errors are
+/// relative to each gradient; gradients are f32 sums of terms of both signs.
 pub(super) fn gradients() -> Case {
     Case::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (scene(3, 40, 3), camera(33, 100));
@@ -133,7 +137,7 @@ pub(super) fn gradients() -> Case {
         };
         Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
 
-        // The blended Gaussians are fixed beforehand, so that the loss has no steps.
+        // Which Gaussians each pixel blends is fixed beforehand, so that the loss is smooth.
         let blended = blended(&scene, &camera);
         let loss = |changed: &Gaussians| -> f64 {
             let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
@@ -160,8 +164,8 @@ pub(super) fn gradients() -> Case {
     })
 }
 
-/// Compares PSNR (in dB) with whole numbers, and SSIM with its definition; sums in f64 of 786,432 squares lose 1e-12 at
-/// most.
+/// Compares PSNR in dB with whole numbers, and SSIM with its definition. The f64 sums of 786,432 squares lose at most
+/// 1e-12.
 pub(super) fn comparison() -> Case {
     Case::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);
@@ -180,19 +184,19 @@ pub(super) fn comparison() -> Case {
     })
 }
 
-/// Seed of a scene whose render has no doubtful pixel.
+/// Seed of a scene in whose render no comparison is so close to its threshold that f32 and f64 may decide differently.
 const UNDOUBTFUL_SEED: u64 = 1;
 
-/// Returns a scene and a camera without a decision so near a threshold that f32 decides differently, and without
-/// clamped alphas.
+/// Returns a scene and a camera for which no comparison is so close to its threshold that f32 may decide differently
+/// from f64, and no alpha is clamped.
 fn undoubtful_scene() -> (Gaussians, Camera) {
     let mut scene = scene(UNDOUBTFUL_SEED, 60, 1);
     scene.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = logit.min(2.0));
     (scene, camera(40, 33))
 }
 
-/// Returns the real spherical harmonics of degree up to 3 by angles: √2·K·P(cos θ)·cos mφ, with sin |m|φ for negative
-/// m.
+/// Returns the real spherical harmonics up to degree 3 in the direction `toward`, by angles: √2·K·P(cos θ)·cos mφ, with
+/// sin |m|φ for negative m, where P is a Legendre function and K its normalization.
 fn basis(toward: DVec3) -> [f64; 16] {
     let (height, angle) = (toward.z, toward.y.atan2(toward.x));
     std::array::from_fn(|k| {
@@ -210,7 +214,8 @@ fn basis(toward: DVec3) -> [f64; 16] {
     })
 }
 
-/// Returns the associated Legendre function, with the sign (−1)^m, by the recurrence in its degree.
+/// Returns the associated Legendre function of `degree` and order `m` at `x`, including the sign (−1)^m, by the
+/// recurrence over degrees.
 fn legendre(degree: usize, m: usize, x: f64) -> f64 {
     let sine = (1.0 - x * x).sqrt();
     let (mut before, mut last) = (0.0, (0..m).map(|k| -((2 * k + 1) as f64) * sine).product::<f64>());
@@ -221,7 +226,8 @@ fn legendre(degree: usize, m: usize, x: f64) -> f64 {
     last
 }
 
-/// Computes SSIM window by window: 11×11 values, σ = 1.5, zeros beyond the border.
+/// Computes SSIM by its definition, window by window. Windows have 11×11 values, weighted by a Gaussian of σ = 1.5;
+/// values beyond the border are zero.
 fn reference_ssim(a: &Image, b: &Image) -> f64 {
     let size = a.width as i64;
     let bell = |d: i64| (-(d * d) as f64 / 4.5).exp();

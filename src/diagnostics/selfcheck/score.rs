@@ -1,4 +1,4 @@
-//! Cases for the percentiles by which values are normalized and scenes are measured.
+//! Self-check cases for percentiles, by which statistics are normalized and the scene extent is measured.
 
 use super::case::{Case, LargestError};
 use super::made::clouds::Random;
@@ -6,7 +6,7 @@ use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
-/// Compares with sorted values: the value at the rank, to the bit.
+/// Compares percentiles with the value at the same rank after sorting, to the bit.
 pub(super) fn percentiles() -> Case {
     Case::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -22,7 +22,7 @@ pub(super) fn percentiles() -> Case {
     })
 }
 
-/// Compares like [`percentiles`].
+/// Compares the box between percentiles of positions with sorted values, to the bit.
 pub(super) fn robust_box() -> Case {
     Case::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -41,14 +41,14 @@ pub(super) fn robust_box() -> Case {
     })
 }
 
-/// Returns the value at rank ⌈p·n/100⌉, at least 1.
+/// Returns the `p`-th percentile of `n` sorted values: the value at rank ⌈p·n/100⌉, at least 1.
 fn sorted_percentile(values: &[f64], p: usize) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted[(sorted.len() * p).div_ceil(100).max(1) - 1]
 }
 
-/// Returns distinct values over 46 powers of ten with both signs, including subnormals of f32.
+/// Returns `count` distinct values over 46 powers of ten with both signs, including subnormal numbers of f32.
 fn values(count: usize) -> Vec<f64> {
     let mut random = Random(count as u64);
     let value = |_| {

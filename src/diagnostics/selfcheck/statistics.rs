@@ -1,4 +1,4 @@
-//! Cases for the statistics of a scan.
+//! Self-check cases for the statistics that a scan of all frames computes.
 
 use std::f64::consts::PI;
 
@@ -14,8 +14,8 @@ use crate::statistics::{BlockScan, ScanPlan};
 
 const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
-/// Compares with the definition, for life spans with many gaps; sums of 40 terms in f64 lose some 1e-15, and variances
-/// a few digits more.
+/// Compares the statistics of motion and opacity with their definition in f64, for life spans with many gaps. Sums of
+/// 40 terms in f64 lose about 1e-15, and variances a few digits more.
 pub(super) fn motion() -> Case {
     Case::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -35,21 +35,21 @@ pub(super) fn motion() -> Case {
     })
 }
 
-/// Compares with whole numbers of ulps; the differences are exact, and a sum of 2000 squares in f64 loses 1e-14 at
-/// most.
+/// Compares statistics of Gaussians far from the origin, whose motion is whole numbers of ulps, with exact values. The
+/// differences are exact; a sum of 2000 squares in f64 loses at most 1e-14.
 pub(super) fn motion_far_away() -> Case {
     Case::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
-/// Compares like [`motion_far_away`], with subnormal positions and with positions whose squares overflow f32.
+/// Compares as [`motion_far_away`] does, for subnormal positions and for positions whose squares overflow f32.
 pub(super) fn motion_of_any_size() -> Case {
     Case::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
         compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
     })
 }
 
-/// Compares with a formula: x = t² at whole t of mean step m has velocities m·(t + t') and turns of 2m²; sums of 40
-/// terms in f64.
+/// Compares motion at unevenly spaced frames with a formula. For x = t² at whole t with mean step m, velocities are
+/// m·(t + t') between t and t', and turns (second differences) are 2m². Sums have 40 terms in f64.
 pub(super) fn uneven_frames() -> Case {
     Case::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -72,13 +72,13 @@ pub(super) fn uneven_frames() -> Case {
     })
 }
 
-/// Compares with exact values for 0 to 3 frames of life.
+/// Compares the statistics of Gaussians that are alive in 0 to 3 frames with exact values.
 pub(super) fn short_lives() -> Case {
     Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
         for motion in DEFINITIONS {
-            // Cases: liveness in each frame; numbers of steps of 3 and of turns of 6 that count, for the paper and for
-            // runs.
+            // Each case lists in which frames the Gaussian is alive, then how many steps of 3 and turns (second
+            // differences) of 6 count: first in the paper's definition (`literal`), then under `runs`.
             for (life, steps, turns) in [
                 (&[0][..], [0, 0], [0, 0]),
                 (&[1], [0, 0], [0, 0]),
@@ -86,7 +86,7 @@ pub(super) fn short_lives() -> Case {
                 (&[0, 1, 1], [2, 1], [0, 0]),
                 (&[1, 0, 1], [1, 0], [0, 0]),
                 (&[1, 1, 1], [2, 2], [1, 1]),
-                // The turn at the last frame of life does not count.
+                // The turn (second difference) about the last frame in which the Gaussian is alive does not count.
                 (&[1, 1, 1, 0], [2, 2], [1, 1]),
                 (&[1, 1, 0, 0], [1, 1], [0, 0]),
             ] {
@@ -107,8 +107,9 @@ pub(super) fn short_lives() -> Case {
     })
 }
 
-/// Compares V with two passes in f64. Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of
-/// itself; with unshifted moments only 2 digits would remain.
+/// Compares the variance V of nearly constant opacities with a computation in two passes in f64. Opacities of 0.9 that
+/// differ by 1e-6 have errors of 1e-16, so V has a relative error below 1e-9. Moments about 0 would leave only 2
+/// correct digits.
 pub(super) fn steady_opacity() -> Case {
     Case::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
@@ -134,7 +135,8 @@ pub(super) fn steady_opacity() -> Case {
     })
 }
 
-/// Compares with full matrices in f64, relative to max(area, 1 px); C is summed in units of some 3e-11 px.
+/// Compares projected areas with full matrices in f64. Errors are relative to max(area, 1 px); the contribution C is
+/// summed in units of about 3e-11 px.
 pub(super) fn projected_area() -> Case {
     Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = random_frames(500, 3);
@@ -153,9 +155,9 @@ pub(super) fn projected_area() -> Case {
     })
 }
 
-/// Compares with a closed form: a needle of variances a and b px², rotated about the line of sight, has det Σ = (a +
-/// 0.3)(b + 0.3). Computed from the entries of Σ, no digit of the determinant would be correct. The error is relative
-/// to max(area, 1 px), as in [`projected_area`].
+/// Compares the projected area of a needle with a formula: with variances a and b px², rotated about the line of sight,
+/// it has det Σ = (a + 0.3)(b + 0.3). Computed from the entries of Σ, no digit of the determinant would be correct.
+/// Errors are relative to max(area, 1 px), as in [`projected_area`].
 pub(super) fn needle_on_screen() -> Case {
     Case::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -165,7 +167,7 @@ pub(super) fn needle_on_screen() -> Case {
             near: Camera::NEAR,
             fx: focal,
             fy: focal,
-            // Pixel centers are whole numbers, so the center of the image is half a pixel off half its size.
+            // Pixel centers have whole coordinates, so the center of the image is at half its size minus half a pixel.
             cx: f64::from(size) / 2.0,
             cy: f64::from(size) / 2.0,
             rotation: DMat3::IDENTITY,
@@ -188,14 +190,15 @@ pub(super) fn needle_on_screen() -> Case {
             let sides = [cosine * cosine * a + sine * sine * b, sine * sine * a + cosine * cosine * b];
             let share = |variance: f64| (f64::from(size) / (6.0 * (variance + 0.3).sqrt())).min(1.0);
             let area = 9.0 * PI * ((a + 0.3) * (b + 0.3)).sqrt() * share(sides[0]) * share(sides[1]);
-            // The Gaussian has an opacity of one half.
+            // The opacity of the Gaussian is one half, so its contribution is half its area.
             worst.near(got.c[0], area / 2.0, (area / 2.0).max(1.0));
         }
         Ok(worst)
     })
 }
 
-/// Measures one Gaussian that moves along x by whole numbers of `unit` from `from`, for every (from, unit).
+/// Compares the statistics of one Gaussian that moves along x from `from` by whole numbers of `unit` with exact values,
+/// for every pair (from, unit) in `sizes`.
 fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {
@@ -203,7 +206,7 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
         let mut place = 0i64;
         let places: Vec<i64> = (0..2000)
             .map(|_| {
-                // Steps lead back toward the start, so that every position is exact in f32.
+                // Steps lead back toward the start, so every position is exact in f32.
                 let step = (1000.0 * random.draw()) as i64;
                 place += if place > 0 { -step } else { step };
                 place
@@ -227,7 +230,7 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     Ok(worst)
 }
 
-/// Returns one Gaussian with steps +3, −3, …
+/// Returns one Gaussian at frame `t` that alternately moves by +3 and −3.
 fn zigzag(t: usize, alive: bool) -> Gaussians {
     let mut frame = resting(1);
     frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);
@@ -235,15 +238,15 @@ fn zigzag(t: usize, alive: bool) -> Gaussians {
     frame
 }
 
-/// Returns Gaussians at the origin with an opacity of one half.
+/// Returns `count` Gaussians at the origin with an opacity of one half.
 fn resting(count: usize) -> Gaussians {
     let mut frame = Gaussians::zeros(count, 0);
     frame.rotation.plane_mut(0).fill(1.0);
     frame
 }
 
-/// Returns Gaussians at random positions in every frame before a camera at the origin, some of them behind it; in a
-/// third of the frames they are not alive.
+/// Returns `count` Gaussians at new random positions in every frame, before a camera at the origin; some are behind it.
+/// In a third of the frames they are not alive.
 fn random_frames(count: usize, frames: usize) -> Vec<Gaussians> {
     let mut random = Random(3);
     let mut frame = |_| {
@@ -270,13 +273,14 @@ fn without_views(frames: usize) -> ViewSchedule {
     schedule
 }
 
-/// Returns the statistics of evenly spaced frames.
+/// Returns the statistics that the scan of the program computes for evenly spaced frames.
 fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
-/// Returns the statistics of frames at `times`; reports unchanged opacities to the scan, as sources do.
+/// Returns the statistics that the scan of the program computes for frames at `times`. Tells the scan when opacities
+/// are unchanged, as sources do.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

@@ -1,4 +1,4 @@
-//! Cases for stored data: reads back what was written.
+//! Self-check cases for stored data: written values are read back and compared.
 
 use std::collections::BTreeMap;
 use std::iter::repeat;
@@ -21,7 +21,8 @@ use crate::outputs::bounds::{Bounds, MaxError};
 use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Compares every bit, including NaN and −0, and including an attribute whose last frame equals its first.
+/// Compares every bit of a lossless container, including NaN and −0, and including an attribute whose last frame equals
+/// its first.
 pub(super) fn container() -> Case {
     Case::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
@@ -35,7 +36,7 @@ pub(super) fn container() -> Case {
     })
 }
 
-/// Compares values; the unit of the error is the requested bound.
+/// Compares the values of a container with error bounds. The unit of the error is the requested bound.
 pub(super) fn bounded_container() -> Case {
     Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
@@ -54,7 +55,8 @@ pub(super) fn bounded_container() -> Case {
     })
 }
 
-/// Compares values; the unit of the error is half a step of the grid plus a rounding to f32.
+/// Compares the values of an archive with the originals. The unit of the error is half a quantization step plus a
+/// rounding to f32.
 pub(super) fn archive_grid() -> Case {
     Case::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
@@ -77,7 +79,8 @@ pub(super) fn archive_grid() -> Case {
     })
 }
 
-/// Compares values on the grid and bytes to the bit: prediction and coding are lossless.
+/// Compares the decoded Gaussians with the originals rounded to the quantization grid, and the other stored data with
+/// the originals, to the bit: prediction and entropy coding of an archive are lossless.
 pub(super) fn archive_codes() -> Case {
     Case::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
@@ -96,10 +99,10 @@ pub(super) fn archive_codes() -> Case {
     })
 }
 
-/// Quantization step of a matrix: 2^(−60/8).
+/// Quantization step of a matrix, as eighths of its binary logarithm: 2^(−60/8).
 const MATRIX_STEP: i32 = -60;
 
-/// Returns a model of 2000 Gaussians of SH degree 2 with two tensors and a file, and its quantization steps.
+/// Returns a model of 2000 Gaussians of SH degree 2 with two tensors and a file, and the quantization steps for it.
 fn model() -> (Content, Steps) {
     let mut random = Random(12);
     let mut tensor = |shape: &[usize]| Tensor {
@@ -118,12 +121,13 @@ fn model() -> (Content, Steps) {
     (content, Steps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
-/// Returns the number of attributes in use: position to opacity, and the SH degrees that exist.
+/// Returns the number of components in use: those from position to opacity, and those of the SH degrees that exist.
 fn used_attributes(content: &Content) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }
 
-/// Writes `written` to a container, reads it back, and passes every value read and its original to `compare`.
+/// Writes `written` to a container, reads it back, and calls `compare` with every value read, the original value, and
+/// its attribute.
 fn compare_round_trip(
     written: &MemoryFrames,
     packing: impl Into<Packing>,
@@ -147,15 +151,16 @@ fn compare_round_trip(
     Ok(())
 }
 
-/// Frames in memory.
+/// Sequence of frames in memory.
 struct MemoryFrames {
     info: SequenceInfo,
     frames: Vec<Gaussians>,
 }
 
 impl MemoryFrames {
-    /// Creates 1100 Gaussians, more than a block, at 70 frames, more than two blocks. Positions wander, opacities jump,
-    /// rotations return to their first value in the last frame of a block, scales and colors are constant.
+    /// Creates 1100 Gaussians (more than one block of Gaussians) at 70 frames (more than two blocks of frames).
+    /// Positions wander, opacities jump, rotations return to their first value in the last frame of a block, and scales
+    /// and colors are constant.
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);

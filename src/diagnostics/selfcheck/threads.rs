@@ -1,4 +1,4 @@
-//! Cases for work that is distributed over threads.
+//! Self-check cases for work that is distributed over threads.
 
 use std::fs;
 
@@ -15,7 +15,7 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
-/// Compares bytes: the distribution of work over threads must not change the result.
+/// Compares the bytes of results computed with different numbers of threads; they must be equal.
 pub(super) fn same_bytes() -> Case {
     Case::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (run_on(1)?, run_on(2)?);
@@ -25,7 +25,8 @@ pub(super) fn same_bytes() -> Case {
     })
 }
 
-/// Returns the compressed demo scene and the gradients of one view, computed on `threads` threads.
+/// Compresses the demo scene and computes the gradients of one view, on `threads` threads. Returns the compressed bytes
+/// and the gradients.
 fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| Error::usage(format!("{threads} threads: {error}")))?;

@@ -8,7 +8,7 @@ use splat_platform::{FileKind, is_system_folder};
 use super::named::{MARKER, Owner, entries, split_target};
 use crate::error::{Error, Result, ShowPath};
 
-/// Kind of an output.
+/// Kind of an output: file or folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A single file.
@@ -17,38 +17,40 @@ pub enum Kind {
     Folder,
 }
 
-/// Policy for an output path that already exists.
+/// Policy for an output path that already exists: replace the existing file or folder, or refuse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 pub enum Replace {
     /// Existing outputs are never replaced.
     #[default]
     Never,
-    /// A file is replaced, whatever it holds: the user named it. In a folder that holds an earlier result, the files that
-    /// its summary lists are replaced; every other file stays where it is, or gets `.kept` behind its name where the new
-    /// result has a file of that name. A folder without such a summary is refused unless it is empty.
+    /// A file is replaced, whatever it holds: the user named it. In a folder that holds an earlier result, the files
+    /// listed in the summary of that result are replaced. Every other file stays, with `.kept` appended to its name if
+    /// the new result has a file of the same name. A folder without a summary of this program is refused unless it is
+    /// empty.
     Existing,
 }
 
-/// Kind of entry found at an output path.
+/// Kind of file or folder that exists at an output path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Destination {
-    /// No entry.
+    /// Nothing exists at the path.
     Free,
-    /// A regular file or a link to one.
+    /// A regular file or a link to a regular file.
     File,
     /// A folder.
     Folder,
-    /// A link to a folder.
+    /// A link that leads to a folder.
     FolderLink,
-    /// A character device or FIFO, or a link to one. Output is written into it; its name is never replaced.
+    /// A character device or FIFO, or a link to one. The output is written into the device or FIFO, which is never
+    /// replaced.
     Stream,
 }
 
-/// Returns the kind of entry at `target`.
+/// Returns what exists at the path `target`.
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] for sockets, block devices, dangling links, and links that lead through a system folder
-/// to a regular file: these are neither written nor replaced.
+/// to a regular file. This program neither writes nor replaces any of these.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
@@ -60,7 +62,8 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     };
     match FileKind::from_type(found) {
         FileKind::CharacterDevice | FileKind::Fifo => Ok(Destination::Stream),
-        // Standard output redirected to a file: replacing the link would replace a link of the system.
+        // Standard output that is redirected to a file, for example `/dev/stdout`: replacing the link would replace a
+        // link that belongs to the system.
         FileKind::File if is_link && leads_through_system_link(target) => {
             refuse("a link of the system, which is not replaced")
         }
@@ -72,10 +75,10 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     }
 }
 
-/// Returns whether `target`, or a link it leads to, lies in a system folder, as `/dev/stdout` does.
+/// Returns whether `target`, or one of the links that it leads to, lies in a system folder, as `/dev/stdout` does.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
-    // Linux follows at most 40 links.
+    // Follow at most 40 links, as Linux does.
     for _ in 0..40 {
         let Ok((parent, name)) = split_target(&link) else { return false };
         let Ok(parent) = fs::canonicalize(parent) else { return false };
@@ -88,10 +91,11 @@ fn leads_through_system_link(target: &Path) -> bool {
     false
 }
 
-/// Checks that the entry at `target`, if there is one, may be replaced by an output of `kind`.
+/// Checks that an existing file or folder at `target` may be replaced by an output of `kind`. Passes if nothing exists
+/// there.
 ///
 /// # Errors
-/// Fails with [`Error::Usage`] if the entry has another kind or `replace` does not allow to replace it.
+/// Fails with [`Error::Usage`] if the existing one has another kind or `replace` does not allow to replace it.
 pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
     let shown = target.shown();
     let found = destination(target)?;
@@ -117,7 +121,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
     }
 }
 
-/// Checks that the folder at `target` is a result of this program with a list of its files.
+/// Checks that the folder at `target` is an earlier result of this program whose summary lists its files.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
     match Owner::read(&target.join(MARKER)) {
@@ -135,7 +139,7 @@ fn is_empty_folder(target: &Path) -> bool {
         && entries(target).is_ok_and(|entries| entries.is_empty())
 }
 
-/// Returns the real path of the folder that `target` is written into.
+/// Returns the real path (without links) of the folder that `target` is written into.
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] if the target has no name, or if its folder does not exist or is not a folder.

@@ -1,5 +1,5 @@
-//! Cleanup of workspaces of killed runs: interrupted publications are completed or reverted, everything else is
-//! removed.
+//! Cleanup after killed runs. A publication (the move of finished outputs to their names) that was interrupted is
+//! completed or reverted; all other workspaces (hidden folders for unfinished outputs) of killed runs are removed.
 
 use std::ffi::{OsStr, OsString};
 use std::io::{self, Read as _};
@@ -18,25 +18,28 @@ use super::workspace::{
 };
 use crate::error::{Error, Result, ShowPath};
 
-/// Maximum time to wait for another run that publishes a result under the same name, which takes milliseconds.
+/// Maximum time to wait while another run moves a result to the same name, which takes milliseconds.
 const MAX_WAIT: Duration = Duration::from_secs(60);
-/// Maximum time to wait until another run has finished inspecting an unfinished workspace, which takes microseconds.
+/// Maximum time to wait while another run inspects an unfinished workspace (hidden folder of a killed run), which takes
+/// microseconds.
 const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
-/// Maximum length of a journal in bytes.
+/// Maximum length in bytes of a journal (list of the files of one result that get their names together).
 const MAX_JOURNAL: u64 = 1 << 20;
 
-/// Lock of a run while it publishes a result under one name or repairs an interrupted publication of it.
+/// Lock that a run holds while it moves a result to its final name or repairs an interrupted move to that name.
 ///
-/// The lock is a workspace with a fixed name, so a lock left by a killed run is removed like any other leftover.
+/// The lock is a hidden folder whose name follows from the name of the result. A lock left by a killed run is removed
+/// like any other workspace.
 pub(super) struct PublishLock {
     _workspace: Workspace,
 }
 
 impl PublishLock {
-    /// Waits until no other run publishes under the name of `target`, then takes the lock.
+    /// Waits until no other run moves a result to the name of `target`, then takes the lock.
     ///
     /// # Errors
-    /// Fails if another run or a foreign folder has the name of the lock for a minute, or if a system call fails.
+    /// Fails if another run holds the lock, or a folder not created by this program has its name, for a minute; also if
+    /// a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
         let (parent, name) = split_target(target)?;
         let name = publishing_name(name);
@@ -67,17 +70,19 @@ impl PublishLock {
     }
 }
 
-/// List of files of a result that are published together, in this order.
+/// List of the files of one result that get their final names together, in this order.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Journal {
     pub(super) replace: Replace,
-    /// Name of each file in the workspace, and its final name beside the workspace.
+    /// For each file, its name in the workspace (hidden folder) and its final name in the folder that holds the
+    /// workspace.
     pub(super) files: Vec<(String, OsString)>,
 }
 
-/// Repairs and removes leftovers of killed runs beside `target`: outputs with this name and scratch files.
+/// Repairs and removes the hidden folders that killed runs left beside `target`: those of outputs with this name and
+/// those of scratch files.
 ///
-/// Never fails; leftovers that cannot be repaired stay and cause a warning.
+/// Never fails. A hidden folder that cannot be repaired stays and causes a warning.
 pub(super) fn clean_up(target: &Path) {
     let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -90,7 +95,7 @@ pub(super) fn clean_up(target: &Path) {
         }
     }
     for entry in left(name).into_iter().chain(left(SCRATCH.as_ref())) {
-        // Leave a workspace that became unfinished meanwhile to the next run.
+        // If another run was killed meanwhile while publishing from this workspace, leave it to the next run.
         if let Ok(leftover) = Leftover::take(&parent, entry)
             && !is_unfinished(&leftover.folder)
         {
@@ -99,7 +104,8 @@ pub(super) fn clean_up(target: &Path) {
     }
 }
 
-/// Removes leftovers of killed runs in `folder` whose target names end with `ending`.
+/// Removes hidden folders of killed runs from `folder` if the name of the output that they were written for ends with
+/// `ending`.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
     let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
@@ -111,10 +117,10 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
     }
 }
 
-/// Repairs interrupted publications under the name of `target`. The caller holds the [`PublishLock`].
+/// Completes or reverts interrupted moves of results to the name of `target`. The caller holds the [`PublishLock`].
 ///
-/// `supersedes`: the caller is about to publish a result. A publication that cannot be completed is then discarded, so
-/// that no later run completes it over that result.
+/// `supersedes`: the caller is about to move its own result to this name. An interrupted move that cannot be completed
+/// is then discarded, so that no later run completes it and thereby overwrites the caller's result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
     let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -130,9 +136,11 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
     }
 }
 
-/// Takes an unfinished workspace while this run holds the [`PublishLock`]. A running process has an unfinished
-/// workspace then only after a failure, just before it ends. A lock on the workspace otherwise means that another run
-/// is inspecting it for a moment, so this waits.
+/// Takes over the unfinished workspace `name` in `parent`; returns `None` if that is not possible.
+///
+/// While this run holds the [`PublishLock`], another run that is still alive has an unfinished workspace only after a
+/// failure, just before it ends. Otherwise a locked workspace is being inspected by another run for a moment. So this
+/// function waits for up to 5 s ([`MAX_INSPECTION_WAIT`]).
 fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {
@@ -144,11 +152,13 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     }
 }
 
-/// Completes or reverts an interrupted publication. The caller holds the [`PublishLock`].
+/// Completes or reverts an interrupted move of a result from the workspace `folder` to `target`. The caller holds the
+/// [`PublishLock`].
 ///
-/// Files of a journal get their final names. An earlier folder gets its name back if no other entry has it. Otherwise
-/// its entries that its summary does not list are moved into the new folder. If that fails, for example because a
-/// folder belongs to another user, the earlier folder is kept beside the result under a visible name.
+/// Files listed in a journal get their final names. If the earlier result folder was moved aside, it gets its name back
+/// if that name is free. Otherwise the new folder is already in place, and entries that are not listed in the earlier
+/// folder's summary are moved into it. If they cannot be moved, for example because a folder belongs to another user,
+/// the earlier folder is kept beside the result under a visible name.
 pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let (_, name) = split_target(target)?;
     if folder.has(JOURNAL) {
@@ -157,7 +167,7 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     if folder.has(REPLACED) && !parent.has(name) {
         folder.rename(REPLACED, parent, name).map_err(Error::io("put back", target))?;
     }
-    // Rename in one step: a partly deleted earlier result must not be mistaken for a result.
+    // Discard by a rename, which is one step: a partly deleted earlier result must not be mistaken for a result.
     if !folder.has(REPLACED) {
         return Ok(());
     }
@@ -185,7 +195,7 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     Ok(())
 }
 
-/// Gives the remaining files of the journal their final names.
+/// Gives their final names to the files of the journal that are still in the workspace `folder`.
 fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = split_target(target)?;

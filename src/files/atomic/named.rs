@@ -1,7 +1,7 @@
-//! Ownership of files: which files belong to a result, and which were added by others.
+//! Ownership of files: which files belong to a result, and which were added by others (foreign files).
 //!
-//! The summary of a result lists its files under `files`, relative to the folder of the summary. Files that other
-//! programs added to a result's folder, such as images and scores, are not in the list.
+//! The summary of a result lists the files of the result under `files`, relative to the folder of the summary. Foreign
+//! files in the folder of a result, such as images and scores of other programs, are not in the list.
 
 use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
@@ -15,24 +15,25 @@ use splat_platform::{FolderHandle, open_without_waiting};
 use crate::error::{Error, Result, ShowPath, quoted};
 
 /// Name of the summary file that identifies a folder as a result of this program: a JSON object whose `tool` names the
-/// program. Its `files` list the result's files; [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add
-/// them.
+/// program. The list `files` in it names the files of the result; [`super::StagedFolder::commit`] and
+/// [`super::StagedFiles::commit`] add them.
 pub const MARKER: &str = "summary.json";
 
 /// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
 /// are not summaries of this program and are not read.
 const MAX_SUMMARY: u64 = 16 << 20;
 
-/// Ownership declared by a summary.
+/// What a summary declares about the files of its result.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
-    /// No summary with a list of files, or a summary of another program.
+    /// There is no summary with a list of files, or the summary is one of another program.
     Unknown,
-    /// Result of this program with these files.
+    /// The summary was written by this program and lists these files.
     Listed(BTreeSet<String>),
 }
 
-/// Fields of a summary that declare ownership. Other fields are skipped without keeping them in memory.
+/// Fields of a summary that declare which files belong to the result. Other fields are skipped without keeping them in
+/// memory.
 #[derive(Deserialize)]
 struct Declared {
     tool: String,
@@ -40,13 +41,13 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads the summary at `path`, which may be a link.
+    /// Reads from the summary at `path`, which may be a link, which files belong to the result.
     pub(super) fn read(path: &Path) -> Owner {
-        // A plain open of a FIFO would wait for its writer.
+        // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
-    /// Reads the summary in `file`.
+    /// Reads from the open summary `file` which files belong to the result.
     pub(super) fn read_file(mut file: File) -> Owner {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;
@@ -62,11 +63,11 @@ impl Owner {
     }
 }
 
-/// Adds the list `files` to the summary at `path`. Fails if the summary is not a JSON object.
+/// Adds the list `files` to the summary file at `path`. Fails if the summary is not a JSON object.
 pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     let text = fs::read_to_string(path).map_err(Error::io("read back", path))?;
     let found: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-    // Edit the text, so that the other entries keep their order.
+    // Edit the text instead of writing the parsed object, so that the other entries keep their order.
     let Some(entries) = text.trim_end().strip_suffix('}').filter(|_| found.is_object()) else {
         return Err(Error::internal(format!(
             "{}: expected a JSON object to list files in, found {}",
@@ -82,7 +83,7 @@ pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     fs::write(path, text).map_err(Error::io("write", path))
 }
 
-/// Returns the paths of all files below `folder`, relative to it and sorted.
+/// Returns the paths of all files below `folder`, relative to `folder` and sorted.
 pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     fn visit(folder: &Path, inside: &Path, out: &mut Vec<String>) -> Result<()> {
         for entry in entries(folder)? {
@@ -97,11 +98,11 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     Ok(files)
 }
 
-/// Moves the entries of the folder `old` that its summary does not list into the folder `new`. An entry whose name
-/// exists in `new` gets `.kept` appended to its name.
+/// Moves foreign entries, which are not listed in the summary of the earlier result `old`, into the folder `new` of the
+/// new result. An entry whose name exists in `new` gets `.kept` appended to its name.
 ///
-/// Entries that cannot be moved stay, and the first failure is returned. The function may be repeated after an
-/// interruption at any point: every entry is always in exactly one of the two folders.
+/// Entries that cannot be moved stay in `old`, and the first failure is returned. The function may be called again
+/// after an interruption at any point: every entry is always in exactly one of the two folders.
 pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
         Ok(Owner::Listed(listed)) => listed,
@@ -117,9 +118,12 @@ pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result
     result
 }
 
-/// Collects in `out` the relative paths of foreign entries of `folder`, which lies at `inside` in the old result: files
-/// that are not in `listed`, and folders that hold no listed file and do not exist in `new`. Skips folders that cannot
-/// be read and returns the first failure.
+/// Appends the paths of foreign entries in `folder` to `out`. `folder` is the subfolder `inside` of an earlier result
+/// whose files are `listed`; `new` is the folder of the new result.
+///
+/// Foreign entries are files that are not in `listed`, and folders that contain no file in `listed` and do not exist in
+/// `new`. Paths are relative to the earlier result. Folders that cannot be read are skipped; the first such failure is
+/// returned at the end.
 fn find_foreign(
     folder: &FolderHandle,
     new: &Path,
@@ -149,7 +153,8 @@ fn find_foreign(
     result
 }
 
-/// Returns an unused path below `folder` for `relative`. Names that are in the way of it get `.kept` appended.
+/// Returns an unused path for `relative` below `folder`. Appends `.kept` to the name of a component if an existing
+/// entry is in the way.
 fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();
@@ -164,13 +169,13 @@ fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     place
 }
 
-/// Returns a relative path as summaries list it, with `/` on every system.
+/// Returns a relative path as it is written in summaries: with `/` as separator on every system.
 fn listed_name(relative: &Path) -> String {
     let components: Vec<_> = relative.iter().map(OsStr::to_string_lossy).collect();
     components.join("/")
 }
 
-/// Returns the names in a folder, sorted because the order of a listing depends on the file system.
+/// Returns the names of the entries in `folder`, sorted because the file system determines the order of a listing.
 pub(super) fn entries(folder: &Path) -> Result<Vec<OsString>> {
     let listed = fs::read_dir(folder).and_then(|entries| entries.map(|entry| Ok(entry?.file_name())).collect());
     let mut names: Vec<OsString> = listed.map_err(Error::io("list", folder))?;
@@ -178,7 +183,7 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<OsString>> {
     Ok(names)
 }
 
-/// Returns whether an entry exists at `path`, including dangling links.
+/// Returns whether a file, a folder or a link, even a dangling one, exists at `path`.
 pub(super) fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
@@ -188,7 +193,7 @@ fn is_folder(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_dir())
 }
 
-/// Splits a target into its folder and its name. Fails if it has no name.
+/// Splits an output path into its folder and its name. Fails if it has no name.
 pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
         return Err(Error::usage(format!(

@@ -1,4 +1,4 @@
-//! Publication of finished outputs under their names, by one run at a time for each name.
+//! Publication: moves finished outputs to their final names. For each name, one run at a time does so.
 
 use std::ffi::OsString;
 use std::fs;
@@ -13,11 +13,11 @@ use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, Workspace, live_workspaces};
 use crate::error::{Error, Result, ShowPath};
 
-/// Renames files from `workspace` to their targets, in order. The last one is the output itself, the others are its
-/// companions. The files must have been synced to disk.
+/// Renames files from `workspace` (a hidden folder) to their targets, in the order of `files`. The last file is the
+/// output itself, the others are its companions. The files must have been synced to disk.
 ///
-/// For more than one file, a journal records which files belong together: if the process is killed or fails in between,
-/// the next run with this output completes the set.
+/// For more than one file, a journal records which files belong together: if the process is killed or fails between two
+/// renames, the next run with this output completes the set.
 ///
 /// # Errors
 /// Fails if a file that `replace` does not allow to replace appeared meanwhile, or if a system call fails.
@@ -47,12 +47,12 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     Ok(())
 }
 
-/// Writes and syncs the journal of the files in `workspace`.
+/// Writes the journal of `workspace`, which lists the files to be renamed together, and syncs it to disk.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
     let text = serde_json::to_vec(&journal).expect("plain data");
-    // Write under another name until it is complete.
+    // Write the journal under another name until it is complete, so that a file called `journal` is never partial.
     let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));
     let written = fs::write(&begun, text).and_then(|()| sync_file(&begun));
     let written = written.and_then(|()| fs::rename(&begun, &path)).and_then(|()| workspace.sync());
@@ -62,9 +62,9 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
     })
 }
 
-/// Renames the folder in `workspace` to `target`, replacing an earlier folder if there is one.
+/// Renames the new folder in `workspace` (a hidden folder) to `target`. Replaces an earlier folder of that name.
 ///
-/// If the process is killed in between, the next run with this output either puts the earlier folder back or completes
+/// If the process is killed meanwhile, the next run with this output either puts the earlier folder back or completes
 /// the replacement.
 ///
 /// # Errors
@@ -102,7 +102,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     Ok(())
 }
 
-/// Syncs the name of a published output to disk. A failure is only a warning, because the output is in place.
+/// Syncs the folder entry of the output `target` to disk. A failure is only a warning, because the output is in place.
 fn sync_parent(target: &Path) {
     let Ok((parent, _)) = split_target(target) else { return };
     if let Err(error) = sync_folder(&parent) {

@@ -11,22 +11,22 @@ use splat_platform::{is_standard_output, open_stream};
 use super::destination::{Destination, destination};
 use crate::error::{Error, Result, ShowPath};
 
-/// Maximum time to wait for a program to open the other end of a FIFO.
+/// Maximum time to wait for another program to open a FIFO for reading.
 const MAX_WAIT: Duration = Duration::from_secs(10);
 
-/// Whether an output was written to standard output.
+/// Whether this process has written an output to standard output.
 static IS_STANDARD_OUTPUT_USED: AtomicBool = AtomicBool::new(false);
 
-/// Returns whether an output was written to the device or pipe that is standard output. Reports must then not be
-/// printed there.
+/// Returns whether an output was written to the device or pipe that is standard output. The caller must then not print
+/// reports on standard output.
 pub fn is_standard_output_used() -> bool {
     IS_STANDARD_OUTPUT_USED.load(Ordering::Relaxed)
 }
 
-/// Copies the file `content` into the device or FIFO `target`.
+/// Copies the content of the file `content` into the device or FIFO `target`.
 ///
 /// # Errors
-/// Fails if the target is no longer a device or FIFO, if no program opens a FIFO for reading within 10 s, or if a write
+/// Fails if `target` is no longer a device or FIFO, if no program opens the FIFO for reading within 10 s, or if a write
 /// fails.
 pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     let failed = |error| Error::io("write to", target)(error);
@@ -42,7 +42,8 @@ pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Opens a device or FIFO for writing. Retries for [`MAX_WAIT`] if no program reads a FIFO, then fails.
+/// Opens a device or FIFO for writing. If no program has a FIFO open for reading, retries for 10 s ([`MAX_WAIT`]), then
+/// fails.
 fn open(target: &Path) -> io::Result<File> {
     let start = Instant::now();
     loop {

@@ -9,7 +9,7 @@ fn write_file(path: &Path, text: &str) {
     fs::write(path, text).unwrap();
 }
 
-/// Names in a folder, sorted.
+/// Returns the names of the entries in a folder, sorted.
 fn names_in(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
@@ -89,7 +89,7 @@ fn input_its_parents_and_children_are_never_targets() {
         assert!(refusal(&detour, Kind::Folder, &[&model], replace).contains("input itself"));
         assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], replace).contains("lies inside the input"));
     }
-    // A name that only starts like the input's is another path.
+    // A path whose name only begins with the name of the input is not inside the input.
     check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], Replace::Never).unwrap();
 }
 
@@ -154,7 +154,8 @@ fn impossible_targets_are_refused() {
     }
 }
 
-/// Creates the workspace that a killed run leaves beside `base/out`: its folder and an unlocked lock file.
+/// Creates the workspace (hidden folder) that a killed run leaves beside the target `base/out`: the folder and an
+/// unlocked lock file.
 fn killed_workspace(base: &Path, random: &str) -> PathBuf {
     let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
     write_file(&folder.join("lock"), workspace::LOCK_LINE);
@@ -168,12 +169,13 @@ fn only_leftovers_of_killed_runs_are_removed() {
     write_file(&killed_workspace(base.path(), "dead1").join("content/deep/part"), "half");
     write_file(&killed_workspace(base.path(), "dead2").join("content"), "half");
     fs::create_dir(base.path().join(".out.begun.splatsieve-tmp")).unwrap();
-    // A run known to this process only by its lock, like one in another container.
+    // A live run that this process can recognize only by its lock, like a run in another container.
     let runs = killed_workspace(base.path(), "alive");
     let lock = File::open(runs.join("lock")).unwrap();
     lock.lock().unwrap();
     write_file(&runs.join("content"), "half");
-    // Folders of other targets or with other names, and folders without the line in their lock file, are foreign.
+    // Foreign folders: those of other targets or with other names, and those without the marker line in their lock
+    // file.
     let kept = [
         ".other.dead1.splatsieve-tmp/lock",
         ".out.a.b.splatsieve-tmp/lock",
@@ -208,7 +210,7 @@ fn run_killed_between_renames_keeps_the_old_output() {
 fn workspace_with_an_empty_lock_is_removed() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    // State left by a run that is killed between creating the lock file and writing its line.
+    // State left by a run that was killed after it created the lock file and before it wrote the marker line.
     let workspace = Workspace::beside(&target).unwrap();
     File::create(workspace.folder.join("lock")).unwrap();
     let begun = base.path().join(".out.killed.splatsieve-tmp");
@@ -294,7 +296,7 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     assert_eq!(names_in(base.path()), ["out"]);
 }
 
-/// Stages `x.ply` and its two companions in `base`, with `text` in each.
+/// Writes `x.ply` and its two companions under hidden names for publication in `base`. Each holds `text`.
 fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
     let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
@@ -315,7 +317,8 @@ fn overwriting_a_file_replaces_it_with_its_companions() {
     assert_eq!(fs::read_to_string(base.path().join("x.ply.notes")).unwrap(), "precious");
 }
 
-/// Creates the state left in `base` by a run that is killed after it published the first `published` files.
+/// Creates in `base` the state that a run leaves if it is killed after giving `published` of its files their final
+/// names.
 fn leave_half_published(base: &Path, published: usize, replace: Replace) {
     let left = base.join(".x.ply.dead.splatsieve-tmp");
     write_file(&left.join("lock"), workspace::LOCK_LINE);

@@ -1,8 +1,9 @@
 //! Workspaces: hidden folders in which outputs are written before they get their names.
 //!
-//! A workspace `.<name>.<random>.splatsieve-tmp` lies beside its target. It holds the file `lock`, the output being
-//! written, and, while an earlier folder is replaced, that folder. The lock file contains a line that marks the
-//! workspace as created by this program; a folder without it is foreign and stays untouched, whatever its name is.
+//! A workspace `.<name>.<random>.splatsieve-tmp` lies beside its target. It holds the file `lock` and the output being
+//! written. While an earlier output folder is being replaced, it also holds that folder. The lock file contains a line
+//! that marks the workspace as created by this program; a folder without this line is foreign and stays untouched,
+//! whatever its name is.
 //!
 //! The system releases a lock when the process that holds it ends for any reason, so a workspace whose lock can be
 //! taken is a leftover. Locks work between containers and, if the file system supports it, between machines. Process
@@ -22,58 +23,60 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Target name of scratch files in any folder.
+/// Name that stands for the target in the workspaces (hidden folders) of scratch files, which have no target.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
-/// End of the names of workspaces.
+/// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
-/// Name of the file whose lock shows that the run is still going on.
+/// Name of the lock file in a workspace. A run keeps this file locked until it ends.
 const LOCK: &str = "lock";
 /// Content of the lock file, which marks the folder as a workspace of this program.
 pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// Name in the workspace of the file or folder being written.
+/// Name, in the workspace, of the output file or folder that is being written.
 pub(super) const CONTENT: &str = "content";
-/// Name in the workspace of an earlier folder that is being replaced. Entries that its summary does not list are moved
-/// into the new one.
+/// Name, in the workspace, of an earlier output folder that is being replaced. Files in it that its summary does not
+/// list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name in the workspace of content that only has to be deleted.
+/// Name, in the workspace, of files and folders that only have to be deleted.
 pub(super) const DISCARDED: &str = "discarded";
-/// Name of the journal of files that are being published together.
+/// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
-/// Entries that must not be deleted with their workspace: the next run with the same output handles them.
+/// Names of entries that must not be deleted with their workspace. The next run with the same output completes or
+/// reverts what they stand for.
 const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
-/// Workspaces of this process and the identity of their folders. A thread that publishes a result holds the guard, so
-/// that a signal is handled either before the result has its name or after.
+/// Paths of the workspaces (hidden output folders) of this process, with the identity of each folder. A thread that
+/// moves a result to its final name holds the guard, so that a signal is handled either before or after the move.
 static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
-/// Locks the table of workspaces of this process.
+/// Locks and returns the table of the workspaces of this process.
 pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
-    // The map is consistent even if a thread panicked while holding the lock.
+    // The table is consistent even if a thread panicked while holding the lock.
     LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Hidden folder for the content of one target. Dropping it removes the folder.
+/// Hidden folder in which the output for one target is written. Dropping this value removes the folder.
 #[derive(Debug)]
 pub(super) struct Workspace {
     pub(super) folder: PathBuf,
     identity: FileIdentity,
-    /// `None` on a file system without locks.
+    /// Locked lock file; `None` on a file system without locks.
     lock: Option<File>,
 }
 
 impl Workspace {
-    /// Creates a workspace beside `target`.
+    /// Creates a workspace (hidden folder) beside the output path `target`.
     pub(super) fn beside(target: &Path) -> Result<Workspace> {
         let (parent, name) = split_target(target)?;
         let mut prefix = OsString::from(".");
         prefix.push(name);
         prefix.push(".");
         loop {
-            // Held until the folder is in the table, so that a signal handler knows it.
+            // Keep the table locked until the folder is entered in it, so that a signal handler knows the folder.
             let mut live = live_workspaces();
             let mut builder = tempfile::Builder::new();
             builder.prefix(&prefix).suffix(ENDING);
-            // Private permissions: [`Leftover::take`] recognizes the folder by them before its lock file has the line.
+            // Set private permissions: until the lock file contains the marker line, [`Leftover::take`] recognizes the
+            // folder by these permissions.
             if let Some(private) = private_permissions() {
                 builder.permissions(private);
             }
@@ -87,7 +90,7 @@ impl Workspace {
         }
     }
 
-    /// Creates the workspace `name` in the folder `parent`; `None` if the name is taken.
+    /// Creates a workspace with the folder name `name` in `parent`; returns `None` if the name is taken.
     pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
         let folder = parent.join(name);
         let mut live = live_workspaces();
@@ -107,17 +110,17 @@ impl Workspace {
         claimed
     }
 
-    /// Returns the path of the output being written in this workspace.
+    /// Returns the path at which the output of this workspace is written.
     pub(super) fn content(&self) -> PathBuf {
         self.folder.join(CONTENT)
     }
 
-    /// Returns whether the workspace holds entries that must not be deleted with it.
+    /// Returns whether the workspace holds an earlier folder or a journal, which must not be deleted with it.
     fn is_unfinished(&self) -> bool {
         UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
     }
 
-    /// Syncs the lock file and the names in the workspace to disk.
+    /// Syncs the lock file and the entries of the workspace folder to disk.
     pub(super) fn sync(&self) -> io::Result<()> {
         if let Some(lock) = &self.lock {
             lock.sync_all()?;
@@ -136,7 +139,8 @@ impl Drop for Workspace {
     }
 }
 
-/// Returns the fixed workspace name that serves as lock for publishing a result called `name`.
+/// Returns the name of the hidden folder that serves as a lock while a result called `name` is moved to its final path.
+/// Every run uses the same name, so only one run can create the folder.
 pub(super) fn publishing_name(name: &OsStr) -> OsString {
     let mut workspace = OsString::from(".");
     workspace.push(name);
@@ -145,31 +149,36 @@ pub(super) fn publishing_name(name: &OsStr) -> OsString {
     workspace
 }
 
-/// Returns whether a workspace holds an earlier folder or a journal, which must be handled before it is removed.
+/// Returns whether a workspace holds an earlier folder or a journal. Both must be handled before the workspace is
+/// removed.
 pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }
 
-/// Returns whether `entry` is the name of a workspace with a random part for the target `name`.
+/// Returns whether `entry` is the folder name of a workspace for an output called `name`: that name, followed by a
+/// random part.
 pub(super) fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
     let rest = entry.as_encoded_bytes().strip_prefix(b".").and_then(|rest| rest.strip_prefix(name.as_encoded_bytes()));
     let random = rest.and_then(|rest| rest.strip_prefix(b".")?.strip_suffix(ENDING.as_bytes()));
     random.is_some_and(|random| !random.is_empty() && random.iter().all(u8::is_ascii_alphanumeric))
 }
 
-/// Returns the target name of the workspace `entry`, or `None` if `entry` is not the name of a workspace.
+/// Returns the name of the output that the workspace called `entry` is for; `None` if `entry` is not a workspace name.
 pub(super) fn target_name(entry: &OsStr) -> Option<&str> {
     hidden_name(entry, ENDING)
 }
 
-/// Returns `name` from an entry `.name.random` followed by `ending`.
+/// Returns the part `name` of an entry called `.name.random` with `ending` appended; `None` for other entries.
 fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
     let name = entry.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
     Some(name.rsplit_once('.')?.0)
 }
 
-/// Translates a path in a workspace into the path that the user gave: the target or a file in it. For a scratch file,
-/// whose name means nothing to the user, returns its folder and `true`. Returns `None` for other paths.
+/// Translates a path in a workspace (hidden folder) into the path that the user gave: the output path, or a file in the
+/// output folder.
+///
+/// For a scratch file, whose name the user does not know, returns the folder that contains it and `true`. Returns
+/// `None` for paths outside workspaces.
 pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     let mut parts = path.components();
     let mut before = PathBuf::new();
@@ -184,7 +193,7 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
         return Some((before, true));
     }
     before.push(name);
-    // Containers are written under a hidden name of their own.
+    // An output that is a container lies in the workspace under one more hidden name.
     before.extend(
         parts
             .skip(1)
@@ -193,24 +202,25 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// Guard during whose lifetime this process neither publishes nor removes an output; see [`withdraw_all`].
+/// Guard that keeps this process from giving outputs their final names and from removing outputs; see [`withdraw_all`].
 #[must_use = "runs go on as soon as this is dropped"]
 pub struct Withdrawn(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
 );
 
-/// Removes all unpublished outputs of this process, for a process that is about to end.
+/// Removes all outputs of this process that do not have their final names yet. Called when the process is about to end.
 ///
-/// Waits for a result that is being published, which is then complete. Files outside workspaces stay.
+/// First waits until a result that is being moved to its final name is complete. Files outside workspaces (hidden
+/// output folders) stay.
 pub fn withdraw_all() -> Withdrawn {
     let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
         if UNFINISHED.iter().any(|name| exists(&folder.join(name))) {
             continue;
         }
-        // Threads that are still writing into it fail from here on, because the folder is gone.
+        // Threads that are still writing into the folder fail from now on, because its path is gone.
         let _ = fs::rename(folder.join(CONTENT), folder.join(DISCARDED));
-        // A thread may be creating a file while the folder is emptied, so try again.
+        // Try again, because a thread may create a file while the folder is being emptied.
         for _ in 0..100 {
             remove_workspace(&folder, identity, None);
             if !exists(&folder) {
@@ -222,7 +232,8 @@ pub fn withdraw_all() -> Withdrawn {
     Withdrawn(live)
 }
 
-/// Locks and marks the new workspace `folder`; `None` if another run mistook it for a leftover and is removing it.
+/// Creates and locks the lock file in the new folder `folder` and writes the marker line. Returns `None` if another run
+/// took the folder for one of a killed run and is removing it.
 fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
@@ -239,7 +250,7 @@ fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lock = match file.try_lock() {
         Err(TryLockError::WouldBlock) => return Ok(None),
         // A run that removes a workspace deletes its lock file before it releases the lock. So if the lock file still
-        // has its name, the workspace is not being removed.
+        // exists under its name, the workspace is not being removed.
         Ok(()) if handle.names_file(LOCK, &file) => true,
         Ok(()) => return Ok(None),
         Err(TryLockError::Error(_)) => false,
@@ -249,24 +260,24 @@ fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     Ok(Some(Workspace { folder: folder.to_owned(), identity, lock: lock.then_some(file) }))
 }
 
-/// Workspace whose run has ended, with its lock held by this process.
+/// Workspace (hidden output folder) of a run that has ended. This process holds its lock.
 pub(super) struct Leftover {
     name: OsString,
     pub(super) folder: FolderHandle,
     lock: File,
 }
 
-/// Reason why a workspace may not be taken as a leftover.
+/// Reason why a workspace may not be treated as left over from a killed run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refusal {
-    /// Workspace whose run is going on, or that another run is inspecting.
+    /// The run that created the workspace is still alive, or another run is inspecting the workspace.
     Busy,
-    /// Workspace that is gone, or that this program did not create for this user.
+    /// The folder is gone, or this program did not create it for this user.
     Foreign,
 }
 
 impl Leftover {
-    /// Takes the workspace `name` in `parent` if this program created it for this user and its run has ended.
+    /// Takes over the workspace `name` in `parent` if this program created it for this user and its run has ended.
     pub(super) fn take(parent: &FolderHandle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;
@@ -279,8 +290,8 @@ impl Leftover {
         let mut lock = match folder.open_file(LOCK, true) {
             Ok(lock) => lock,
             Err(error) => {
-                // The run is about to create the lock file (it will fail and try again), or the folder is almost
-                // removed.
+                // Either the run is about to create the lock file (it will then fail and try again), or another run has
+                // almost removed the folder.
                 if error.kind() == io::ErrorKind::NotFound {
                     let _ = parent.remove_empty(name);
                 }
@@ -294,21 +305,22 @@ impl Leftover {
         }
         let mut line = String::new();
         (&mut lock).take(LOCK_LINE.len() as u64 + 1).read_to_string(&mut line).map_err(foreign)?;
-        // A run killed before it wrote the line leaves a private folder with an empty or partly written lock file.
+        // A run that was killed before it wrote the marker line leaves a folder with private permissions and an empty
+        // or partly written lock file.
         let is_begun =
             || LOCK_LINE.starts_with(&line) && status.is_private && folder.entries().is_ok_and(|names| names == [LOCK]);
         let is_marked = line == LOCK_LINE || is_begun();
         if is_marked { Ok(Leftover { name: name.to_owned(), folder, lock }) } else { Err(Refusal::Foreign) }
     }
 
-    /// Removes the workspace. Entries that cannot be removed stay and are harmless.
+    /// Removes the workspace. Entries that cannot be removed stay; they do no harm.
     pub(super) fn remove(self, parent: &FolderHandle) {
         remove_content(&self.folder, Some(self.lock));
         let _ = parent.remove_empty(&self.name);
     }
 }
 
-/// Removes the workspace at `folder` if it still has this identity.
+/// Removes the workspace at `folder` if it is still the folder with this identity.
 fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };
@@ -319,8 +331,8 @@ fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     }
 }
 
-/// Removes everything in a workspace. The lock file goes last and before the lock is released: a run that gets the lock
-/// afterwards sees that the file is gone.
+/// Deletes everything in a workspace. The lock file is deleted last and before its lock is released, so a run that gets
+/// the lock afterwards sees that the file is gone.
 fn remove_content(folder: &FolderHandle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);

@@ -1,4 +1,5 @@
-//! Builds a [`Rig`] from the images that a file lists: checks cameras, finds equal ones, numbers views.
+//! Builds a [`Rig`] (cameras and views) from the images that a camera file lists: checks the cameras, merges equal
+//! cameras and assigns view numbers.
 
 use std::hash::BuildHasher;
 use std::path::{Path, PathBuf};
@@ -12,54 +13,54 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Maximum absolute entry of RᵀR − I of a rotation matrix R. Matrices written in f32 reach 1e-6; at 1e-4 a point moves
-/// by 0.05 px at a focal length of 1000 px, and a scaled or sheared matrix is far beyond.
+/// Maximum absolute entry of RᵀR − I of a rotation matrix R. Matrices written in f32 reach 1e-6; at 1e-4 a projected
+/// point moves by 0.05 px at a focal length of 1000 px. A scaled or sheared matrix exceeds the limit by far.
 const ROTATION_TOLERANCE: f64 = 1e-4;
 
-/// Maximum focal length in pixels. Above it, the squared image size of the largest Gaussians overflows.
+/// Maximum focal length in pixels. Above it, the squared image size of the largest Gaussians overflows f32.
 const MAX_FOCAL_PX: f64 = 1e9;
 
-/// Image as a camera file lists it.
+/// Entry of one image in a camera file.
 #[derive(Debug, Clone)]
 pub(super) struct ListedImage {
     /// Camera that took the image.
     pub(super) camera: Camera,
-    /// Time stamp; `None` if the image stands for every frame.
+    /// Time stamp; `None` if the image shows every frame.
     pub(super) time: Option<f64>,
-    /// Split of the data set.
+    /// Split to which the image belongs: training, validation or test.
     pub(super) split: Split,
-    /// Path of the image file.
+    /// Path of the image file; `None` if the camera file states none.
     pub(super) image: Option<PathBuf>,
-    /// View number, if the file states it.
+    /// View number, if the camera file states one.
     pub(super) view: Option<u32>,
 }
 
 /// Builder of a [`Rig`] that takes the images of all files of a data set one by one.
 ///
-/// Cameras that are equal in every bit become one. Views have the numbers stated in the files if every image has one,
-/// else one number per distinct camera in order of appearance. An image without a time stands for every frame, so a
-/// second one of the same camera and split adds nothing and is left out.
+/// Cameras that are equal in every bit become one camera. If the files state a view number for every image, these
+/// numbers are used; otherwise the distinct cameras are numbered in order of appearance. An image without a time shows
+/// every frame, so a second image without a time of the same camera and split is left out.
 #[derive(Debug)]
 pub(super) struct Assembly {
     rig: Rig,
     memory_counter: MemoryCounter,
-    /// Indices in `rig.cameras`, by the values of the camera.
+    /// Indices in `rig.cameras`, hashed by the values of the camera.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
-    /// (Camera, split) pairs that stand for every frame.
+    /// (Camera index, split) pairs for which an image without a time has been added.
     untimed: HashSet<(u32, Split)>,
-    /// Path of every file, and the index of its first shot.
+    /// Path of every camera file, and the index in `rig.shots` of its first image.
     files: Vec<(PathBuf, usize)>,
-    /// Number of images added from the last file.
+    /// Number of images added so far from the file begun last.
     taken: usize,
-    /// Whether every image so far has a view number.
+    /// Whether every image so far has a stated view number.
     are_views_stated: bool,
-    /// Whether images have times; `None` before the first image.
+    /// Whether the images have time stamps; `None` before the first image.
     is_timed: Option<bool>,
 }
 
 impl Assembly {
-    /// Returns an empty rig; `memory` limits the memory of its images and cameras.
+    /// Returns a builder without images; `memory` limits the memory of the images and cameras.
     pub(super) fn new(memory: ReadLimit) -> Assembly {
         Assembly {
             rig: Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() },
@@ -74,15 +75,16 @@ impl Assembly {
         }
     }
 
-    /// Returns the counter of the memory that is used while the rig is built.
+    /// Returns the counter of the memory that is used while the cameras are read.
     pub(super) fn memory_counter(&mut self) -> &mut MemoryCounter {
         &mut self.memory_counter
     }
 
-    /// Reserves memory for the `count` images that `file` lists. Images added from now on belong to this file.
+    /// Begins the camera file `file`, to which the images added next belong, and reserves memory for its `count`
+    /// images.
     ///
     /// # Errors
-    /// There are too many images, or they take more memory than allowed.
+    /// Fails if there are too many images, or if they take more memory than allowed.
     pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
         let total = self.rig.shots.len() + count;
         if total > MAX_IMAGES {
@@ -90,8 +92,8 @@ impl Assembly {
         }
         self.memory_counter.take(file, "", &format!("{count} images"), Rig::BYTES_PER_VIEW * count as u64)?;
         self.rig.shots.reserve_exact(count);
-        // Usually either every camera is new or few are. Reserved memory that stays unused costs nothing, but copying
-        // the list would.
+        // Reserve one camera per image, up to a limit: usually either every image has its own camera or there are few
+        // cameras. Reserved memory that stays unused costs nothing, but growing the list would copy it.
         let affordable = self.memory_counter.limit.bytes() / 4 / Rig::BYTES_PER_CAMERA;
         self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
         self.files.push((file.to_owned(), self.rig.shots.len()));
@@ -99,10 +101,10 @@ impl Assembly {
         Ok(())
     }
 
-    /// Adds the next image of the file that was begun last.
+    /// Adds the next image of the file that was last passed to [`Assembly::begin`].
     ///
     /// # Errors
-    /// The camera is invalid; only some images have a time; the memory limit is exceeded.
+    /// Fails if the camera is invalid, if only some images have a time, or if the memory limit for reading is exceeded.
     ///
     /// # Panics
     /// If no file was begun.
@@ -127,7 +129,7 @@ impl Assembly {
             None => {
                 self.memory_counter.take(path, &place(Some(frame)), "the cameras", Rig::BYTES_PER_CAMERA)?;
                 if cameras.len() == cameras.capacity() {
-                    // The old list and the new one exist at the same time while one is copied to the other.
+                    // While the list grows, the old list and the longer copy exist at the same time.
                     let more = (cameras.len() / 4).max(64);
                     let copied = (size_of::<Camera>() * (cameras.len() + more)) as u64;
                     self.memory_counter.take(path, &place(Some(frame)), "the cameras", copied)?;
@@ -155,22 +157,22 @@ impl Assembly {
         Ok(())
     }
 
-    /// Returns the largest time so far, but at least `least`.
+    /// Returns the largest time stamp so far, or `least` if that is larger.
     pub(super) fn latest(&self, least: f64) -> f64 {
         self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
     }
 
-    /// Divides all times by `span`.
+    /// Divides the time stamps of all images by `span`.
     pub(super) fn divide_times(&mut self, span: f64) {
         for shot in &mut self.rig.shots {
             shot.time = shot.time.map(|time| time / span);
         }
     }
 
-    /// Returns the rig of all images.
+    /// Returns the rig of all images added. `origin` describes for the user where the cameras come from.
     ///
     /// # Errors
-    /// There are no images, or two images of one file have the same view, split and time.
+    /// Fails if there are no images, or if two images of one file have the same view, split and time.
     pub(super) fn finish(mut self, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
         if let (true, Some((path, _))) = (self.rig.shots.is_empty(), self.files.first()) {
             return Err(Error::input(path, "", "at least one image", "none"));
@@ -179,7 +181,7 @@ impl Assembly {
             self.rig.shots.iter_mut().for_each(|shot| shot.view = shot.camera);
         }
         let shots = &self.rig.shots;
-        // Adding 0.0 makes −0 and 0 the same time.
+        // Adding 0.0 turns −0 into 0, so that both count as the same time.
         let shot_key = |at: usize| {
             let shot: &Shot = &shots[at];
             shot.time.map(|time| (shot.view, shot.split, (time + 0.0).to_bits()))
@@ -206,7 +208,7 @@ impl Assembly {
     }
 }
 
-/// Counter of the memory that is kept while cameras are read, with its limit.
+/// Counter of the bytes of memory that are in use while cameras are read, and their limit.
 #[derive(Debug)]
 pub(super) struct MemoryCounter {
     limit: ReadLimit,
@@ -214,10 +216,10 @@ pub(super) struct MemoryCounter {
 }
 
 impl MemoryCounter {
-    /// Adds `bytes` that are about to be kept for `what` of the file at `path`.
+    /// Counts `bytes` of memory that will be used for `what`, read from `place` in the file at `path`.
     ///
     /// # Errors
-    /// The memory limit is exceeded.
+    /// Fails if the memory limit for reading would be exceeded.
     pub(super) fn take(&mut self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
         let used = self.used.saturating_add(bytes);
         self.limit.check(path, place, what, used)?;
@@ -225,18 +227,18 @@ impl MemoryCounter {
         Ok(())
     }
 
-    /// Subtracts `bytes` that have been freed.
+    /// Subtracts `bytes` of memory that have been freed.
     pub(super) fn release(&mut self, bytes: u64) {
         self.used = self.used.saturating_sub(bytes);
     }
 }
 
-/// Returns the text for an image that differs from the first image in having a time.
+/// Returns the error text for an image without a time although the first image has one (`timed`), or the reverse.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }
 
-/// Checks that a camera is valid; the error is (expected, found).
+/// Checks that a camera is valid. The error is the pair (expected, found) for the message.
 pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)> {
     let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let side = 1..=MAX_SIDE_PX;
@@ -254,7 +256,7 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
         return Err(("a finite principal point".into(), format!("{cx} and {cy}")));
     }
     let defect = (rotation.transpose() * *rotation - DMat3::IDENTITY).to_cols_array();
-    // `all` rather than a maximum, because a maximum ignores NaN.
+    // Test `all` entries rather than their maximum, because a maximum would ignore NaN.
     if !defect.iter().all(|x| x.abs() <= ROTATION_TOLERANCE) {
         let worst = defect.iter().fold(0.0, |worst: f64, x| worst.max(x.abs()));
         return Err((
@@ -265,15 +267,15 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
     if rotation.determinant() < 0.0 {
         return Err(("a rotation".into(), "a reflection (determinant −1)".into()));
     }
-    // Checked after the rotation, because some formats compute the translation with it: a bad rotation is reported as
-    // one.
+    // Check the translation after the rotation: some formats compute the translation from the rotation, and a bad
+    // rotation should be reported as such.
     if !translation.is_finite() {
         return Err(("a finite camera position".into(), format!("{translation}")));
     }
     Ok(())
 }
 
-/// Returns every value of a camera except `near` as bits, with −0 as 0.
+/// Returns the bits of every value of a camera except `near`, with −0 replaced by 0, for comparing and hashing.
 fn camera_bits(camera: &Camera) -> [u64; 18] {
     let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let mut bits = [0; 18];
@@ -286,7 +288,8 @@ fn camera_bits(camera: &Camera) -> [u64; 18] {
     bits
 }
 
-/// Builds a camera from a camera-to-world pose in OpenCV axes; `intrinsics` are fx, fy, cx, cy in pixels.
+/// Builds a camera from a camera-to-world pose (`rotation`, camera position `center`) in OpenCV axes. The second
+/// argument holds fx, fy, cx, cy in pixels.
 pub(super) fn from_camera_to_world(
     (width, height): (u32, u32),
     [fx, fy, cx, cy]: [f64; 4],
@@ -297,7 +300,7 @@ pub(super) fn from_camera_to_world(
     Camera { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * center), near: Camera::NEAR }
 }
 
-/// Returns the view number in an image name of the form `…tNNN_vNN…`.
+/// Returns the number after `v` in an image name of the form `…tNNN_vNN…`: the view number.
 pub(super) fn view_in_name(name: &str) -> Option<u32> {
     let name = name.rsplit(['/', '\\']).next()?;
     name.match_indices("_v").find_map(|(at, mark)| {

@@ -1,4 +1,4 @@
-//! Reads the two formats of a file called `cameras.json`.
+//! Reads `cameras.json`, a file name that is used for two formats.
 //!
 //! *This project's*, one entry per image:
 //!
@@ -16,8 +16,8 @@
 //!
 //! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`, `position` (of the
 //! camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. The file has no times, so each camera
-//! sees every frame unless `--times` gives times. It does not distinguish test from training views, so all are for
-//! training.
+//! sees every frame unless `--times` gives times. It does not distinguish test from training views, so all views are
+//! training views.
 
 use std::path::Path;
 
@@ -32,12 +32,12 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Keys of an image.
+/// Keys of an image entry in this project's format.
 const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
-/// Keys of a camera.
+/// Keys of a camera entry in the 3DGS format.
 const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
-/// Reads this project's own format. `outline` holds the keys outside the list of images.
+/// Reads a file in this project's own format. `outline` holds the keys outside the list of images.
 pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimit) -> Result<Rig> {
     let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;
@@ -53,7 +53,7 @@ pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimi
     assembly.finish(background, shown_name(file))
 }
 
-/// Builds one image entry of this project's format.
+/// Builds an image from its entry `own` in this project's format.
 fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = own.pose("w2c")?;
     let split = match own.optional_text("split")? {
@@ -82,7 +82,7 @@ fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     })
 }
 
-/// Reads the format of a 3DGS model folder, a list of `count` cameras.
+/// Reads the `cameras.json` of a 3DGS model folder, a list of `count` cameras.
 pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
     let mut assembly = Assembly::new(options.memory);
     assembly.begin(file, count)?;
@@ -110,7 +110,7 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     assembly.finish(None, origin)
 }
 
-/// Builds one image entry of the 3DGS format.
+/// Builds an image from the camera entry `own` in the 3DGS format.
 fn per_camera(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let size @ (width, height) = (own.side("width")?, own.side("height")?);
     let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];

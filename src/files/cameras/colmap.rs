@@ -1,12 +1,12 @@
 //! Reads a COLMAP reconstruction: `cameras` and `images`, as `.bin` or `.txt` (<https://colmap.github.io/format.html>).
-//! The points are not needed.
+//! The 3D points are not read.
 //!
-//! An image has a unit quaternion wxyz and a translation, world to camera in OpenCV axes, the number of its camera, and
-//! its path below `images/` beside `sparse/`. The center of the first pixel is at 0.5, as in this project. Cameras must
-//! be without distortion: SIMPLE_PINHOLE, PINHOLE, or another model whose distortion coefficients are all 0. `--resolution`
-//! scales the focal lengths and the principal point. Images in folders called `test` or `val` belong to that split, all
-//! others are for training. [`super::times`] finds the times; [`super::frames`] handles data sets with a folder for
-//! each frame.
+//! An image entry holds a unit quaternion wxyz and a translation (world to camera, OpenCV axes), the number of its
+//! camera, and its path below the folder `images/`, which lies beside `sparse/`. The center of the first pixel is at
+//! 0.5, as in this project. Cameras must be without distortion: SIMPLE_PINHOLE, PINHOLE, or another model whose
+//! distortion coefficients are all 0. `--resolution` scales the focal lengths and the principal point. Images in
+//! folders called `test` or `val` belong to that split, all others are for training. [`super::times`] finds the times;
+//! [`super::frames`] handles data sets with a folder for each frame.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -25,17 +25,19 @@ use crate::model::{Camera, Rig, Split};
 
 /// Maximum length of an image name in bytes.
 const MAX_NAME_BYTES: u64 = 4096;
-/// Bytes of a point that an image sees: two coordinates and a number.
+/// Bytes of one 2D point in an image entry: two coordinates (f64) and the number of the 3D point (u64).
 const POINT_BYTES: u64 = 24;
-/// Memory of a camera in the table, in bytes, while the table grows by being copied to twice its size.
+/// Bytes of memory per camera in the table of cameras. While the table grows, the old one and a copy of twice the size
+/// exist.
 const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
-/// Memory of an image in the list, without its name, in bytes, while the list grows by being copied to twice its size.
+/// Bytes of memory per image in the list of images, without its name. While the list grows, the old one and a copy of
+/// twice the size exist.
 const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
-/// Maximum deviation of the length of a quaternion from 1.
+/// Maximum difference between 1 and the length of the quaternion of a rotation.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Camera models in the order of COLMAP's numbers: name, number of parameters, index of the first distortion parameter
-/// (0: not a pinhole model).
+/// Camera models, indexed by COLMAP's model number: name, number of parameters, index of the first distortion parameter
+/// (0 if the model is not a pinhole model).
 const MODELS: [(&str, usize, usize); 12] = [
     ("SIMPLE_PINHOLE", 3, 3),
     ("PINHOLE", 4, 4),
@@ -51,14 +53,14 @@ const MODELS: [(&str, usize, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16, 0),
 ];
 
-/// Size (width, height) of the images of a camera, and fx, fy, cx, cy, all in pixels.
+/// Camera of a COLMAP reconstruction: size (width, height) of its images and intrinsics fx, fy, cx, cy, all in pixels.
 #[derive(Debug, Clone, Copy)]
 struct Lens {
     size: (u32, u32),
     intrinsics: [f64; 4],
 }
 
-/// Image as COLMAP lists it.
+/// Image entry of a COLMAP reconstruction.
 struct ColmapImage {
     quaternion: [f64; 4],
     translation: [f64; 3],
@@ -66,10 +68,12 @@ struct ColmapImage {
     name: Box<str>,
 }
 
-/// Reads the reconstruction at `found`, which is its folder, a folder that holds it, or one of its files.
+/// Reads the reconstruction at `found`, which is the folder of the reconstruction, a folder that contains this folder,
+/// or one of its files.
 ///
 /// # Errors
-/// A file is missing, truncated or malformed; a camera has distortion; the times cannot be found.
+/// Fails if a file is missing, truncated or malformed, if a camera has distortion, or if the times of the images cannot
+/// be found.
 pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let folder = reconstruction_folder(found)?;
     let binary = folder.join("cameras.bin").is_file();
@@ -79,7 +83,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let counter = assembly.memory_counter();
     let lenses = if binary { read_cameras(&cameras, counter)? } else { parse_cameras(&cameras, counter)? };
     let mut listed = if binary { read_images(&images, counter)? } else { parse_images(&images, counter)? };
-    // COLMAP lists images in the order in which it registered them.
+    // Sort by name, because COLMAP lists images in the order in which it registered them.
     listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
     let images_folder = find_images_folder(&folder);
     let listed_image = |image: &ColmapImage| -> Result<ListedImage> {
@@ -139,7 +143,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, origin)
 }
 
-/// Returns the folder that holds the files: that of `found`, or `0` in it.
+/// Returns the folder that holds the COLMAP files: the folder `found` or that of the file `found`, or `0` inside it.
 fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
     let holds = |folder: &Path| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file());
     let folder = if found.is_dir() { found } else { found.parent().unwrap_or(Path::new("")) };
@@ -148,14 +152,15 @@ fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
     })
 }
 
-/// Returns the folder of the images: `images` beside `sparse`, or the data set's folder if there is none.
+/// Returns the folder of the images: `images` beside `sparse`, or the folder of the data set if there is none.
 fn find_images_folder(folder: &Path) -> PathBuf {
     let below = if folder.ends_with("sparse/0") { 2 } else { usize::from(folder.ends_with("sparse")) };
     let root = folder.ancestors().nth(below).unwrap_or(folder);
     Some(root.join("images")).filter(|images| images.is_dir()).unwrap_or_else(|| root.to_owned())
 }
 
-/// Returns the split of an image by the innermost folder called `test` or `val` in its name; training without one.
+/// Returns the split that the innermost folder called `test` or `val` in an image name stands for; training if there is
+/// no such folder.
 fn split_of(name: &str) -> Split {
     match name
         .split(['/', '\\'])
@@ -169,7 +174,8 @@ fn split_of(name: &str) -> Split {
     }
 }
 
-/// Returns the size and intrinsics of a camera, scale_intrinsics to the size `requested` if there is one.
+/// Returns the size and the intrinsics (fx, fy, cx, cy) of a camera in pixels, scaled to the image size `requested` if
+/// that is given.
 fn scale_intrinsics(
     Lens { size, intrinsics: [fx, fy, cx, cy] }: Lens,
     requested: Option<(u32, u32)>,
@@ -182,7 +188,8 @@ fn scale_intrinsics(
 /// Builds a camera from the name, image size and parameters of its COLMAP model.
 ///
 /// # Errors
-/// The model is unknown, has distortion or another number of parameters; the size is out of range.
+/// Fails if the model is unknown, has distortion, or has another number of parameters than given, or if the image size
+/// is out of range.
 fn lens(
     wrong: impl Fn(String, String) -> Error,
     name: &str,
@@ -214,7 +221,7 @@ fn lens(
     Ok(Lens { size: (w, h), intrinsics })
 }
 
-/// Reads `cameras.txt`: the cameras by number.
+/// Reads `cameras.txt`. Returns the cameras by their COLMAP numbers.
 fn parse_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
     let mut lines = TextLines::open(path)?;
@@ -238,7 +245,7 @@ fn parse_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32
     Ok(lenses)
 }
 
-/// Reads `images.txt`.
+/// Reads `images.txt`. Returns its images in file order.
 fn parse_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
     let mut lines = TextLines::open(path)?;
@@ -267,13 +274,13 @@ fn parse_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapIm
         counter.take(path, &format!("line {number}"), "the images", IMAGE_BYTES + 2 * rest.len() as u64)?;
         let name = rest.into();
         images.push(ColmapImage { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
-        // The points that the image sees, on a line that may be empty.
+        // Skip the line with the 2D points of the image, which may be empty.
         lines.skip_line()?;
     }
     Ok(images)
 }
 
-/// Reader of little-endian numbers with the position in the file.
+/// Reader of little-endian numbers from a file; keeps the present position for error messages.
 struct Binary<'a> {
     path: &'a Path,
     file: BufReader<File>,
@@ -288,18 +295,18 @@ impl<'a> Binary<'a> {
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }
 
-    /// Returns an error about the bytes at the present position.
+    /// Returns an error about the bytes at the present position of the file.
     fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("byte {}", self.at), expected, found)
     }
 
-    /// Returns the error for a truncated file.
+    /// Returns the error for a file that ends before the value `what` is complete.
     fn truncated(&self, what: &str) -> Error {
         self.wrong(what, format!("the end of the file, after {} bytes", self.len))
             .hint("it is cut short: copy it again")
     }
 
-    /// Reads `W` bytes; `what` names them in the error.
+    /// Reads the next `W` bytes. `what` names them in the error for a file that ends too early.
     fn bytes<const W: usize>(&mut self, what: &str) -> Result<[u8; W]> {
         if self.len - self.at < W as u64 {
             return Err(self.truncated(what));
@@ -310,17 +317,17 @@ impl<'a> Binary<'a> {
         Ok(bytes)
     }
 
-    /// Reads a `u32`.
+    /// Reads the next `u32`. `what` names it in errors.
     fn u32(&mut self, what: &str) -> Result<u32> {
         self.bytes(what).map(u32::from_le_bytes)
     }
 
-    /// Reads a `u64`.
+    /// Reads the next `u64`. `what` names it in errors.
     fn u64(&mut self, what: &str) -> Result<u64> {
         self.bytes(what).map(u64::from_le_bytes)
     }
 
-    /// Reads `W` values of type `f64`.
+    /// Reads the next `W` values of type `f64`. `what` names them in errors.
     fn f64s<const W: usize>(&mut self, what: &str) -> Result<[f64; W]> {
         let mut values = [0.0; W];
         for value in &mut values {
@@ -329,7 +336,7 @@ impl<'a> Binary<'a> {
         Ok(values)
     }
 
-    /// Reads a text that truncated with a zero byte.
+    /// Reads a text that is terminated with a zero byte.
     fn text(&mut self, what: &str) -> Result<String> {
         let mut bytes = Vec::new();
         let most = MAX_NAME_BYTES.min(self.len - self.at);
@@ -341,17 +348,17 @@ impl<'a> Binary<'a> {
         String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is not UTF-8"))
     }
 
-    /// Skips `bytes`; `None` stands for a number that overflowed and is an error.
+    /// Skips `bytes` bytes. `None` stands for a length that overflowed and is an error.
     fn skip(&mut self, bytes: Option<u64>, what: &str) -> Result<()> {
         let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.truncated(what)) };
-        // File sizes fit into i64.
+        // The cast cannot overflow, because file sizes fit into i64.
         self.file.seek_relative(bytes as i64).map_err(Error::io("read", self.path))?;
         self.at += bytes;
         Ok(())
     }
 }
 
-/// Reads `cameras.bin`: the cameras by number.
+/// Reads `cameras.bin`. Returns the cameras by their COLMAP numbers.
 fn read_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut file = Binary::open(path)?;
     let mut lenses = HashMap::new();
@@ -371,7 +378,7 @@ fn read_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32,
     Ok(lenses)
 }
 
-/// Reads `images.bin`.
+/// Reads `images.bin`. Returns its images in file order.
 fn read_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut file = Binary::open(path)?;
     let mut images = Vec::new();

@@ -8,10 +8,10 @@ use super::MAX_SIDE_PX;
 use crate::error::{Error, Result};
 use crate::files::json::small::{Object, SmallValue};
 
-/// Description of a pose matrix in error messages.
+/// Expected content of a pose matrix, for error messages.
 pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
 
-/// One JSON object of a camera file: that of an image, or the top-level object.
+/// Reader of the keys of one JSON object in a camera file: the object of an image, or the top-level object.
 #[derive(Clone, Copy)]
 pub(super) struct CameraFields<'a> {
     path: &'a Path,
@@ -21,10 +21,10 @@ pub(super) struct CameraFields<'a> {
 }
 
 impl<'a> CameraFields<'a> {
-    /// Returns access to the keys of `value`.
+    /// Returns a reader of the keys of the JSON object `value`.
     ///
     /// # Errors
-    /// `value` is not an object.
+    /// Fails if `value` is not an object.
     pub(super) fn new(path: &'a Path, frame: Option<usize>, value: &'a SmallValue) -> Result<Self> {
         match value {
             SmallValue::Object(map) => Ok(CameraFields { path, frame, map }),
@@ -32,7 +32,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns an error about the value of `key`.
+    /// Returns an error that the value of `key` is not as `expected`.
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
         let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), SmallValue::describe);
         let place = match self.frame {
@@ -42,7 +42,7 @@ impl<'a> CameraFields<'a> {
         Error::input(self.path, place, expected, found)
     }
 
-    /// Returns a finite number, or `None` if the key is missing or null.
+    /// Returns the finite number under `key`, or `None` if the key is missing or null.
     pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -53,13 +53,13 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns a finite number.
+    /// Returns the finite number under `key`.
     pub(super) fn number(&self, key: &str) -> Result<f64> {
         self.optional_number(key)?.ok_or_else(|| self.wrong(key, "a finite number"))
     }
 
-    /// Returns an image width or height in pixels, or `None` if the key is missing. Accepts 800.0, as some programs
-    /// write it.
+    /// Returns the image width or height in pixels under `key`, or `None` if the key is missing. Accepts 800.0, as some
+    /// programs write it.
     pub(super) fn optional_side(&self, key: &str) -> Result<Option<u32>> {
         match self.optional_number(key)? {
             None => Ok(None),
@@ -70,12 +70,12 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns an image width or height in pixels.
+    /// Returns the image width or height in pixels under `key`.
     pub(super) fn side(&self, key: &str) -> Result<u32> {
         self.optional_side(key)?.ok_or_else(|| self.wrong(key, "a number of pixels"))
     }
 
-    /// Returns a text, or `None` if the key is missing or null.
+    /// Returns the text under `key`, or `None` if the key is missing or null.
     pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -84,7 +84,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns a whole number that fits 32 bits, or `None` if the key is missing or null.
+    /// Returns the whole number under `key`, which must fit into 32 bits, or `None` if the key is missing or null.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -95,7 +95,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns width and height in pixels.
+    /// Returns the image width and height in pixels, from the list under `key`.
     pub(super) fn sides(&self, key: &str) -> Result<[u32; 2]> {
         let side = |value: f64| {
             (value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value)).then_some(value as u32)
@@ -104,7 +104,7 @@ impl<'a> CameraFields<'a> {
         found.ok_or_else(|| self.wrong(key, format!("width and height, 1 to {MAX_SIDE_PX} pixels")))
     }
 
-    /// Returns three numbers, or `None` if the key is missing or null.
+    /// Returns the three numbers of the list under `key`, or `None` if the key is missing or null.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -112,19 +112,19 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns three numbers.
+    /// Returns the three numbers of the list under `key`.
     pub(super) fn vector(&self, key: &str) -> Result<[f64; 3]> {
         self.optional_vector(key)?.ok_or_else(|| self.wrong(key, "3 finite numbers"))
     }
 
-    /// Returns a row-major 3 × 3 matrix.
+    /// Returns the row-major 3 × 3 matrix under `key`.
     pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
         let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| rows.len() == 3);
         rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
             .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
     }
 
-    /// Returns the rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
+    /// Returns the rotation and translation of the pose `[R | t]` under `key`, a row-major 3 × 4 or 4 × 4 matrix.
     pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
         let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| matches!(rows.len(), 3 | 4));
         let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
@@ -138,7 +138,7 @@ impl<'a> CameraFields<'a> {
         Ok((rotation, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
     }
 
-    /// Returns the number of elements of the list_len under `key`.
+    /// Returns the number of elements of the list under `key`.
     pub(super) fn list_len(&self, key: &str) -> Result<usize> {
         match self.map.get(key) {
             Some(SmallValue::List(_, total)) => Ok(*total),
@@ -147,12 +147,12 @@ impl<'a> CameraFields<'a> {
     }
 }
 
-/// Returns the place of image `frame` in error messages: "frame 12", or an empty text for `None`.
+/// Returns how error messages name image `frame`: "frame 12", or an empty text for `None`.
 pub(super) fn place(frame: Option<usize>) -> String {
     frame.map_or_else(String::new, |frame| format!("frame {frame}"))
 }
 
-/// Returns the elements of a list_len of exactly `W` finite numbers.
+/// Returns the elements of `value` if it is a list of exactly `W` finite numbers.
 fn numbers<const W: usize>(value: &SmallValue) -> Option<[f64; W]> {
     let elements: &[SmallValue; W] = value.elements()?.try_into().ok()?;
     let mut out = [0.0; W];
@@ -162,7 +162,7 @@ fn numbers<const W: usize>(value: &SmallValue) -> Option<[f64; W]> {
     Some(out)
 }
 
-/// Returns the matrix with these rows.
+/// Returns the matrix whose rows are `rows`.
 fn from_rows(rows: [[f64; 3]; 3]) -> DMat3 {
     DMat3::from_cols_array_2d(&rows).transpose()
 }

@@ -1,7 +1,7 @@
-//! Folders `colmap_K`, one for each frame, as SpacetimeGaussians prepares its data.
+//! Data sets with one COLMAP folder `colmap_K` for each frame, as SpacetimeGaussians prepares them.
 //!
-//! The cameras do not move: every frame has the cameras of `sparse/0` in the first folder, as in that trainer's loader.
-//! Frame j of n is at time j/n; its images are in folder K + j. A single frame has no time. Source:
+//! The cameras do not move: every frame has the cameras of `sparse/0` in the first folder, as in the loader of
+//! SpacetimeGaussians. Frame j of n is at time j/n; its images are in folder K + j. A single frame has no time. Source:
 //! `readColmapSceneInfo` of the SpacetimeGaussians repository.
 
 use std::fs;
@@ -10,36 +10,36 @@ use std::path::{Path, PathBuf};
 use super::assemble::ListedImage;
 use crate::model::Split;
 
-/// Start of the folder names.
+/// Beginning of the folder names.
 const PREFIX: &str = "colmap_";
 
-/// Returns the folder of the reconstruction in the first folder `colmap_K` of `path`.
+/// Returns the folder of the COLMAP reconstruction (`sparse/0`) in the first of the folders `colmap_K` in `path`.
 pub(super) fn first_in(path: &Path) -> Option<PathBuf> {
     let entries = fs::read_dir(path).ok()?.flatten();
     let first = entries.filter_map(|entry| number(&entry.path())).min()?;
     Some(path.join(format!("{PREFIX}{first}")).join("sparse/0")).filter(|found| found.is_dir())
 }
 
-/// Returns K of a folder `colmap_K`.
+/// Returns the number K of a folder called `colmap_K`.
 fn number(folder: &Path) -> Option<u32> {
     folder.file_name()?.to_str()?.strip_prefix(PREFIX)?.parse().ok()
 }
 
-/// Returns the folder `colmap_K` that contains the reconstruction `sparse`, and K.
+/// Returns the folder `colmap_K` that contains the COLMAP reconstruction `sparse`, and the number K.
 pub(super) fn find(sparse: &Path) -> Option<(PathBuf, u32)> {
-    // The path may be relative to the working folder and not name `colmap_K`.
+    // Make the path absolute: a path relative to the working folder need not contain the name `colmap_K`.
     let sparse = std::path::absolute(sparse).ok()?;
     let root = sparse.ends_with("sparse/0").then(|| sparse.ancestors().nth(2)).flatten()?;
     number(root).map(|number| (root.to_owned(), number))
 }
 
-/// Returns the number of consecutive folders beside `root`, from that of frame `first` on.
+/// Returns the number of folders `colmap_K` beside `root` with consecutive K, beginning with K = `first`.
 pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Returns `images`, which all show frame `first` in `root`, repeated at each of `frames` frames. The first image of
-/// each frame is a test image.
+/// Repeats `images`, which are the images of frame `first` in the folder `root`, at each of `frames` frames. The first
+/// image of each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
     images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),

@@ -1,4 +1,4 @@
-//! Streaming access to the list of images in a JSON camera file, and to the keys outside that list.
+//! Streaming access to the list of images in a JSON camera file, and access to the keys outside this list.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use crate::files::json::lists::{ListSelection, each_element};
 use crate::files::json::small::{Keep, SmallValue};
 use crate::files::json::{ParseAbort, read};
 
-/// Keys by which a document is recognized, and keys that hold for all of its images.
+/// Keys by which the format of a camera file is recognized, and keys that hold for all images of the file.
 const OUTLINE_KEYS: [&str; 14] = [
     "frames",
     "w2c",
@@ -24,30 +24,31 @@ const OUTLINE_KEYS: [&str; 14] = [
     "background",
     "rotation",
 ];
-/// Number of elements kept of each list: a background has three.
+/// Maximum number of elements kept of each list. A background color has three.
 const MAX_ELEMENTS: usize = 4;
 
-/// Reads the document in `file` except its images: of each list only the first elements and the length.
+/// Reads the JSON document in `file` without its images: of each list, only the length and the first 4 elements are
+/// kept.
 ///
 /// # Errors
-/// The file is not valid JSON.
+/// Fails if the file is not valid JSON.
 pub(super) fn outline(file: &Path) -> Result<SmallValue> {
     read(file, &ParseAbort::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
 }
 
-/// Reads the keys `wanted` of a small document.
+/// Reads the values of the keys `wanted` from a small JSON file.
 ///
 /// # Errors
-/// The file is not valid JSON.
+/// Fails if the file is not valid JSON.
 pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<SmallValue> {
     read(file, &ParseAbort::default(), Keep { wanted, elements: MAX_ELEMENTS })
 }
 
-/// Passes every element of the list under `key`, or of the document itself if `key` is `None`, to `take`, with its
-/// index. `wanted` are the keys of each element that are kept.
+/// Calls `take` with the index and the content of every element of the list under `key`, or of the document itself if
+/// `key` is `None`. Of each element only the keys `wanted` are read.
 ///
 /// # Errors
-/// An error of `take`; a key that occurs twice; a file that is not valid JSON.
+/// Fails if `take` fails, if a key occurs twice, or if the file is not valid JSON.
 pub(super) fn each_image(
     file: &Path,
     key: Option<&str>,

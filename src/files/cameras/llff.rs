@@ -1,10 +1,10 @@
 //! Reads `poses_bounds.npy` of LLFF and DyNeRF: f64 or f32 `[V, 17]`, one row per camera.
 //!
-//! A row is a 3 × 5 matrix, row by row, and two depth bounds (unused). The columns of the matrix are the camera's down,
+//! A row holds a row-major 3 × 5 matrix and two depth bounds (unused). The columns of the matrix are the camera's down,
 //! right and backward axes in the world, its position, and (height, width, focal length) in pixels of the original
-//! images. Images are used at half that size unless another is given; the focal length is scaled with the width. The
-//! principal point is the middle of the image. Camera 0 is the test camera. Every camera sees every frame. Frame i of n
-//! is at time i/n, so time 1 is never reached (see FORMATS: the DyNeRF loader of 4DGaussians).
+//! images. Images are used at half this size unless `--resolution` gives another; the focal length is scaled with the
+//! width. The principal point is the middle of the image. Camera 0 is the test camera. Every camera sees every frame.
+//! Frame i of n is at time i/n, so time 1 is never reached (see FORMATS: the DyNeRF loader of 4DGaussians).
 
 use std::io::{BufReader, Read, Seek};
 use std::path::Path;
@@ -21,15 +21,16 @@ use crate::files::npy::{HEAD, header_is_sound};
 use crate::files::open::open_file;
 use crate::model::{Camera, Rig, Split};
 
-/// Number of values per camera.
+/// Number of values per camera: a 3 × 5 matrix and two depth bounds.
 const WIDTH: usize = 17;
-/// Number of frames of the original DyNeRF scenes.
+/// Default number of frames: that of the original DyNeRF scenes.
 const DEFAULT_FRAMES: usize = 300;
 
 /// Reads the cameras in `file`, each at every frame.
 ///
 /// # Errors
-/// The array or a camera is malformed; cameras times frames exceed the maximum number of images.
+/// Fails if the array or a camera is malformed, or if the number of cameras times the number of frames exceeds the
+/// maximum number of images.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let mut assembly = Assembly::new(options.memory);
     let rows = read_rows(file, assembly.memory_counter())?;
@@ -52,7 +53,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, origin)
 }
 
-/// Returns one image per frame and camera, frame after frame.
+/// Returns one image per camera and frame, ordered by frame, then by camera.
 fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
     let listed_image = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),
@@ -64,7 +65,7 @@ fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = List
     (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| listed_image(frame, view)))
 }
 
-/// Builds the camera of row `index`.
+/// Builds the camera of row `index` from the values `row` of that row.
 fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions) -> Result<Camera> {
     let wrong = |expected: String, found: String| Error::input(file, format!("row {index}"), expected, found);
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
@@ -74,7 +75,7 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
         let expected = format!("height and width of 1 to {MAX_SIDE_PX} whole pixels in columns 4 and 9");
         return Err(wrong(expected, format!("{height} and {width}")));
     }
-    // Half the size, but at least one pixel, for an image that is one pixel high.
+    // Half the size, but at least one pixel, in case a side of the image is only one pixel.
     let half = |side: f64| ((side as u32) / 2).max(1);
     let (width_px, height_px) = options.size.unwrap_or((half(width), half(height)));
     let focal = focal * f64::from(width_px) / width;
@@ -85,7 +86,7 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
     Ok(camera)
 }
 
-/// Reads the rows of the array in `file`. Checks that it holds `[V, 17]` floats and is complete.
+/// Reads the rows of the array in `file`. Checks that the array has the shape `[V, 17]`, holds floats and is complete.
 fn read_rows(file: &Path, counter: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
     let mut opened = open_file(file)?;
@@ -112,11 +113,11 @@ fn read_rows(file: &Path, counter: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH
         return Err(Error::input(file, "header", "rows stored one after the other (C order)", "Fortran order")
             .hint("save it again with numpy.ascontiguousarray"));
     }
-    // The length is checked against the file size before anything of that size is allocated.
+    // Check the length against the file size before memory of that length is allocated.
     if real.is_some_and(|size| count.saturating_mul(WIDTH as u64 * size as u64) > bytes) {
         return Err(Error::input(file, "data", format!("{count} rows of {WIDTH}"), format!("{bytes} bytes in all")));
     }
-    // Counts the values as they are stored, the values as f64 in rows, and a camera for each row.
+    // Count the memory of the values as they are stored, of the rows of f64 values, and of one camera per row.
     counter.take(file, "data", &format!("{count} rows of {WIDTH}"), count.saturating_mul(24 * WIDTH as u64 + 256))?;
     let truncated =
         |error: std::io::Error| Error::input(file, "data", format!("{count} rows of {WIDTH}"), error.to_string());

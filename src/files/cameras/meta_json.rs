@@ -1,9 +1,8 @@
-//! Reads `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: for every frame, a list of the cameras that took
-//! it.
+//! Reads `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: for every frame, a list of its cameras.
 //!
-//! Keys: `w`, `h`, in pixels; by frame and camera: `k`, the 3 × 3 matrix of focal lengths and principal point in
-//! pixels; `w2c`, world to camera, row-major, OpenCV axes; `fn`, the path of the image below `ims`; `cam_id`. There are
-//! no times: frame i of T is at time i / (T − 1).
+//! The keys `w` and `h` give the image size in pixels. Four keys hold lists by frame and camera: `k`, the 3 × 3 matrix
+//! of focal lengths and principal point in pixels; `w2c`, world to camera, row-major, OpenCV axes; `fn`, the path of
+//! the image below `ims`; `cam_id`. The files state no times: frame i of T is at time i / (T − 1).
 
 use std::path::{Path, PathBuf};
 
@@ -20,21 +19,22 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Names of the files of a sequence, and the split that each one lists.
+/// Names of the files of a data set, and the split that each file lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
-/// Keys of the lists by frame and camera.
+/// Keys whose values are lists by frame and camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
-/// Returns whether a document is in this format.
+/// Returns whether the document with the keys `outline` is in this format.
 pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
     ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(SmallValue::List(..))))
 }
 
-/// Reads `file`, and the other file of the sequence beside it if `with_others` is set.
+/// Reads `file`. If `with_others` is set, also reads the other one of `train_meta.json` and `test_meta.json` beside it.
 ///
 /// # Errors
-/// A value is missing, has the wrong length or is not a valid camera; the files have different numbers of frames.
+/// Fails if a value is missing, has the wrong length or is not a valid camera, or if the files have different numbers
+/// of frames.
 pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
     let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
     let mut assembly = Assembly::new(memory);
@@ -52,20 +52,21 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
     assembly.finish(None, shown_name(file))
 }
 
-/// Values under one key, by frame and camera.
+/// Values of one key, by frame and camera.
 #[derive(Debug)]
 struct KeyedValues<T> {
     /// Values of all frames, one frame after another.
     values: Vec<Option<T>>,
-    /// End of each frame in `values`.
+    /// For each frame, the index in `values` after its last value.
     ends: Vec<usize>,
 }
 
 impl<T> KeyedValues<T> {
-    /// Table without frames.
+    /// Table without any frames.
     const EMPTY: KeyedValues<T> = KeyedValues { values: Vec::new(), ends: Vec::new() };
 
-    /// Memory in bytes for one more value: three copies, because a list is copied to twice its length when it grows.
+    /// Bytes of memory to count for one more value. A list that grows is copied to twice its length, so three times the
+    /// size of a value may be in use.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
     /// Returns the index in `values` of the first value of `frame`.
@@ -73,19 +74,19 @@ impl<T> KeyedValues<T> {
         frame.checked_sub(1).map_or(0, |before| self.ends[before])
     }
 
-    /// Returns the number of values of `frame`.
+    /// Returns the number of values (cameras) of `frame`.
     fn len(&self, frame: usize) -> usize {
         self.ends[frame] - self.start(frame)
     }
 
-    /// Returns the value of `camera` at `frame`; `None` if there is none.
+    /// Returns the value of camera `camera` at `frame`; `None` if there is none.
     fn get(&self, frame: usize, camera: usize) -> Option<&T> {
         (frame < self.ends.len() && camera < self.len(frame))
             .then(|| self.values[self.start(frame) + camera].as_ref())?
     }
 }
 
-/// Values of one file.
+/// Values of the four keys by frame and camera, of one file.
 #[derive(Debug)]
 struct Tables {
     intrinsics: KeyedValues<[f64; 4]>,
@@ -95,7 +96,7 @@ struct Tables {
 }
 
 impl Tables {
-    /// Adds the value of key `KEYS[key]` to the current frame.
+    /// Adds the value of key `KEYS[key]`, read from `own`, to the current frame.
     fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
@@ -109,7 +110,7 @@ impl Tables {
         Ok(())
     }
 
-    /// Ends the current frame of key `KEYS[key]`.
+    /// Ends the current frame for key `KEYS[key]`.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),
@@ -120,7 +121,7 @@ impl Tables {
     }
 }
 
-/// Adds the images of a file and returns its number of frames.
+/// Adds the images of `file` to `assembly`. Returns the number of frames of the file.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;

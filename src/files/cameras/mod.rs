@@ -10,9 +10,12 @@
 //! | COLMAP's `cameras` and `images`, `.bin` or `.txt` (`colmap.rs`) | from names or a table (`times.rs`) | from folders in names |
 //! | the first of several folders `colmap_K`, one for each frame, with a reconstruction in `sparse/0` (SpacetimeGaussians) | i/n | the first camera is test |
 //!
+//! "i/n" means that frame i of n frames is at time i/n.
+//!
 //! All cameras are returned in OpenCV axes, world to camera, in f64. Rotation matrices are checked to be rotations.
-//! Memory: one record per image; its size is checked against the limit before it is allocated. JSON and text files are
-//! read as streams: once for the keys outside the list of images, and once for the images.
+//! Memory: one record per image; the size of all records is checked against the memory limit for reading before they
+//! are allocated. JSON and text files are read as streams: once for the keys outside the list of images, and once for
+//! the images.
 
 mod assemble;
 mod cameras_json;
@@ -44,11 +47,11 @@ pub use virtual_rig::{surrounding_rig, virtual_rig};
 
 /// Largest image side in pixels. Above it, the number of pixels of one image approaches 2³².
 const MAX_SIDE_PX: u32 = 1 << 15;
-/// Maximum number of images of a rig.
+/// Maximum number of images in a data set.
 const MAX_IMAGES: usize = 1 << 24;
 
-/// File names that are searched for in a folder; the first match wins. `transforms*.json` come before `cameras.json`
-/// because a 3DGS `cameras.json` beside them has lost the times.
+/// File names that are searched for in a folder; the first existing one is used. `transforms*.json` come before
+/// `cameras.json`, because the `cameras.json` that 3DGS writes beside them has no times.
 const NAMES: [&str; 9] = [
     "transforms_train.json",
     "transforms_test.json",
@@ -66,43 +69,44 @@ const NERFIES: &str = "dataset.json";
 /// Paths, relative to a data set, at which a COLMAP reconstruction is searched for.
 const COLMAP: [&str; 6] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin", "images.txt"];
 
-/// Values that a camera file may not contain and the caller supplies.
+/// Settings supplied by the caller for values that a camera file may lack.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CameraOptions {
-    /// Image (width, height) in pixels, used if the file states no size and the image file cannot be measured. For
-    /// `poses_bounds.npy`, NeRFies and COLMAP it replaces the default size.
+    /// Image (width, height) in pixels, used if the camera file states no size and the size of the image file cannot be
+    /// read. For `poses_bounds.npy`, NeRFies and COLMAP it replaces their default image size.
     pub size: Option<(u32, u32)>,
-    /// Number of frames of formats that do not state it: `poses_bounds.npy` (300 if not given) and folders `colmap_K`
-    /// (if not given, the number of consecutive folders).
+    /// Number of frames, for formats that do not state it: `poses_bounds.npy` (default: 300) and folders `colmap_K`
+    /// (default: the number of consecutive folders).
     pub frames: Option<usize>,
     /// Source of the times of images whose camera file has none.
     pub times: Times,
     /// Meaning of the times in `transforms*.json`.
     pub clock: Clock,
-    /// Maximum memory that reading the cameras may take.
+    /// Maximum memory in bytes that reading the cameras may take.
     pub memory: ReadLimit,
 }
 
 /// Meaning of the times in `transforms*.json`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Clock {
-    /// Times in any unit; they are divided by the largest, as the D-NeRF loaders do.
+    /// Times in any unit. They are divided by the largest time, as the loaders of D-NeRF do.
     #[default]
     Normalized,
-    /// Times in the unit of the model's own time; they are used as they are.
+    /// Times in the unit of the model's own time. They are used unchanged.
     Given,
 }
 
-/// Reads the cameras of `path`: a file, or a folder that holds one. The format is recognized by file name and content.
+/// Reads the cameras of the data set at `path`, which is a camera file or a folder that contains one. The format is
+/// recognized by file name and content.
 ///
 /// # Errors
-/// [`Error::Input`] naming the file and the image ("frame 12" counts from 0 in file order) when a value is missing, not
-/// finite or out of range, when a matrix is not a rotation, or when a view occurs twice at the same time;
-/// [`Error::Usage`] when `options` are out of range.
+/// Fails with [`Error::Input`] if a value is missing, not finite or out of range, if a matrix is not a rotation, or if
+/// a view occurs twice at the same time. The message names the file and the image ("frame 12" counts from 0 in file
+/// order). Fails with [`Error::Usage`] if `options` are out of range.
 pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     check_options(options)?;
     let Some(file) = locate(path) else {
-        // If the path cannot be opened at all, that error is more useful to the user.
+        // If the path cannot be opened at all, report that error, which is more useful to the user.
         path.metadata().map_err(Error::io("open", path))?;
         let expected = format!("a folder with one of {}, or with COLMAP's sparse/0", NAMES.join(", "));
         return Err(Error::input(path, "", expected, "none of them"));
@@ -138,7 +142,8 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     }
 }
 
-/// Searches for the cameras a model was trained with. `source_path` is the path given in its configuration.
+/// Searches for the camera file with which a model was trained. `source_path` is the path of the data set in the
+/// configuration of the model.
 ///
 /// A relative path is tried from the working folder, then from each parent folder of the model folder, the nearest
 /// first. Returns `None` when no camera file is found; never fails.
@@ -151,12 +156,13 @@ pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     std::iter::once(PathBuf::from(source_path)).chain(beside).find(|path| locate(path).is_some())
 }
 
-/// Returns whether the images of the cameras at `path` get their times from their file names (COLMAP).
+/// Returns whether the data set at `path` takes the times of its images from their file names, as COLMAP data sets do.
 pub fn are_timed_by_name(path: &Path) -> bool {
     locate(path).is_some_and(|file| is_colmap(&file))
 }
 
-/// Returns the camera file for `path`: `path` itself, or the first known name inside the folder.
+/// Returns the camera file for `path`: `path` itself, or the first of the known file names that exists in the folder
+/// `path`.
 fn locate(path: &Path) -> Option<PathBuf> {
     if path.is_file() {
         return Some(path.to_owned());
@@ -170,24 +176,24 @@ fn locate(path: &Path) -> Option<PathBuf> {
         .or_else(|| frames::first_in(path))
 }
 
-/// Returns whether `path` ends with one of the names of a COLMAP reconstruction.
+/// Returns whether `path` ends with the name of a file or folder of a COLMAP reconstruction.
 fn is_colmap(path: &Path) -> bool {
     COLMAP.iter().any(|name| path.ends_with(name))
 }
 
 /// Format of a JSON camera file.
 enum Kind {
-    /// NeRF: camera to world, OpenGL axes.
+    /// `transforms*.json` of NeRF: camera-to-world poses in OpenGL axes, one entry per image.
     Transforms,
     /// This project's `cameras.json`: one entry per image.
     PerImage,
-    /// 3DGS `cameras.json`: one entry per camera; holds their number.
+    /// 3DGS `cameras.json`: one entry per camera. Holds the number of cameras.
     PerCamera(usize),
-    /// Dynamic3DGaussians: one list of cameras per frame.
+    /// `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: one list of cameras per frame.
     PerFrame,
 }
 
-/// Returns the format of a JSON camera file, recognized by the keys in its `outline`.
+/// Returns the format of a JSON camera file, recognized by the keys in its `outline` (the document without its images).
 fn kind(outline: &SmallValue) -> Option<Kind> {
     if let SmallValue::List(_, count) = outline {
         return Some(Kind::PerCamera(*count));
@@ -206,7 +212,7 @@ fn kind(outline: &SmallValue) -> Option<Kind> {
     }
 }
 
-/// Checks that the image size and the number of frames are in range.
+/// Checks that the image size and the number of frames in `options` are in range.
 fn check_options(options: &CameraOptions) -> Result<()> {
     let side = 1..=MAX_SIDE_PX;
     if let Some((width, height)) = options.size.filter(|(w, h)| !side.contains(w) || !side.contains(h)) {

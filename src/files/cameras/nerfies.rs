@@ -26,15 +26,15 @@ use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
-/// Keys of a camera file.
+/// Keys of the camera file of an image.
 const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
-/// Distance between training images in a data set that names no test images.
+/// In a data set that names no test images, every image whose index is a multiple of this number is a training image.
 const TRAIN_EVERY: usize = 4;
 
 /// Reads the data set whose `dataset.json` is `file`.
 ///
 /// # Errors
-/// A file is missing or malformed; an image has no camera or no time.
+/// Fails if a file is missing or malformed, or if an image has no camera or no time.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let folder = file.parent().unwrap_or(Path::new(""));
     let mut assembly = Assembly::new(options.memory);
@@ -57,12 +57,13 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, shown_name(folder))
 }
 
-/// Keys of the lists of image names: all images, test images, training images.
+/// Keys in `dataset.json` of the lists of image names: all images, test images, training images.
 const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
-/// Bytes that a name takes in addition to its text, in its list and in two tables.
+/// Bytes of memory per image name in addition to its text: its entries in a list and in two tables.
 const NAME_BYTES: u64 = 200;
 
-/// Reads the three lists of names of `file`. `train_ids` may be missing if `val_ids` is empty.
+/// Reads the three lists of image names in `file`: all, test, training. `train_ids` may be missing if `val_ids` is
+/// empty.
 fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
     let outline = read_keys(file, &LIST_KEYS)?;
     let fields = CameraFields::new(file, None, &outline)?;
@@ -91,10 +92,10 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
     Ok(names)
 }
 
-/// Reads the `warp_id` of each image.
+/// Reads the `warp_id` (time index) of each image in `ids`.
 fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
     counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
-    // A name may occur twice in `ids`.
+    // Give each distinct name one index, because a name may occur twice in `ids`.
     let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
     let mut found = Vec::new();
     for id in ids {
@@ -118,7 +119,7 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// Returns the splits of every image: mostly one, for some images none.
+/// Returns for every image the splits to which it belongs: mostly one, for some images none.
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);
@@ -139,8 +140,8 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
     ids.iter().map(|id| split(id)).collect()
 }
 
-/// Reads the camera of the image called `id`. Its size in pixels comes from `--resolution`, else from the image file, else it
-/// is half the size in the camera file.
+/// Reads the camera of the image called `id`. The image size in pixels comes from `--resolution`, else from the image
+/// file, else it is half the size stated in the camera file.
 fn listed_image(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
     let document = read_keys(&file, &CAMERA_KEYS)?;

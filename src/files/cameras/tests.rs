@@ -1,4 +1,4 @@
-//! Tests with cameras in the formats of real data sets, and of the error messages for malformed ones.
+//! Tests with cameras in the formats of real data sets, and tests of the error messages for malformed camera files.
 
 mod colmap;
 
@@ -11,7 +11,8 @@ use serde_json::{Value, json};
 use super::{CameraOptions, find, load};
 use crate::model::{Camera, Rig, Split};
 
-/// Returns the folders of the trained models in `SPLATSIEVE_DATA`, else in `../shared/data`, which must exist.
+/// Returns the folders of three trained models, below the folder `SPLATSIEVE_DATA`, else below `../shared/data`. They
+/// must exist.
 fn shared_models() -> [PathBuf; 3] {
     let data = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
@@ -19,7 +20,7 @@ fn shared_models() -> [PathBuf; 3] {
     ["deform2", "room2_big", "room2_dynerf"].map(|name| data.join(name))
 }
 
-/// Returns a temporary folder with these files.
+/// Returns a temporary folder that holds `files`, given as (name, JSON content).
 fn folder(files: &[(&str, &Value)]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for (name, content) in files {
@@ -32,7 +33,8 @@ fn load_json(name: &str, content: &Value) -> crate::error::Result<Rig> {
     load(folder(&[(name, content)]).path(), &CameraOptions::default())
 }
 
-/// Asserts that the error message for a file of this name and content contains every part.
+/// Writes `content` to a file called `name`, loads it, and asserts that the error message contains every one of
+/// `parts`.
 fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
     let message = load_json(name, content).unwrap_err().to_string();
     for part in parts.iter().chain(&[name]) {
@@ -40,7 +42,7 @@ fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
     }
 }
 
-/// Returns the OpenGL camera-to-world pose of a camera at `eye`, looking along +y of the world, z up.
+/// Returns the camera-to-world pose, in OpenGL axes, of a camera at `eye` that looks along +y of the world, with z up.
 fn along_y(eye: [f64; 3]) -> Value {
     json!([[1, 0, 0, eye[0]], [0, 0, -1, eye[1]], [0, 1, 0, eye[2]], [0, 0, 0, 1]])
 }
@@ -62,7 +64,7 @@ fn per_image(times: &[f64]) -> Value {
     json!({"background": [1, 0.5, 0], "frames": times.iter().map(frame).collect::<Vec<_>>()})
 }
 
-/// Returns a file of NumPy's format 1.0.
+/// Returns the bytes of an array file in NumPy's format 1.0.
 fn npy(dtype: &str, order: &str, shape: &str, rows: &[[f64; 17]]) -> Vec<u8> {
     let header = format!("{{'descr': '{dtype}', 'fortran_order': {order}, 'shape': {shape}, }}");
     let mut bytes = b"\x93NUMPY\x01\0\x76\0".to_vec();
@@ -75,7 +77,7 @@ fn write_npy(path: &Path, rows: &[[f64; 17]]) {
     fs::write(path, npy("<f8", "False", &format!("({}, 17)", rows.len()), rows)).unwrap();
 }
 
-/// Returns a row for a camera at `eye` looking along +y of the world, z up.
+/// Returns the row of `poses_bounds.npy` for a camera at `eye` that looks along +y of the world, with z up.
 fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
     let [x, y, z] = eye;
     // Columns: down −z, right +x, backward −y, position, (height, width, focal).
@@ -135,7 +137,8 @@ fn a_folder_gives_all_splits_and_a_file_one() {
     let whole = load(folder.path(), &options).unwrap();
     assert_eq!(whole.shots.len(), 4);
     assert_eq!(whole.shots.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
-    // A file that is named itself contributes only its own images, at the times they have among all splits.
+    // If the user names a file of one split, only its images are loaded, but their times are those they have among all
+    // splits.
     let alone = |name: &str| load(&folder.path().join(name), &options).unwrap();
     for (name, split) in [("transforms_train.json", Split::Train), ("transforms_test.json", Split::Test)] {
         let own: Vec<_> = whole.shots.iter().filter(|shot| shot.split == split).map(|shot| shot.time).collect();
@@ -185,7 +188,8 @@ fn nerfies_cameras_match_the_4dgaussians_loader() {
     write("dataset.json", json!({"ids": ids, "val_ids": [], "train_ids": []}));
     let rig = load(folder.path(), &CameraOptions::default()).unwrap();
     let camera = &rig.cameras[0];
-    // Half the size; world to camera row by row; `scale` and `center` of the scene are not applied.
+    // Expected: half the image size; rotation world to camera, row by row; `scale` and `center` of the scene not
+    // applied.
     assert_eq!(
         (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         (40, 30, 50.0, 50.0, 20.0, 15.0)
@@ -217,7 +221,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
         fy: focal,
         cx: 40.0,
         cy: 30.0,
-        // Right is +x, down is −z, forward is +y.
+        // Camera axes in the world: right is +x, down is −z, forward is +y.
         rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y).transpose(),
         translation: DVec3::new(0.0, 1.0, 4.0),
         near: Camera::NEAR,
@@ -225,7 +229,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
     assert_eq!(rig.cameras[0], expected);
     assert_eq!(rig.cameras[1].center(), DVec3::new(1.0, -4.0, 1.0));
 
-    // Looking along +x: for this pose the order of the axis flip and the rotation matters.
+    // The camera looks along +x: for this pose the order of axis flip and rotation matters.
     let mut document = transforms(&[0.0]);
     document["frames"][0]["transform_matrix"] = json!([[0, 0, -1, 7], [-1, 0, 0, 8], [0, 1, 0, 9], [0, 0, 0, 1]]);
     let camera = load_json("transforms.json", &document).unwrap().cameras[0].clone();

@@ -1,9 +1,10 @@
 //! Finds the times of images whose camera file has none: from the numbers in their names, or from a table.
 //!
-//! The number of an image is NNN of a name `…tNNN_vNN…`, else the last number in its file name: 12 of
-//! `cam03/frame_00012.png`. Its time is (number − smallest)/(largest − smallest), so that the last image is at 1, as in
-//! the COLMAP loaders of the supported trainers. A table is a CSV of `name,time`. The name is the one in the camera
-//! file, or its last component, with or without extension. Times of a table are used as they are.
+//! The number of an image is NNN in a name of the form `…tNNN_vNN…`. In other names it is the last number in the file
+//! name, for example 12 in `cam03/frame_00012.png`. Its time is (number − smallest)/(largest − smallest), so that the
+//! last image is at 1, as in the COLMAP loaders of the supported trainers. A table is a CSV file with lines
+//! `name,time`. `name` is the image name in the camera file, or its last component, with or without extension. Times of
+//! a table are used as they are.
 
 use std::path::{Path, PathBuf};
 
@@ -14,20 +15,22 @@ use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::text::TextLines;
 
-/// Memory of a table entry without its name, in bytes, while the table grows by being copied to twice its size.
+/// Bytes of memory per entry of the time table, without its name. While the table grows, the old one and a copy of
+/// twice the size exist.
 const TABLE_ENTRY_BYTES: u64 = 3 * 40 + 32;
 
 /// Source of the times of images.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Times {
-    /// COLMAP: the numbers in the image names, if all names have one. Other formats: the times in the camera file.
+    /// Default of the format. COLMAP: the numbers in the image names, if all names have one. Other formats: the times
+    /// in the camera file.
     #[default]
     Own,
     /// The numbers in image names; every name must have one.
     Names,
-    /// No times: every image shows every frame.
+    /// No times: every image shows the scene at every frame.
     None,
-    /// A CSV table.
+    /// A CSV table of image names and times, at this path.
     Table(PathBuf),
 }
 
@@ -41,7 +44,7 @@ impl Times {
         }
     }
 
-    /// Returns the text that [`Times::named`] parses to this value; `None` for [`Times::Own`].
+    /// Returns the text from which [`Times::named`] parses this value; `None` for [`Times::Own`].
     pub fn name(&self) -> Option<String> {
         match self {
             Times::Own => None,
@@ -56,7 +59,8 @@ impl Times {
 /// are no times.
 ///
 /// # Errors
-/// A name has no number, or is missing in the table; the table is malformed.
+/// Fails if an image name contains no number although its number is needed, or if the table of times is malformed or
+/// lacks a name.
 pub(super) fn resolve(
     file: &Path,
     names: &[Box<str>],
@@ -103,14 +107,14 @@ pub(super) fn resolve(
     }
 }
 
-/// Returns the number in an image name that stands for its time.
+/// Returns the number in the image name `name` that determines the time of the image.
 fn number(name: &str) -> Option<u64> {
     let file = name.rsplit(['/', '\\']).next()?;
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
     let digits = |text: &str| -> Option<u64> {
         let end = text.rfind(|c: char| c.is_ascii_digit())? + 1;
         let start = text[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |at| {
-            // Start after that character, which may have several bytes.
+            // Continue after this character, which may take several bytes.
             at + text[at..].chars().next().map_or(1, char::len_utf8)
         });
         text[start..end].parse().ok()
@@ -122,14 +126,15 @@ fn number(name: &str) -> Option<u64> {
     digits(before_view.unwrap_or(stem))
 }
 
-/// Returns the names under which an image is searched for in a table: as given, file name, file name without extension.
+/// Returns the names under which an image is searched for in a table of times: the whole name, the file name, the file
+/// name without extension.
 fn keys(name: &str) -> impl Iterator<Item = &str> {
     let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let stem = |text| Path::new(text).file_stem().and_then(|stem| stem.to_str()).unwrap_or(text);
     [name, file, stem(file)].into_iter()
 }
 
-/// Reads a CSV table of names and times.
+/// Reads a CSV table of image names and times.
 fn read_table(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<String, f64>> {
     let mut known = HashMap::new();
     let mut lines = TextLines::open(path)?;
@@ -154,7 +159,7 @@ fn read_table(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<String
                     return Err(wrong("every name once", quoted(name)));
                 }
             }
-            // Header line of the table.
+            // Skip the first line if its time is not a number: it is a header.
             Err(_) if at == 0 => (),
             _ => return Err(wrong("a finite time behind the name", quoted(time.trim()))),
         }

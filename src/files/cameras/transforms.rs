@@ -1,9 +1,10 @@
 //! Reads `transforms*.json` of NeRF and D-NeRF: one camera-to-world pose per image, in OpenGL axes.
 //!
-//! Keys of an image or of the file (those of the image take precedence): `fl_x fl_y cx cy w h`, or `camera_angle_x`
-//! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is the middle of the
-//! image unless the file states otherwise. An image has `file_path`, `transform_matrix` and, if the scene moves,
-//! `time`. Lens distortion (`k1` …) is ignored: images are assumed to be undistorted.
+//! Intrinsics are `fl_x fl_y cx cy w h`, or `camera_angle_x` (and `camera_angle_y`), the field of view in radians. They
+//! are keys of the image or, for all images, of the file; a key of the image takes precedence. Pixels are square and
+//! the principal point is the middle of the image unless the file states otherwise. An image has `file_path`,
+//! `transform_matrix` and, if the scene moves, `time`. Lens distortion (`k1` …) is ignored: images are assumed to be
+//! undistorted.
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
@@ -23,15 +24,15 @@ use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
-/// Converts OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
+/// Rotation from OpenGL camera axes (x right, y up, z backward) to OpenCV axes (x right, y down, z forward).
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Keys of an image.
+/// Keys of an image entry.
 const IMAGE_KEYS: [&str; 11] =
     ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
 
-/// Reads `file`, and the files of the other splits beside it if `with_others` is set, which is the case if the user
-/// named the folder. Otherwise the other files only contribute to the largest time.
+/// Reads the cameras in `file`. If `with_others` is set (the user named the folder), also reads the files of the other
+/// splits beside it. Otherwise those files only contribute to the largest time, by which times are divided.
 pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
     let mut files = vec![file.to_owned()];
     let mut latest = 0.0;
@@ -55,7 +56,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
     assembly.finish(None, names.join(" and "))
 }
 
-/// Returns the split that a file name states; training if it states none.
+/// Returns the split named in a file name (train, val or test); training if the name contains none.
 fn split_of(file: &Path) -> Split {
     let name = file.file_name().unwrap_or_default().to_string_lossy();
     match () {
@@ -65,7 +66,8 @@ fn split_of(file: &Path) -> Split {
     }
 }
 
-/// Returns the existing files of the other splits beside `file`; empty if `file` is not one of train, val and test.
+/// Returns those files of the other splits (train, val, test) that exist beside `file`; empty if `file` itself is none
+/// of the three.
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
@@ -76,7 +78,7 @@ fn others(file: &Path) -> Vec<PathBuf> {
     others.filter(|other| other.is_file()).collect()
 }
 
-/// Returns the largest time in a file. Other errors of the file are not reported here.
+/// Returns the largest time stamp in a file. Other defects of the file are not reported here.
 fn latest_in(file: &Path) -> Result<f64> {
     let mut latest = 0.0;
     each_image(file, Some("frames"), &["time"], |_, frame| {
@@ -87,7 +89,7 @@ fn latest_in(file: &Path) -> Result<f64> {
     Ok(latest)
 }
 
-/// Adds the images of `file` to `assembly`.
+/// Adds the images listed in `file` to `assembly`.
 fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
@@ -98,7 +100,7 @@ fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<
     })
 }
 
-/// Builds one image entry from its own keys and the keys `shared` by all images of the file.
+/// Builds an image from its own keys `own` and the keys `shared` by all images of the file.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
@@ -120,7 +122,7 @@ fn listed_image(
     })
 }
 
-/// Returns the image size in pixels: from the file, else from the image itself, else from the options.
+/// Returns the image width and height in pixels: from the camera file, else from the image file, else from the options.
 fn size(
     shared: CameraFields<'_>,
     own: CameraFields<'_>,
@@ -132,7 +134,7 @@ fn size(
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
-    // A missing or unreadable image is not an error, because the options may give the size.
+    // Ignore a missing or unreadable image, because the options may give the size.
     image.and_then(measure).or(options.size).ok_or_else(|| {
         let tried = image.map_or_else(String::new, |image| format!(", or the image {}", image.shown()));
         own.wrong("w", format!("the image size as w and h{tried}"))
@@ -140,7 +142,7 @@ fn size(
     })
 }
 
-/// Returns fx, fy, cx, cy in pixels.
+/// Returns the focal lengths and the principal point fx, fy, cx, cy in pixels, for an image of the given size.
 fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
     let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
@@ -154,7 +156,7 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     for fields in [own, shared] {
         if fx.is_none() {
             fx = focal(fields, "fl_x", "camera_angle_x", width)?;
-            // The vertical focal length must come from the same place as the horizontal one: the image, or the file.
+            // Take the vertical focal length from the same object as the horizontal one: the image, or the file.
             fy = focal(fields, "fl_y", "camera_angle_y", height)?;
         }
     }
@@ -165,7 +167,8 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }
 
-/// Returns the path of the image that `file` calls `name`, relative to `file`. D-NeRF names have no extension.
+/// Returns the path of the image that `file` calls `name`. The name is relative to the folder of `file`. Image names of
+/// D-NeRF have no extension.
 fn resolve(file: &Path, name: &str) -> PathBuf {
     let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
     let with = |extension: &str| {

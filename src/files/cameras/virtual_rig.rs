@@ -1,24 +1,25 @@
-//! Virtual camera rigs for scenes without cameras: one around a moving scene, and one that views the surface of a still
-//! from all sides.
+//! Virtual cameras for scenes without cameras: a rig around a moving scene, and a rig that views the surface of a still
+//! (model without motion) from all sides.
 
 use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Number of cameras of the rig: as many views as are used to score the static models of docs/benchmarks.md.
+/// Number of cameras around a moving scene: as many views as are used to score the static models of docs/benchmarks.md.
 const CAMERAS: u32 = 12;
-/// Distance of the cameras from the center, in extents. At 60° the image then spans 2.3 extents, so that a scene with
-/// equal sides is seen whole from every corner.
+/// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
+/// image then spans 2.3 extents, so that a scene with equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
 /// Horizontal field of view of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
-/// Near plane in extents, so that visibility does not depend on the unit of length.
+/// Distance of the near plane as a multiple of the extent of the scene, so that visibility does not depend on the unit
+/// of length.
 const NEAR: f64 = 0.1;
-/// Image width and height in pixels.
+/// Image width and height in pixels, for the cameras around a moving scene.
 const SIDE_PX: u32 = 512;
 
 /// Returns cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, all looking at the center. Every
-/// camera sees every frame and is for training. [`crate::model::RobustBox`] gives `center` and `extent`.
+/// camera sees every frame and is a training view. [`crate::model::RobustBox`] gives `center` and `extent`.
 ///
 /// Camera k of n is at latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z points up in the images. An extent
 /// that is zero, negative or not finite counts as 1, a center that is not finite as 0.
@@ -43,24 +44,26 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     }
 }
 
-/// Number of cameras around a still; enough that no part of a surface is seen only at a grazing angle.
+/// Number of cameras around a still (model without motion); enough that every part of the surface is seen at more than
+/// a grazing angle from some camera.
 const SURROUNDING_CAMERAS: u32 = 24;
-/// Distance of these cameras from the center, in radii of the surface.
+/// Distance of the cameras around a still from its center, as a multiple of the radius of the surface.
 const SURROUNDING_DISTANCE: f64 = 2.2;
-/// Field of view in degrees; the surface nearly fills the image.
+/// Field of view in degrees of the cameras around a still; the surface nearly fills the image.
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
-/// Image width and height in pixels around a still.
+/// Image width and height in pixels, for the cameras around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;
-/// Fraction of the weight that lies within the radius. Gaussians further away, mostly floaters and ground, are seen
-/// only where they are in front.
+/// Fraction of the total weight (visible area) of a still that defines the radius: Gaussians of this weight lie within
+/// it. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
 const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
-/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still, all for training.
+/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still (model without motion), all as
+/// training views.
 ///
 /// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
-/// of the weight lie. `weights` are the area of each Gaussian: opacity times the product of its two larger scales.
-/// Weights above the 99th percentile are set to that percentile. The weighting ignores floaters, which are many and
-/// thin, and the limit keeps a backdrop of few huge Gaussians from dominating.
+/// of the weight lie. `weights` holds the visible area of each Gaussian: opacity times the product of its two larger
+/// scales. Weights above the 99th percentile are set to that percentile. The weights make floaters, which are many and
+/// thin, count little; their limit keeps a backdrop of few huge Gaussians from dominating.
 pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     let mut all: Vec<(DVec3, f64)> = positions
         .iter()
@@ -112,8 +115,8 @@ pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     }
 }
 
-/// Returns direction `k` of `n` evenly distributed over the unit sphere: latitude asin(1 − (2k + 1)/n), longitude k·π(3
-/// − √5).
+/// Returns direction `k` of `n` directions that are evenly distributed over the unit sphere: latitude asin(1 − (2k +
+/// 1)/n), longitude k·π(3 − √5).
 fn on_sphere(k: u32, n: u32) -> DVec3 {
     let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let z = 1.0 - f64::from(2 * k + 1) / f64::from(n);

@@ -5,7 +5,7 @@ use std::io::{Cursor, Write};
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// Value to be pickled.
+/// Python value to be written as a pickle.
 #[derive(Debug, Clone)]
 pub(crate) enum Made {
     None,
@@ -21,11 +21,11 @@ pub(crate) enum Made {
     Parameter(PickledTensor),
 }
 
-/// Tensor of f32, or of another storage class with these bytes.
+/// Tensor to be pickled: f32 values, or values of another storage class with the given bytes.
 #[derive(Debug, Clone)]
 pub(crate) struct PickledTensor {
     pub(crate) class: &'static str,
-    /// Number of the storage. A storage named by several tensors is stored once.
+    /// Number of the storage (block of values). A storage used by several tensors is stored once.
     pub(crate) storage: usize,
     pub(crate) bytes: Vec<u8>,
     pub(crate) width: usize,
@@ -34,7 +34,7 @@ pub(crate) struct PickledTensor {
     pub(crate) stride: Vec<usize>,
 }
 
-/// Returns a dense f32 tensor in the storage of that number.
+/// Returns a dense f32 tensor whose values are in storage number `storage`.
 pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> PickledTensor {
     let mut stride = vec![1; shape.len()];
     (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));
@@ -49,13 +49,13 @@ pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> Pickled
     }
 }
 
-/// Returns dict items whose keys are texts.
+/// Converts dict items with text keys to items whose keys are pickled values.
 pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
     items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
 }
 
 impl Made {
-    /// Appends the pickle of this value: protocol 2, without memo.
+    /// Appends the pickle (protocol 2, without memo) of this value to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
         let items = |items: &[(Made, Made)], out: &mut Vec<u8>| {
             out.push(b'(');
@@ -95,7 +95,7 @@ impl Made {
         }
     }
 
-    /// Collects the storages of all tensors in this value, as (number, bytes).
+    /// Adds the storages (blocks of values) of all tensors in this value to `found`, as (number, bytes).
     fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
         match self {
             Made::Tensor(tensor) | Made::Parameter(tensor) => found.push((tensor.storage, tensor.bytes.clone())),
@@ -122,13 +122,13 @@ impl Made {
 }
 
 impl PickledTensor {
-    /// Appends the pickle of the tensor.
+    /// Appends the pickle of the tensor to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
         let numbers = |values: &[usize]| Made::Tuple(values.iter().map(|&x| Made::Int(x as i64)).collect());
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
         Made::Text("storage").pickle(out);
         out.extend(format!("ctorch\n{}\n", self.class).bytes());
-        // Storage keys are numbers written as texts.
+        // The keys of storages are their numbers written as texts.
         let key = self.storage.to_string();
         out.extend([b"X", &(key.len() as u32).to_le_bytes()[..], key.as_bytes()].concat());
         Made::Text("cuda:0").pickle(out);
@@ -141,7 +141,7 @@ impl PickledTensor {
     }
 }
 
-/// Returns a zip archive of uncompressed files in the folder `made`.
+/// Returns the bytes of a zip archive with uncompressed `files`, given as (name, content), in the folder `made`.
 pub(crate) fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in files {

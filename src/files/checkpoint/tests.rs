@@ -35,8 +35,8 @@ fn ramp(n: usize) -> Vec<f32> {
     (0..n).map(|i| i as f32 + 0.5).collect()
 }
 
-/// Returns a pair of dicts: tensors of four rows, one of them a transposed parameter, a tensor without rows of
-/// Gaussians, two tensors that share a storage, a mask and other values.
+/// Returns a pair of dicts for the tests. It contains tensors of four rows, one of them a transposed parameter, a
+/// tensor whose rows are not Gaussians, two tensors that share a storage (block of values), a mask and other values.
 fn model() -> Made {
     let transposed = PickledTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =
@@ -128,14 +128,14 @@ fn kept_rows_and_everything_else_are_unchanged() {
     let reduced = temp.reduced(&checkpoint, &[1, 3], &rows).unwrap();
     assert_eq!(values(&reduced, 0, "means"), [3.5, 4.5, 5.5, -1.0, -2.0, -3.0]);
     assert_eq!(values(&reduced, 0, "turned"), [-4.0, -5.0, -6.0, 3.5, 7.5, 11.5]);
-    // The stored order stays column-major, as before.
+    // The transposed tensor is still stored column by column.
     assert_eq!(find(&reduced, 0, "turned").stride, [1, 2]);
     assert_eq!(values(&reduced, 0, "net"), ramp(4));
     assert_eq!(values(&reduced, 1, "first"), [3.5, 4.5, 5.5, 9.5, 10.5, 11.5]);
     assert_eq!(values(&reduced, 1, "second"), [15.5, 16.5, 17.5, 0.0, 0.0, 0.0]);
     assert_eq!(reduced.storage("4").unwrap(), [0, 1]);
     assert_eq!(reduced.storage("3").unwrap().len(), 4 * 12);
-    // Only numbers differ between the pickles; the archives hold the same files in the same order.
+    // The pickles may differ only in numbers, and the archives must hold the same files in the same order.
     let texts = |checkpoint: &Checkpoint| {
         let describe = |id| match checkpoint.pickle().node(id) {
             Node::Int(..) => "a number".to_owned(),
@@ -155,7 +155,7 @@ fn kept_rows_and_everything_else_are_unchanged() {
         names
     };
     assert_eq!(names(&reduced), names(&checkpoint));
-    // The same content gives the same bytes.
+    // Writing the same content again must give the same bytes.
     let bytes = fs::read(temp.path()).unwrap();
     temp.reduced(&checkpoint, &[1, 3], &rows).unwrap();
     assert_eq!(fs::read(temp.path()).unwrap(), bytes);
@@ -208,7 +208,7 @@ fn a_shared_shape_is_refused_if_one_tensor_changes() {
             Ok(())
         })
         .unwrap();
-    // Stores the first shape in the memo, and uses it in place of the second.
+    // Store the first shape in the pickle's memo (table for repeated values), and use it in place of the second shape.
     let shape = [&b"(J\x03\0\0\0J\x03\0\0\0t"[..]].concat();
     let pickle = &mut files[0].1;
     let found: Vec<usize> = (0..pickle.len() - shape.len()).filter(|&at| pickle[at..].starts_with(&shape)).collect();
@@ -220,7 +220,7 @@ fn a_shared_shape_is_refused_if_one_tensor_changes() {
         |k| GaussianRows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
     let error = temp.reduced(&checkpoint, &[0], &[rows_of(0)]).unwrap_err().to_string();
     assert!(error.contains("several share") && error.contains("clone()"), "{error}");
-    // If both tensors change, they still agree.
+    // If both tensors change, their common shape still holds for both.
     temp.reduced(&checkpoint, &[0], &[rows_of(0), rows_of(1)]).unwrap();
 }
 
@@ -244,7 +244,7 @@ fn incomplete_tensors_and_files_are_named() {
     }
     let no_rank = message(PickledTensor { stride: vec![1], ..valid() });
     assert!(no_rank.contains("_rebuild_tensor_v2"), "{no_rank}");
-    // The file of the storage is missing.
+    // The archive lacks the file that holds the values of the tensor.
     let checkpoint = temp.open(&Made::Tensor(valid()).file()).unwrap();
     let mut files = Vec::new();
     checkpoint

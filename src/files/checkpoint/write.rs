@@ -1,10 +1,10 @@
-//! Writes a copy of a PyTorch checkpoint with fewer rows.
+//! Writes a copy of a PyTorch checkpoint with fewer Gaussians.
 //!
-//! In: an open checkpoint, and the list of its tensors that have a row per Gaussian. Out: a checkpoint with the same
-//! structure, in which these tensors have fewer rows. Names, order, types, devices and everything else stay the same,
-//! byte for byte. The pickle is not rebuilt: only the numbers in it that have to change are replaced. Memory: the
-//! pickle, and one storage before and after the change. The output bytes depend only on the content: files in the
-//! archive are dated 1980-01-01.
+//! Input: an open checkpoint, and the list of its tensors that have one row per Gaussian. Output: a checkpoint with the
+//! same structure, in which these tensors have fewer rows. Names, order, types, devices and everything else stay the
+//! same, byte for byte. The pickle is not rebuilt: only the numbers in it that have to change are replaced. Memory: the
+//! pickle (description of the objects), and one storage (block of tensor values) before and after the change. The
+//! output bytes depend only on the content, because all files in the zip archive are dated 1980-01-01.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -23,21 +23,22 @@ use crate::files::zip_output::ZipOutput;
 /// Alignment of the contents of each file in the archive, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
 
-/// Tensor whose first axis counts Gaussians, and the changes to its rows.
+/// Tensor with one row per Gaussian, and the changes to its rows.
 #[derive(Debug)]
 pub(crate) struct GaussianRows {
-    /// Tensor in the checkpoint that is copied.
+    /// Tensor in the original checkpoint.
     pub(crate) tensor: TensorView,
-    /// Rows of the result whose values differ from those of the row they come from, increasing.
+    /// Indices of the rows of the result whose values change, increasing.
     pub(crate) changed: Vec<u32>,
-    /// New values of the changed rows, `[changed, elements of a row]`, last index fastest; empty: zeros.
+    /// New values of the changed rows, `[changed, elements of a row]`, last index fastest. If empty, the new values are
+    /// zeros.
     pub(crate) values: Vec<f32>,
 }
 
-/// Part of a rewritten storage that holds one tensor.
+/// Part of a rewritten storage (block of tensor values) that holds one tensor.
 struct StoragePart<'a> {
     tensor: &'a TensorView,
-    /// Changes to the rows; `None`: all elements are kept.
+    /// Changes to the rows of the tensor; `None` if the tensor is copied whole.
     rows: Option<&'a GaussianRows>,
     shape: Vec<usize>,
     stride: Vec<usize>,
@@ -48,8 +49,8 @@ struct StoragePart<'a> {
 /// Writes `checkpoint` to `path`, keeping only the rows `kept` (increasing) of the tensors `rows`.
 ///
 /// # Errors
-/// A tensor has elements outside its storage; two tensors share a shape or stride in the pickle that must differ
-/// between them; the file cannot be written.
+/// Fails if a tensor has elements outside its storage, if two tensors share one shape or stride object in the pickle
+/// although their new shapes or strides differ, or if the file cannot be written.
 pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[GaussianRows], path: &Path) -> Result<()> {
     let by_node: BTreeMap<NodeId, &GaussianRows> =
         rows.iter().filter(|rows| !rows.tensor.shape.is_empty()).map(|rows| (rows.tensor.id, rows)).collect();
@@ -121,7 +122,8 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 }
 
 impl<'a> StoragePart<'a> {
-    /// Returns the shape and strides of `tensor` with `kept` rows, placed `offset` elements into the new storage.
+    /// Returns the part for `tensor` with `kept` rows (all rows if `rows` is `None`), placed `offset` elements into the
+    /// new storage. Computes the new shape and strides.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
@@ -130,7 +132,7 @@ impl<'a> StoragePart<'a> {
         let row: usize = tensor.shape.iter().skip(1).product();
         let mut stride = tensor.stride.clone();
         // A tensor whose rows follow one another without gaps keeps its strides. Every other tensor keeps the order of
-        // its axes, but loses its gaps.
+        // its axes, but is stored without gaps.
         let is_dense = stride.first() == Some(&row) && {
             let row_view = TensorView {
                 offset: 0,
@@ -158,7 +160,7 @@ impl<'a> StoragePart<'a> {
         StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
-    /// Appends the bytes of this part, taken from `stored`, the bytes of the old storage.
+    /// Appends the bytes of this part to `out`. `stored` holds the bytes of the old storage.
     fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
@@ -176,7 +178,7 @@ impl<'a> StoragePart<'a> {
             });
             return;
         };
-        // Offsets of the elements of a row from its first element.
+        // Returns the offset of every element of a row from the first element of the row.
         let row_offsets = |tensor: &TensorView| {
             let mut places = Vec::new();
             let row = TensorView {
@@ -206,8 +208,8 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor in the pickle to be written has the expected shape, strides and offset. This fails if two
-/// tensors share a shape and only one of them changes.
+/// Checks that every tensor in the pickle `written` has the expected shape, strides and offset. This fails if two
+/// tensors share one shape object and only one of them changes.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

@@ -1,46 +1,50 @@
 //! Decoded tiles of a container that are kept in memory.
 //!
-//! In: the values of tiles as they are decoded. Out: the same values, to any thread, as long as the container is open.
-//! Memory: the bytes allowed and no more, plus [`HeldTiles::BYTES_PER_SLOT`] for every tile, held or not. Held tiles
-//! are never evicted: every pass goes over all frames, so the least recently used tile is the next one to be needed.
+//! A tile holds the values of one attribute for a block of consecutive Gaussians and frames. Input: the values of tiles
+//! as they are decoded. Output: the same values, for any thread, as long as the container is open. Memory: at most the
+//! bytes allowed for values, plus [`HeldTiles::BYTES_PER_SLOT`] for every tile of the file, whether it is kept or not.
+//! Kept tiles are never evicted: every pass goes over all frames, so the least recently used tile is the next one to be
+//! needed.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::error::Result;
 
-/// Values of a tile, once they have been decoded.
+/// Values of one tile; empty until the tile has been decoded.
 type TileSlot = OnceLock<Box<[f32]>>;
 
-/// Number of locks that tiles share while they are decoded: more than there are threads, so that threads rarely wait
-/// for one another.
+/// Number of locks shared by all tiles while tiles are decoded. There are more locks than threads, so that threads
+/// rarely wait for one another.
 const LOCKS: usize = 256;
 
-/// Tiles kept in memory. Each has its own slot, so that readers of a decoded tile never wait.
+/// Decoded tiles that are kept in memory. Each tile of the file has its own slot, so that readers of a decoded tile
+/// never wait.
 pub(super) struct HeldTiles {
     slots: Vec<TileSlot>,
-    /// Lock `slot % LOCKS` is held by the thread that decodes the tile of a slot.
+    /// The thread that decodes the tile of a slot holds lock `slot % LOCKS`.
     locks: Vec<Mutex<()>>,
-    /// Maximum number of bytes of values.
+    /// Maximum number of bytes of tile values kept.
     capacity: AtomicU64,
-    /// Bytes of `capacity` that are still free.
+    /// Bytes of `capacity` that are not used yet.
     left: AtomicU64,
-    /// Whether a tile did not fit. From then on the sizes of further tiles are not looked up.
+    /// Whether a tile did not fit into the remaining bytes. From then on the sizes of further tiles are not looked up.
     full: AtomicBool,
 }
 
 impl HeldTiles {
-    /// Memory of one slot.
+    /// Bytes of memory of one slot, without tile values.
     pub(super) const BYTES_PER_SLOT: u64 = size_of::<TileSlot>() as u64;
 
-    /// Returns `slots` empty slots; [`HeldTiles::allow`] grants memory for values.
+    /// Returns `slots` empty slots. No tile can be kept before [`HeldTiles::allow`] grants memory for values.
     pub(super) fn new(slots: usize) -> HeldTiles {
         let slots = (0..slots).map(|_| TileSlot::new()).collect();
         let locks = (0..LOCKS).map(|_| Mutex::default()).collect();
         HeldTiles { slots, locks, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
     }
 
-    /// Raises the limit to `bytes`. A limit below the present one has no effect.
+    /// Raises the maximum number of bytes of tile values to `bytes`. Has no effect if `bytes` is below the present
+    /// maximum.
     pub(super) fn allow(&self, bytes: u64) {
         let before = self.capacity.fetch_max(bytes, Ordering::Relaxed);
         self.left.fetch_add(bytes.saturating_sub(before), Ordering::Relaxed);
@@ -49,12 +53,12 @@ impl HeldTiles {
         }
     }
 
-    /// Returns the values of the tile in slot `at`, or `None` if they do not fit. On the first call, `count` returns
-    /// the number of values and `decode` writes them. If several threads ask at the same time, one decodes and the
-    /// others wait.
+    /// Returns the values of the tile in slot `at`, or `None` if they do not fit into the allowed memory. If the tile
+    /// is not in memory yet, `count` returns its number of values and `decode` writes them. If several threads ask at
+    /// the same time, one decodes and the others wait.
     ///
     /// # Errors
-    /// An error of `count` or `decode`; the tile is not held then.
+    /// Fails if `count` or `decode` fails; the tile is then not kept.
     pub(super) fn get_or_decode(
         &self,
         at: usize,
@@ -89,7 +93,7 @@ impl HeldTiles {
         Ok(Some(slot.get_or_init(|| values)))
     }
 
-    /// Returns whether the tile in `slot` is held.
+    /// Returns whether the decoded tile of `slot` is in memory.
     pub(super) fn has(&self, slot: usize) -> bool {
         self.slots[slot].get().is_some()
     }

@@ -1,4 +1,5 @@
-//! An open container: its columns, the tiles it holds in memory, and the buffers for decoding.
+//! An open container (`gseq` sequence file): its columns (attributes), the decoded tiles that are kept in memory, and
+//! the buffers for decoding. A tile holds the values of one attribute for a block of consecutive Gaussians and frames.
 
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
@@ -12,31 +13,31 @@ use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::Count;
 
-/// Open container with all columns of a Gaussian model.
+/// Open container file whose columns are all attributes of Gaussians.
 pub struct Container {
     pub(super) path: PathBuf,
     pub(super) reader: Reader,
     pub(super) info: SequenceInfo,
     /// Attributes in the order of [`Attributes::all`], each with the index of its column in the container.
     pub(super) places: Vec<(Attributes, u32)>,
-    /// Decoding buffers, at most one for each thread, shared by all readers.
+    /// Decoding buffers that are free at present, shared by all readers; at most one per thread.
     pub(super) scratch: Mutex<Vec<TileScratch>>,
-    /// Tiles held in memory; created when the first tile may be held.
+    /// Decoded tiles kept in memory; created when the first tile may be kept.
     pub(super) held: OnceLock<HeldTiles>,
-    /// Number of states (Gaussian × frame) read so far.
+    /// Number of states (one Gaussian at one frame) read so far.
     pub(super) states: Count,
 }
 
-/// Buffers for decoding a tile.
+/// Buffers in which a tile is decoded.
 #[derive(Default)]
 pub(super) struct TileScratch {
     pub(super) buffer: TileBuffer,
     pub(super) frames: TileFrames,
-    /// One frame of the tile.
+    /// Values of one frame of the tile.
     pub(super) plane: Vec<f32>,
 }
 
-/// [`TileScratch`] in use; returned to the container when dropped.
+/// [`TileScratch`] in use by a thread; returned to the container when dropped.
 pub(super) struct ScratchGuard<'a> {
     from: &'a Mutex<Vec<TileScratch>>,
     scratch: TileScratch,
@@ -47,15 +48,15 @@ impl Container {
     /// sh, each of the right width.
     ///
     /// # Errors
-    /// The errors of [`Reader::open`]; a column is missing or has another width.
+    /// Fails like [`Reader::open`], and if a column is missing or has another width.
     pub fn open(path: &Path) -> Result<Container> {
         Self::open_within(path, ReadLimit::NONE)
     }
 
-    /// Opens the container like [`Container::open`], with at most `memory` for the index of frames and tiles.
+    /// Opens the container like [`Container::open`], using at most `memory` for the index of frames and tiles.
     ///
     /// # Errors
-    /// The errors of [`Container::open`]; a container that needs more memory.
+    /// Fails like [`Container::open`], and if the index needs more memory.
     pub fn open_within(path: &Path, memory: ReadLimit) -> Result<Container> {
         let reader = Reader::open_within(path, memory.bytes())?;
         let layout = reader.layout();
@@ -109,24 +110,24 @@ impl Container {
         })
     }
 
-    /// Returns the reader of the container format.
+    /// Returns the reader of the underlying container file.
     pub fn reader(&self) -> &Reader {
         &self.reader
     }
 
-    /// Returns the path of the file.
+    /// Returns the path of the container file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns a hash that covers every tile, as 16 hexadecimal digits.
+    /// Returns a hash of the values of all tiles as 16 hexadecimal digits.
     pub fn digest(&self) -> String {
         format!("{:016x}", self.reader.digest())
     }
 
-    /// Allows decoded tiles to stay in memory, in at most `bytes`, as long as the container is open, so that later
-    /// passes do not read the file again. Nothing is held at first. The limit may be raised at any time; a lower one
-    /// has no effect. Values are the same with and without it.
+    /// Allows up to `bytes` of decoded tiles to stay in memory as long as the container is open, so that later passes
+    /// over the frames do not read the file again. Without this call no tile is kept. The number may be raised at any
+    /// time; a smaller one has no effect. The values read do not depend on it.
     pub fn hold_decoded(&self, bytes: u64) {
         let own = self.slots() as u64 * HeldTiles::BYTES_PER_SLOT;
         if bytes > own {
@@ -134,8 +135,8 @@ impl Container {
         }
     }
 
-    /// Returns the maximum number of bytes for holding every tile ([`Container::hold_decoded`]). Fewer are used if
-    /// tiles of a varying column are constant.
+    /// Returns the bytes of memory that [`Container::hold_decoded`] needs to keep every decoded tile. Less is used if
+    /// an attribute that varies over time is constant in some tiles.
     pub fn decoded_bytes(&self) -> u64 {
         let values = |&(column, _): &(Attributes, u32)| {
             let frames = if self.info.varying.contains(column) { self.info.times.len() } else { 1 };
@@ -144,13 +145,14 @@ impl Container {
         4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
     }
 
-    /// Returns the number of distinct tiles: a column that does not vary has those of one frame block.
+    /// Returns the number of distinct tiles. A column that does not vary over time has only the tiles of one frame
+    /// block.
     pub(super) fn slots(&self) -> usize {
         self.slot(self.places.len(), 0, 0)
     }
 
-    /// Returns the index of a tile of column `index` of `places` among the distinct tiles. For `index` = number of
-    /// columns it is the number of distinct tiles.
+    /// Returns the index, among all distinct tiles, of a tile of column `index` of `places`. If `index` is the number
+    /// of columns, this is the number of distinct tiles.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };
@@ -159,11 +161,11 @@ impl Container {
         (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
     }
 
-    /// Returns the values `[frames, width, len]` of a tile of column `index` of `places` (one frame for a constant
-    /// tile) if they are held or can be held from now on, else `None`.
+    /// Returns the decoded values `[frames, width, len]` of a tile of column `index` of `places` if they are in memory
+    /// or fit into the memory allowed for kept tiles, else `None`. A constant tile has one frame.
     ///
     /// # Errors
-    /// The tile cannot be read or decoded.
+    /// Fails if the tile cannot be read or decoded.
     pub(super) fn held(&self, index: usize, at: TileId) -> Result<Option<&[f32]>> {
         let Some(held) = self.held.get() else { return Ok(None) };
         held.get_or_decode(
@@ -186,12 +188,13 @@ impl Container {
         )
     }
 
-    /// Returns whether a tile of column `index` of `places` is held.
+    /// Returns whether a decoded tile of column `index` of `places` is in memory.
     pub(super) fn is_held(&self, index: usize, gaussian_block: u32, frame_block: u32) -> bool {
         self.held.get().is_some_and(|held| held.has(self.slot(index, gaussian_block, frame_block)))
     }
 
-    /// Returns the tiles of `columns` in the given blocks that would have to be read from the file.
+    /// Returns the tiles of `columns` in the given Gaussian block and frame block that are not in memory and have to be
+    /// read from the file.
     pub(super) fn unheld(
         &self,
         columns: Attributes,
@@ -205,7 +208,7 @@ impl Container {
         self.places.iter().enumerate().filter(needed).map(at)
     }
 
-    /// Returns a decoding buffer, reusing one that is free.
+    /// Returns decoding buffers, reusing free ones if there are any.
     pub(super) fn scratch(&self) -> ScratchGuard<'_> {
         let scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner).pop();
         ScratchGuard { from: &self.scratch, scratch: scratch.unwrap_or_default() }

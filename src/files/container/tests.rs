@@ -13,9 +13,9 @@ use crate::source::ReadPlan;
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
 const FRAMES: usize = 2 * FRAME_BLOCK + 5;
 
-/// Source that covers every encoding of a tile: positions are noise in the first Gaussian block (zstd cannot compress
-/// it) and curves in the others; opacities change only in the second frame block; rotations are constant in the last
-/// Gaussian block; scales and colors never change.
+/// Frame source whose tiles need every encoding of the container: positions are noise in the first Gaussian block (zstd
+/// cannot compress it) and curves in the others; opacities change only in the second frame block; rotations are
+/// constant in the last Gaussian block; scales and colors never change.
 struct EncodingSource(SequenceInfo);
 
 impl EncodingSource {
@@ -52,7 +52,7 @@ impl EncodingSource {
         (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
     }
 
-    /// Returns the values of the columns `want` of `ids` at `frame`, computed from the formula.
+    /// Returns the attributes `want` of the Gaussians `ids` at `frame`, computed from the formula of this source.
     fn expected(&self, ids: &Ids<'_>, frame: usize, want: Attributes) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
@@ -89,7 +89,8 @@ impl BlockReader for EncodingReader<'_> {
     }
 }
 
-/// Returns a tile, the short last tile, a part of a tile, parts of two tiles, and scattered Gaussians in no order.
+/// Returns five selections of Gaussians: one tile, the short last tile, a part of a tile, parts of two tiles, and
+/// `scattered` Gaussians in no order.
 fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
     let tile = GAUSSIAN_BLOCK;
     [
@@ -155,7 +156,7 @@ fn a_reader_keeps_no_more_than_allowed() {
     }
 }
 
-/// Returns the number of tiles that a pass over every frame takes, and their stored bytes.
+/// Returns the number of tiles that are read in one pass over all frames, and their bytes in the file.
 fn all_tiles(container: &Container) -> (u64, u64) {
     let (reader, mut found) = (container.reader(), (0, 0));
     for &(column, place) in &container.places {
@@ -170,7 +171,7 @@ fn all_tiles(container: &Container) -> (u64, u64) {
     found
 }
 
-/// Reads every frame in Gaussian blocks, as a scan does, and compares positions.
+/// Reads every frame in blocks of Gaussians, as a scan does, and compares the positions with those of `source`.
 fn scan(source: &EncodingSource, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));
@@ -197,7 +198,7 @@ fn a_scan_reads_each_stored_byte_once() {
         let once = Reads { bytes, tiles, states: (COUNT * FRAMES) as u64 };
         scan(&source, &container);
         assert_eq!(container.reads(), once, "{compression:?}");
-        // Raw tiles have been verified by the first scan.
+        // The first scan has verified the raw (uncompressed) tiles. A second scan must read the same bytes again.
         scan(&source, &container);
         assert_eq!(container.reads() - once, once, "{compression:?}, again");
     }

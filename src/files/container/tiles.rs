@@ -1,5 +1,5 @@
-//! Reads some Gaussians of a container. Each tile is decoded once for all frames that are needed from it, as far as
-//! memory allows.
+//! Reads some Gaussians of a container. A tile holds the values of one column (attribute) for a block of consecutive
+//! Gaussians and frames. As far as memory allows, each tile is decoded once for all frames that are needed from it.
 
 use std::ops::Range;
 
@@ -10,11 +10,12 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Maximum number of bytes of the memory map that a reader touches before it releases pages that it no longer needs.
+/// Maximum number of bytes of the memory-mapped file that a reader touches before it releases the pages that it no
+/// longer needs.
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
-/// Gaussians that are adjacent both in a tile and in the reader's block: `len` of them, from `from` in the tile, `to`
-/// in the block.
+/// Gaussians that are adjacent both in a tile and in the reader's list: `len` of them, from index `from` in the tile
+/// and from index `to` in the list.
 struct TileRun {
     gaussian_block: u32,
     from: usize,
@@ -22,27 +23,29 @@ struct TileRun {
     len: usize,
 }
 
-/// Data that a reader keeps of one column.
+/// Values of one column (attribute) that a reader keeps in memory.
 pub(super) enum KeptColumn {
     Nothing,
-    /// Frame block, and the one tile that holds exactly the reader's Gaussians: decompressed, or raw in the file.
+    /// Index of the frame block, and the tile, which holds exactly the reader's Gaussians. The tile is decompressed, or
+    /// raw (uncompressed) in the file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
 
-/// Values at some frames of a frame block.
+/// Values of the reader's Gaussians at some frames of a frame block.
 #[derive(Default)]
 pub(super) struct FrameValues {
-    /// Frames of the frame block.
+    /// Frame numbers that the frame block covers.
     block: Range<usize>,
-    /// Frames whose values are stored, increasing; empty if one frame stands for the whole block.
+    /// Frames whose values are stored, increasing. Empty if the values are the same in all frames of the block and
+    /// stored once.
     frames: Vec<usize>,
-    /// Values, `[frames, width, len]`.
+    /// Values `[frames, width, len]` for the stored frames, the components of the column, and the Gaussians.
     pub(super) values: Vec<f32>,
 }
 
 impl FrameValues {
-    /// Returns the index in `frames` of the values for `frame`.
+    /// Returns the index, along the first axis of `values`, of the values for `frame`.
     fn place(&self, frame: usize) -> Option<usize> {
         match self.frames[..] {
             [] if self.block.contains(&frame) => Some(0),
@@ -53,32 +56,33 @@ impl FrameValues {
 
 /// Reader of some Gaussians of a container.
 ///
-/// Memory per Gaussian: 4 bytes × width × frames held for each column that varies. "Frames held" are the needed frames
-/// of a frame block, at most the limit of [`ReadPlan::holding`]. Add 8 bytes × width if this is a whole block. Raw
-/// tiles that are read whole take as much of the memory map if a whole block may be held, else nothing. There is no
-/// such memory if only one frame is held, for columns that do not vary, and for tiles that the container holds.
+/// Memory in bytes per Gaussian, for each column that varies over time: 4 × width × frames kept. The frames kept are
+/// those of a frame block that will be read, but at most the number given by [`ReadPlan::holding`]. If this is a whole
+/// frame block, add 8 × width. Raw (uncompressed) tiles that are read whole take the same amount of mapped memory if a
+/// whole frame block may be kept, else none. No memory is used if only one frame is kept, for columns that do not vary,
+/// and for tiles that the container keeps in memory.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
     runs: Vec<TileRun>,
-    /// Whether the Gaussians are exactly those of one tile, in its order.
+    /// Whether the reader's Gaussians are exactly those of one tile, in the order of the tile.
     pub(super) whole: bool,
-    /// Frames that will be read.
+    /// Numbers of the frames that will be read.
     plan: ReadPlan,
-    /// Last frame block for which the operating system was told which tiles come next.
+    /// Last frame block for which the operating system was told which tiles will be read next.
     announced_block: Option<u32>,
-    /// Data kept of each column, in the order of [`Container::places`].
+    /// Values kept of each column, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
-    /// Frame block of the raw tiles in `raw_in_use`.
+    /// Index of the frame block of the raw tiles in `raw_in_use`.
     entered: u32,
-    /// Raw tiles in use, to be released when another frame block is entered.
+    /// Mapped pages of raw (uncompressed) tiles in use, to be released when another frame block is entered.
     raw_in_use: TouchedPages,
-    /// Tiles that have been decoded, to be released soon.
+    /// Mapped pages of tiles that have been decoded, to be released soon.
     decoded: TouchedPages,
 }
 
 impl<'a> TileReader<'a> {
-    /// Returns a reader of the Gaussians `ids`.
+    /// Returns a reader of the Gaussians with the indices `ids`.
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();
@@ -89,7 +93,7 @@ impl<'a> TileReader<'a> {
                 _ => runs.push(TileRun { gaussian_block: tile, from, to, len: 1 }),
             }
         }
-        // Sorted, so that each tile is decoded once for Gaussians in any order.
+        // Sort the runs by tile, so that each tile is decoded once even if the Gaussians are in any order.
         runs.sort_by_key(|run| run.gaussian_block);
         let whole = match runs[..] {
             [TileRun { gaussian_block, from: 0, len, .. }] => {
@@ -117,7 +121,7 @@ impl<'a> TileReader<'a> {
         (frame / self.source.reader.layout().frame_block as usize) as u32
     }
 
-    /// Writes column `index` at `frame` to `out`, `[width, len]`.
+    /// Writes the values of column `index` at `frame` to `out`, `[width, len]`.
     fn read_column(&mut self, index: usize, frame: usize, out: &mut [f32]) -> Result<()> {
         if !self.try_keep(index, frame)? {
             return self.decode(index, &[frame], out);
@@ -136,8 +140,9 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Makes the reader keep column `index` at `frame`, if that is worth its memory. Returns false if it is not, or if
-    /// the container holds the tiles; [`TileReader::decode`] then writes the values to their destination.
+    /// Reads column `index` into the reader's memory for `frame` and later frames of its frame block, if that is worth
+    /// the memory. Returns false if it is not, or if the container keeps the tiles; the caller then uses
+    /// [`TileReader::decode`], which writes the values to their destination.
     fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
         if self.try_hold(index, frame_block)? {
@@ -163,13 +168,15 @@ impl<'a> TileReader<'a> {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
             let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
             let all = self.plan.held() >= block.len();
-            // A decompressed tile is as large as all of its frames.
+            // A decompressed tile takes the memory of all its frames, so keep one only if more than half of its frames
+            // are needed.
             if raw || all && 2 * frames.len() > block.len() {
                 let mut tile = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
                     KeptColumn::Tile(_, tile) => tile,
                     _ => TileFrames::default(),
                 };
-                // Releasing a raw tile frame by frame costs more than copying from the file.
+                // Copy raw tiles from the file if less than a frame block may be kept, because releasing their pages
+                // frame by frame costs more.
                 let touched = match (raw, all) {
                     (true, true) => Some(&mut self.raw_in_use),
                     (true, false) => None,
@@ -201,8 +208,8 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Makes the container hold all tiles of column `index` that are needed in a frame block. Returns whether it holds
-    /// them.
+    /// Makes the container keep all tiles of column `index` that the reader needs in a frame block. Returns whether
+    /// they are all in memory.
     fn try_hold(&self, index: usize, frame_block: u32) -> Result<bool> {
         if self.source.held.get().is_none() {
             return Ok(false);
@@ -217,7 +224,7 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Returns whether no value of the column changes within the frame block.
+    /// Returns whether no value that the reader needs of `column` changes within the frame block.
     fn is_constant(&self, column: u32, frame_block: u32) -> Result<bool> {
         for run in &self.runs {
             let at = TileId { column, gaussian_block: run.gaussian_block, frame_block };
@@ -228,15 +235,15 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Writes column `index` at `frames`, which are increasing and in one frame block, to `out`: `[frames, width,
-    /// len]`.
+    /// Decodes the values of column `index` at `frames` into `out`, `[frames, width, len]`. `frames` are increasing and
+    /// lie in one frame block.
     fn decode(&mut self, index: usize, frames: &[usize], out: &mut [f32]) -> Result<()> {
         let (source, reader) = (self.source, &self.source.reader);
         let layout = reader.layout();
         let (column, place) = source.places[index];
         let width = column.width(source.info.sh_degree);
         let frame_block = self.frame_block(frames[0]);
-        // A single frame of many is copied from the file, which is cheaper than mapping and releasing its pages.
+        // Copy a single frame of many from the file, which is cheaper than mapping and releasing its pages.
         let in_place = frames.len() > 1 || !source.info.varying.contains(column);
         let mut lent = source.scratch();
         let TileScratch { buffer, frames: tile, plane: plane_buffer } = &mut *lent;
@@ -252,7 +259,7 @@ impl<'a> TileReader<'a> {
             for (&frame, out) in frames.iter().zip(out.chunks_exact_mut(width * self.len)) {
                 let within = frame % layout.frame_block as usize;
                 let plane = match held {
-                    // A constant tile has one frame for all frames.
+                    // A constant tile stores one frame, which holds for all frames.
                     Some(values) => &values[(within * width * len) % values.len()..][..width * len],
                     None if self.whole => {
                         reader.read_frame(tile, within, out)?;
@@ -273,7 +280,8 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Releases the raw tiles of the previous frame block if `frame` belongs to another one.
+    /// If `frame` belongs to another frame block than the last one read, releases the pages of the raw tiles of that
+    /// block.
     fn enter_frame_block(&mut self, frame: usize) {
         let frame_block = self.frame_block(frame);
         if frame_block != self.entered {
@@ -287,9 +295,9 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Tells the operating system, once per frame block, which tiles of the columns `want` come next. Does nothing for
-    /// a reader that holds less than a frame block: it decodes a block several times, and read-ahead would evict pages
-    /// that it still needs.
+    /// Tells the operating system, once per frame block, which tiles of the columns `want` come next. Does nothing if
+    /// the reader may keep less than a frame block in memory: it then decodes each block several times, and read-ahead
+    /// would evict pages that it still needs.
     fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);
@@ -306,7 +314,7 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Checks that there is a frame `frame`.
+    /// Checks that the sequence has a frame with number `frame`.
     fn check(&self, frame: usize) -> Result<()> {
         match frame < self.source.info.times.len() {
             true => Ok(()),
@@ -347,7 +355,7 @@ impl BlockReader for TileReader<'_> {
     fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
         self.check(frame)?;
         if self.len > 0 {
-            // The caller of `prepare` fetches the next tiles itself.
+            // Record the block as announced, because the caller of `prepare` fetches the next tiles itself.
             self.announced_block = Some(self.frame_block(frame));
             self.enter_frame_block(frame);
             for index in 0..self.kept.len() {

@@ -1,39 +1,41 @@
-//! Conversion of the fixed parts of a frame stream between bytes and values (format/STREAM.md).
+//! Conversion of the fixed parts of a frame stream (header and marks; format/STREAM.md) between bytes and values.
 
 use crate::error::quoted;
 use crate::model::{Attributes, sh_coefficients};
 
-/// Versions of the format: in version 1 every frame has the same Gaussians, in version 2 every frame states their
-/// number.
+/// Versions of the stream format. In version 1 every frame has the same Gaussians, in version 2 every frame states
+/// their number.
 const VERSIONS: [u32; 2] = [1, 2];
-/// Mark before a frame.
+/// First bytes of the mark that precedes a frame.
 const FRAME_MAGIC: [u8; 4] = *b"FRAM";
-/// Mark at the end of the stream.
+/// First bytes of the mark at the end of the stream.
 const END_MAGIC: [u8; 4] = *b"DONE";
 
 /// Header of a stream, before its first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamHeader {
-    /// N, number of Gaussians in every frame; below 2³². 0 for unlinked frames.
+    /// N, the number of Gaussians in every frame; below 2³². 0 if the frames are unlinked.
     pub count: usize,
     /// SH degree, 0 to 3.
     pub sh_degree: usize,
-    /// Attributes that are stored with every frame; the others are stored once.
+    /// Attributes that are stored with every frame. The others are constant and stored once, after the header.
     pub varying: Attributes,
-    /// Whether every frame states its number of Gaussians and Gaussians have no ids across frames (version 2).
+    /// Whether frames are unlinked (version 2): every frame states its own number of Gaussians, and the same index in
+    /// two frames does not mean the same Gaussian.
     pub is_unlinked: bool,
 }
 
-/// Mark before the attributes of a frame, or at the end of the stream.
+/// Mark: fixed-size part of the stream before the attributes of each frame and at the end of the stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum FrameMark {
-    /// Number of the frame, its time stamp and the length of its attributes in bytes.
+    /// Mark before a frame: number of the frame, its time stamp, and the length of its attributes in bytes.
     Frame { index: u32, time: f64, bytes: u64 },
-    /// Number of frames in the stream.
+    /// Mark at the end of the stream: number of frames in the stream.
     End(u32),
 }
 
-/// Description of an illegal field: offset in bytes within its part, expected and found value.
+/// Field of a header or mark that violates the format: its offset in bytes within the header or mark, the expected
+/// value and the value found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct IllegalField {
     pub(crate) offset: u64,
@@ -42,26 +44,27 @@ pub(crate) struct IllegalField {
     pub(crate) hint: &'static str,
 }
 
-/// Hint for errors that arise if other output got into the stream, or if frames have another length than stated.
+/// Hint for errors that occur if a program prints other output into the stream, or if frames have another length than
+/// stated.
 const FOREIGN_OUTPUT: &str = "whatever the exporter prints must go to standard error, never into the stream";
 
 impl StreamHeader {
     /// Length of the header in bytes.
     pub(crate) const BYTES: usize = 32;
-    /// First bytes of every stream, chosen like those of the container.
+    /// First bytes of every stream, built like the first bytes of a container file.
     pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";
 
-    /// Returns the number of bytes of the varying attributes of one frame, if all frames have the same Gaussians.
+    /// Returns the number of bytes that the varying attributes of one frame take if all frames have the same Gaussians.
     pub fn frame_bytes(&self) -> u64 {
         self.gaussian_bytes() * self.count as u64
     }
 
-    /// Returns the number of bytes of one Gaussian in a frame.
+    /// Returns the number of bytes that the varying attributes of one Gaussian take in a frame.
     pub(crate) fn gaussian_bytes(&self) -> u64 {
         4 * self.varying.width(self.sh_degree) as u64
     }
 
-    /// Returns the header as stored.
+    /// Returns the bytes of the header as stored in the stream.
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let mut bytes = [0; Self::BYTES];
         bytes[..8].copy_from_slice(&Self::MAGIC);
@@ -72,10 +75,10 @@ impl StreamHeader {
         bytes
     }
 
-    /// Reads a header.
+    /// Decodes a header from its stored bytes.
     ///
     /// # Errors
-    /// The first field that violates STREAM.md.
+    /// Returns the first field that violates format/STREAM.md.
     pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, IllegalField> {
         let illegal = |offset, expected: &str, found: String, hint| {
             Err(IllegalField { offset, expected: expected.to_owned(), found, hint })
@@ -114,10 +117,10 @@ impl StreamHeader {
 }
 
 impl FrameMark {
-    /// Length of a mark in bytes.
+    /// Length of a mark in bytes; marks precede frames and the end of the stream.
     pub(crate) const BYTES: usize = 24;
 
-    /// Returns the mark as stored.
+    /// Returns the bytes of the mark as stored in the stream.
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let (mark, index, time, length) = match self {
             FrameMark::Frame { index, time, bytes } => (FRAME_MAGIC, index, time, bytes),
@@ -131,11 +134,11 @@ impl FrameMark {
         bytes
     }
 
-    /// Reads the mark that follows `frames` complete frames, the last of them at time `before`, in a stream with
-    /// `header`.
+    /// Decodes a mark from its stored bytes. The mark follows `frames` complete frames of a stream with the header
+    /// `header`; the last of these frames is at time `before`.
     ///
     /// # Errors
-    /// The first field that violates STREAM.md.
+    /// Returns the first field that violates format/STREAM.md.
     pub(crate) fn from_bytes(
         bytes: &[u8; Self::BYTES],
         header: &StreamHeader,
@@ -192,16 +195,17 @@ impl FrameMark {
     }
 }
 
-/// Hint for frames of another length than the header states.
+/// Hint for errors about a frame whose length differs from the one that the header states.
 const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in the same columns";
 
-/// Returns the length of a frame by the header, for messages.
+/// Returns the length of a frame that follows from the header, as text for messages.
 fn expected_length(header: &StreamHeader) -> String {
     let names: Vec<&str> = header.varying.iter().map(Attributes::name).collect();
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 
-/// Describes a wrong frame length: as another number of Gaussians if it is a multiple, else as impossible.
+/// Describes a wrong frame length for messages: as another number of Gaussians if it is a multiple of the length of one
+/// Gaussian, else as impossible.
 fn found_length(header: &StreamHeader, length: u64) -> String {
     let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
     if length.checked_rem(per_gaussian) == Some(0) {
@@ -225,5 +229,5 @@ fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
 }
 
-/// Proves that the number of bytes of a frame fits into `u64` for every legal header.
+/// Compile-time check that the number of bytes of a frame fits into `u64` for every legal header.
 const _: () = assert!((u32::MAX as u64).checked_mul(4 * (11 + 3 * sh_coefficients(3)) as u64).is_some());

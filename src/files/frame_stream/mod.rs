@@ -1,8 +1,8 @@
 //! Reads a frame stream that another program writes to a pipe (format/STREAM.md).
 //!
-//! In: bytes from any source. Out: the attributes that are constant over all frames, then one frame after another.
-//! Memory: the constant attributes and the current frame; both are refused before they are read if they exceed the
-//! limit. At most 1 MiB is allocated beyond twice the bytes received.
+//! Input: bytes from any source. Output: the attributes that are constant over all frames, then one frame after
+//! another. Memory: the constant attributes and the current frame. If they exceed the memory limit, they are refused
+//! before they are read. At most 1 MiB is allocated beyond twice the number of bytes received.
 
 mod framing;
 #[cfg(test)]
@@ -17,10 +17,10 @@ use crate::model::{AttributeValues, Attributes, Gaussians};
 pub use framing::StreamHeader;
 pub(crate) use framing::{FrameMark, IllegalField};
 
-/// Minimum number of bytes allocated at a time.
+/// Minimum number of bytes by which the buffer for received values grows.
 const MIN_ALLOCATION_BYTES: u64 = 1 << 20;
 
-/// Stream whose header and constant attributes have arrived.
+/// Frame stream of which the header and the constant attributes have been read.
 #[derive(Debug)]
 pub struct FrameStream<R> {
     bytes: CountingReader<R>,
@@ -32,25 +32,28 @@ pub struct FrameStream<R> {
     memory: ReadLimit,
 }
 
-/// Source of bytes that counts the bytes received.
+/// Source of bytes that counts how many it has delivered.
 #[derive(Debug)]
 struct CountingReader<R> {
     from: R,
-    /// Name of the stream in messages.
+    /// Name of the stream in error messages.
     name: PathBuf,
     received: u64,
 }
 
 impl<R: Read> FrameStream<R> {
-    /// Reads the header and the attributes that are constant over all frames. Messages call the stream `name`.
+    /// Reads the header and the attributes that are constant over all frames. `name` is the name of the stream in error
+    /// messages.
     ///
     /// # Errors
-    /// The header violates STREAM.md; the stream ends early; the constant attributes exceed `memory`.
+    /// Fails if the header violates format/STREAM.md, if the stream ends early, or if the constant attributes need more
+    /// than `memory`.
     pub fn open(from: R, name: &Path, memory: ReadLimit) -> Result<FrameStream<R>> {
         let mut bytes = CountingReader { from, name: name.to_owned(), received: 0 };
         let mut header = [0; StreamHeader::BYTES];
         let got = bytes.read_up_to(&mut header)?;
-        // If the first bytes are not those of a stream, the error names them instead of the missing length.
+        // Report a stream that ends within the header only if its first bytes are those of a frame stream. Otherwise
+        // the error names these bytes.
         if got < header.len() && (got == 0 || header[..got.min(8)] == StreamHeader::MAGIC[..got.min(8)]) {
             return Err(bytes.ended("the header of a frame stream", None));
         }
@@ -72,12 +75,12 @@ impl<R: Read> FrameStream<R> {
         &self.header
     }
 
-    /// Returns the attributes that are constant over all frames; the others are empty.
+    /// Returns the attributes that are constant over all frames. The varying attributes in it are empty.
     pub fn constant(&self) -> &Gaussians {
         &self.constant
     }
 
-    /// Returns the constant attributes and leaves [`FrameStream::constant`] empty.
+    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant`] is empty.
     pub fn take_constant(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }
@@ -87,12 +90,12 @@ impl<R: Read> FrameStream<R> {
         self.bytes.received
     }
 
-    /// Reads the next frame: writes the attributes that vary into `out`, leaves the others unchanged, and returns the
-    /// time of the frame; `None` after the end mark.
+    /// Reads the next frame. Writes its varying attributes into `out`, leaves the other attributes of `out` unchanged,
+    /// and returns the time of the frame. Returns `None` after the end mark.
     ///
     /// # Errors
-    /// Every violation of STREAM.md, with the frame and the byte; a frame that exceeds the memory limit; a failed read.
-    /// The stream cannot be used afterwards.
+    /// Fails if the stream violates format/STREAM.md (the message names the frame and the byte), if a frame exceeds the
+    /// memory limit, or if reading fails. The stream cannot be used afterwards.
     pub fn next_frame(&mut self, out: &mut Gaussians) -> Result<Option<f64>> {
         if self.ended {
             return Ok(None);
@@ -140,7 +143,7 @@ impl<R: Read> FrameStream<R> {
 }
 
 impl<R: Read> CountingReader<R> {
-    /// Reads until `into` is full or the stream ends. Returns the number of bytes read.
+    /// Reads bytes until `into` is full or the stream ends. Returns the number of bytes read.
     fn read_up_to(&mut self, into: &mut [u8]) -> Result<usize> {
         let mut got = 0;
         while got < into.len() {
@@ -155,7 +158,7 @@ impl<R: Read> CountingReader<R> {
         Ok(got)
     }
 
-    /// Reads one attribute of `len` Gaussians. Returns false if the stream ends early.
+    /// Reads the values of one attribute of `len` Gaussians into `column`. Returns false if the stream ends early.
     fn read_attribute(&mut self, len: usize, column: &mut AttributeValues) -> Result<bool> {
         if column.len() != len {
             let Some(planes) = self.read_new_values(len * column.width())? else { return Ok(false) };
@@ -165,7 +168,7 @@ impl<R: Read> CountingReader<R> {
         self.read_values(column.planes_mut())
     }
 
-    /// Reads `count` values into a buffer that grows with the bytes received. Returns `None` if the stream ends early.
+    /// Reads `count` values into a new buffer, which grows as bytes arrive. Returns `None` if the stream ends early.
     fn read_new_values(&mut self, count: usize) -> Result<Option<Vec<f32>>> {
         let mut values: Vec<f32> = Vec::new();
         while values.len() < count {
@@ -180,7 +183,7 @@ impl<R: Read> CountingReader<R> {
         Ok(Some(values))
     }
 
-    /// Reads little-endian values until `values` is full. Returns false if the stream ends early.
+    /// Reads little-endian f32 values until `values` is full. Returns false if the stream ends early.
     fn read_values(&mut self, values: &mut [f32]) -> Result<bool> {
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(values);
         let expected = bytes.len();
@@ -191,13 +194,13 @@ impl<R: Read> CountingReader<R> {
         Ok(all)
     }
 
-    /// Returns the error for an illegal field of the part that begins at byte `start`.
+    /// Returns the error for an illegal field of the header or mark that begins at byte `start` of the stream.
     fn error(&self, start: u64, frame: Option<u32>, illegal: IllegalField) -> Error {
         let IllegalField { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 
-    /// Returns the error for a stream that ended before `expected` arrived, after `frames` complete frames.
+    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames.
     fn ended(&self, expected: &str, frames: Option<u32>) -> Error {
         let found = match frames {
             None => "the end of the stream, before its first frame".to_owned(),
@@ -211,7 +214,7 @@ impl<R: Read> CountingReader<R> {
     }
 }
 
-/// Returns the place of a byte in messages.
+/// Returns the text that names a byte of the stream, and its frame if there is one, in messages.
 fn place(byte: u64, frame: Option<u32>) -> String {
     frame.map_or(format!("byte {byte}"), |frame| format!("frame {frame}, byte {byte}"))
 }

@@ -6,7 +6,8 @@ use crate::source::{FrameSource, Ids};
 const N: usize = 150;
 const T: usize = 4;
 
-/// Returns a small scene, its bytes as a stream, and the offset of each of its frames.
+/// Returns a small scene, the bytes of its frame stream, and the offset of the mark before each frame and of the end
+/// mark.
 fn written() -> (Scene, Vec<u8>, Vec<usize>) {
     let scene = Scene::new(N, T);
     let info = scene.info();
@@ -23,7 +24,7 @@ fn written() -> (Scene, Vec<u8>, Vec<usize>) {
     (scene, bytes, (0..=T).map(|t| first + t * frame).collect())
 }
 
-/// Returns the frame states of the scene.
+/// Returns the attributes of all Gaussians of the scene at each frame.
 fn states(scene: &Scene) -> Vec<Gaussians> {
     let mut reader = scene.open(Ids::Range(0..N)).unwrap();
     (0..T)
@@ -35,7 +36,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
         .collect()
 }
 
-/// Returns the frames of a stream with all their attributes, and their times.
+/// Reads a frame stream. Returns the time and all attributes of each frame.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
     let mut state = stream.constant().clone();
@@ -47,7 +48,7 @@ fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     Ok(frames)
 }
 
-/// Returns the error message for a stream.
+/// Returns the message of the error with which reading the stream `bytes` fails.
 fn refusal(bytes: &[u8]) -> String {
     let error = read(bytes).unwrap_err();
     assert!(matches!(error, Error::Input(_)), "{error}");
@@ -125,7 +126,8 @@ fn truncated_streams_name_the_number_of_complete_frames() {
     }
 }
 
-/// Returns the stream with bytes of the mark of frame `frame` replaced.
+/// Returns the bytes of the test stream in which `field` replaces the bytes from `offset` on in the mark (header) of
+/// frame `frame`.
 fn with_mark_bytes(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
     let (_, mut bytes, starts) = written();
     bytes[starts[frame] + offset..][..field.len()].copy_from_slice(field);

@@ -1,7 +1,7 @@
 //! Writes renders as image files: 8-bit as shown on a screen, or the exact values.
 //!
-//! In: an [`Image`]. Out: an 8-bit RGB `.png`, or a `.npy` of float32 `[height, width, 3]`, not clamped; for HTML pages
-//! a JPEG. Memory: 3 bytes per pixel for a PNG or JPEG, no extra memory for an array.
+//! Input: an [`Image`]. Output: an 8-bit RGB `.png`, a `.npy` of float32 `[height, width, 3]` that is not clamped, or,
+//! for HTML pages, a JPEG. Memory: 3 bytes per pixel for a PNG or JPEG, no extra memory for an array.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -14,17 +14,17 @@ use npyz::{WriteOptions, WriterBuilder};
 use crate::error::{Error, Result};
 use crate::render::Image;
 
-/// File format of an image.
+/// File format in which a render is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageFormat {
-    /// 8 bits per channel, clamped.
+    /// PNG with 8 bits per channel, values clamped to [0, 1].
     Png,
-    /// float32, not clamped.
+    /// NumPy array of float32, values not clamped.
     Npy,
 }
 
 impl ImageFormat {
-    /// Returns the extension of file names, by which the format is also recognized.
+    /// Returns the file name extension of the format. [`ImageFormat::from_path`] recognizes the format by it.
     pub fn extension(self) -> &'static str {
         match self {
             ImageFormat::Png => "png",
@@ -32,7 +32,7 @@ impl ImageFormat {
         }
     }
 
-    /// Returns the format for the extension of a file name, ignoring case; `None` for other extensions.
+    /// Returns the format that the extension of a file name stands for, ignoring case; `None` for other extensions.
     pub fn from_path(path: &Path) -> Option<ImageFormat> {
         let extension = path.extension()?;
         [ImageFormat::Png, ImageFormat::Npy]
@@ -44,23 +44,23 @@ impl ImageFormat {
 /// Writes `image` to `path`.
 ///
 /// # Errors
-/// The file cannot be written; a PNG has no pixels, which the format does not allow.
+/// Fails if the file cannot be written, or if a PNG would have no pixels, which that format does not allow.
 pub fn write_image(image: &Image, format: ImageFormat, path: &Path) -> Result<()> {
     let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
     write(&mut out, image, format).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// Returns the bytes that [`write_image`] writes.
+/// Returns the content of the file that [`write_image`] writes.
 ///
 /// # Errors
-/// A PNG has no pixels, which the format does not allow.
+/// Fails if a PNG would have no pixels, which that format does not allow.
 pub fn image_bytes(image: &Image, format: ImageFormat) -> io::Result<Vec<u8>> {
     let mut out = Vec::new();
     write(&mut out, image, format)?;
     Ok(out)
 }
 
-/// Writes `image` in `format` to `out`.
+/// Encodes `image` in the file format `format` and writes the bytes to `out`.
 fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result<()> {
     match format {
         ImageFormat::Png => write_png(out, image),
@@ -68,7 +68,7 @@ fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result
     }
 }
 
-/// Writes an 8-bit RGB PNG.
+/// Writes `image` as an 8-bit RGB PNG to `out`.
 fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);
@@ -78,7 +78,8 @@ fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     writer.finish().map_err(png_error_to_io)
 }
 
-/// Converts a PNG error. I/O errors are passed on unchanged, so that callers can recognize a full disk.
+/// Converts an error of the PNG encoder. An I/O error inside it is passed on unchanged, so that callers can recognize a
+/// full disk.
 pub(crate) fn png_error_to_io(error: png::EncodingError) -> io::Error {
     match error {
         png::EncodingError::IoError(error) => error,
@@ -86,15 +87,15 @@ pub(crate) fn png_error_to_io(error: png::EncodingError) -> io::Error {
     }
 }
 
-/// Returns the pixels with 8 bits per channel, clamped to [0, 1].
+/// Returns the pixels of `image` as RGB with 8 bits per channel, clamped to [0, 1].
 pub(crate) fn rgb(image: &Image) -> Vec<u8> {
     image.data.iter().map(|&value| byte(value)).collect()
 }
 
-/// Returns a JPEG of `quality` from 1 to 100, for pages that hold many renders.
+/// Returns `image` as a JPEG, for pages that hold many renders. `quality` is from 1 to 100.
 ///
 /// # Errors
-/// The image has no pixels, or more than 65535 along a side.
+/// Fails if the image has no pixels, or more than 65535 along a side.
 pub fn jpeg_bytes(image: &Image, quality: u8) -> io::Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut out, quality);
@@ -102,12 +103,12 @@ pub fn jpeg_bytes(image: &Image, quality: u8) -> io::Result<Vec<u8>> {
     Ok(out)
 }
 
-/// Returns the nearest of 256 steps from 0 to 1, rounding halves up; NaN gives 0.
+/// Converts a value in [0, 1] to the nearest of 256 steps; halves are rounded up, and NaN gives 0.
 fn byte(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// Writes a float32 array `[height, width, 3]`.
+/// Writes `image` as a NumPy float32 array `[height, width, 3]` to `out`.
 fn write_npy(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let shape = [u64::from(image.height), u64::from(image.width), 3];
     let mut array = WriteOptions::<f32>::new().default_dtype().shape(&shape).writer(out).begin_nd()?;

@@ -1,4 +1,4 @@
-//! Checks of the bytes of a JSON file before the parser sees them.
+//! Checks the bytes of a JSON file before the parser sees them.
 
 use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult};
 use std::path::{Path, PathBuf};
@@ -6,36 +6,38 @@ use std::path::{Path, PathBuf};
 use crate::error::Error;
 use crate::files::text::{not_utf_8, without_mark};
 
-/// Number of bytes that are read and checked together.
+/// Size of the buffer in bytes: this many bytes are read and checked together.
 const BUFFER: usize = 1 << 16;
-/// Maximum length of a string in bytes, without quotes.
+/// Maximum length in bytes of a string without its quotes.
 const MAX_TEXT: u32 = 1 << 20;
-/// Maximum length of a number in bytes.
+/// Maximum length in bytes of a number in a JSON file.
 const MAX_NUMBER: u32 = 1 << 10;
-/// Maximum nesting depth of lists and objects.
+/// Maximum nesting depth of lists and objects in a JSON file.
 const MAX_DEPTH: u32 = 64;
 
-/// Token that the previous byte belongs to.
+/// Kind of token that the byte read last belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Token {
     None,
     Text,
-    /// Backslash in a string; the next byte is escaped.
+    /// Backslash in a string: the next byte is escaped.
     Escape,
     /// Number or keyword.
     Word,
 }
 
-/// Reader that passes on UTF-8 text and fails for other bytes and for strings, numbers or nesting beyond the limits.
+/// Reader that passes on UTF-8 text. Fails for other bytes, and for strings, numbers or nesting depths that exceed
+/// their limits.
 #[derive(Debug)]
 pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Number of buffer bytes that the parser has taken, and number that have been checked.
+    /// Number of bytes of the buffer that the parser has taken, and (`checked`) that have been checked.
     taken: usize,
     checked: usize,
-    /// Number of buffer bytes that were read. Up to 3 bytes of an incomplete character may follow the checked ones.
+    /// Number of bytes of the buffer that have been read from the file. Up to 3 bytes of an incomplete character may
+    /// follow the checked bytes.
     filled: usize,
     /// Offset in the file of the first byte of the buffer.
     start: u64,
@@ -48,7 +50,7 @@ pub(super) struct CheckedReader<R> {
 }
 
 impl<R: Read> CheckedReader<R> {
-    /// Starts a checked reader of `file`; `path` names it in messages.
+    /// Creates a checked reader of `file`; error messages call the file `path`.
     pub(super) fn new(file: R, path: &Path) -> CheckedReader<R> {
         CheckedReader {
             file,
@@ -67,18 +69,18 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Returns the error that ended the reading, if there was one.
+    /// Takes the error for which the reader refused the file, if there is one.
     pub(super) fn refusal(&mut self) -> Option<Error> {
         self.refusal.take()
     }
 
-    /// Returns whether the text so far is only white space.
+    /// Returns whether all text read so far is white space.
     pub(super) fn is_blank(&self) -> bool {
         self.is_blank
     }
 
-    /// Returns bytes around the parser's position: the last two it has taken and at least 14 following ones, if there
-    /// are any.
+    /// Returns bytes around the position of the parser: the last two that it has taken, and at least 14 that follow
+    /// unless the file ends before.
     pub(super) fn around(&mut self) -> Vec<u8> {
         let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
         if around.len() < 16 && self.fill().is_ok() {
@@ -87,7 +89,7 @@ impl<R: Read> CheckedReader<R> {
         around
     }
 
-    /// Replaces the checked bytes of the buffer by the next ones of the file.
+    /// Reads the next bytes of the file into the buffer, in place of the bytes already checked.
     fn fill(&mut self) -> IoResult<()> {
         if self.refusal.is_some() {
             return Err(ErrorKind::InvalidData.into());
@@ -96,7 +98,7 @@ impl<R: Read> CheckedReader<R> {
         self.start += self.checked as u64;
         self.filled -= self.checked;
         (self.taken, self.checked) = (0, 0);
-        // Read more than once if few bytes come at a time: a byte order mark has three bytes, a character up to four.
+        // Read again if only a few bytes arrive: a byte order mark has three bytes, a character up to four.
         loop {
             let count = match self.file.read(&mut self.buffer[self.filled..]) {
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
@@ -126,18 +128,18 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Stores the error for the byte at index `at` of the buffer. Fails at once if the parser has taken all bytes
-    /// before it.
+    /// Stores `error`, which concerns the byte at index `at` of the buffer. Returns an error at once if the parser has
+    /// already taken all bytes before this byte.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
-        // Pass on the bytes before it first: they may hold an earlier error for the parser to report.
+        // Otherwise pass on the bytes before it first: they may contain an earlier error that the parser reports.
         match at > self.taken {
             true => Ok(()),
             false => Err(ErrorKind::InvalidData.into()),
         }
     }
 
-    /// Checks the bytes that were read; `is_end` says that no more will follow.
+    /// Checks the bytes that were read but not checked yet. `is_end`: no more bytes will follow.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {
@@ -163,7 +165,7 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Advances the state by one byte. Returns a description of the limit if the byte exceeds one.
+    /// Updates the state by one byte. Returns a description of the limit that the byte exceeds, if there is one.
     fn step(&mut self, byte: u8) -> Option<String> {
         if self.is_blank && !byte.is_ascii_whitespace() {
             self.is_blank = false;

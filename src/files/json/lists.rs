@@ -11,30 +11,31 @@ use super::{ParseAbort, read, read_from};
 use crate::error::Result;
 use crate::files::open::open_file;
 
-/// Position of a value in a document.
+/// Position of a list element in a JSON document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct JsonPlace {
-    /// Index of its key in [`ListSelection::keys`]; 0 if the document itself is the list.
+    /// Index in [`ListSelection::keys`] of the key of the list; 0 if the document itself is the list.
     pub(crate) key: usize,
-    /// Index in the list. Restarts at 0 if a key is repeated; the last list counts.
+    /// Index of the element in the list. Restarts at 0 if the key occurs again; the last list counts.
     pub(crate) index: usize,
-    /// Index in the inner list. `None` in two cases: at the end of an inner list, with an empty list as value; or if
-    /// the element is not a list, with the element as value.
+    /// For nested lists, the index of the element in the inner list. `None` in two cases: at the end of an inner list
+    /// (the value is then an empty list), and for an element that is not a list (the value is then this element).
     pub(crate) inner: Option<usize>,
 }
 
-/// Selection of values to read from a document.
+/// Selection of the list elements to read from a JSON document.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ListSelection<'a> {
-    /// Keys of the object under which the lists are; empty if the document itself is the list.
+    /// Keys of the top-level object whose values are the lists; empty if the document itself is the list.
     pub(crate) keys: &'a [&'a str],
-    /// Whether the elements of the lists are lists whose elements are wanted.
+    /// Whether the elements of the lists are lists themselves, whose elements are to be read.
     pub(crate) nested: bool,
-    /// Keys of the elements that are kept.
+    /// Keys that are kept of each element.
     pub(crate) wanted: &'a [&'a str],
 }
 
-/// Calls `each` with the elements of the lists selected by `ask` in the file at `path`.
+/// Calls `each` with the position and value of every element of the lists that `ask` selects in the JSON file at
+/// `path`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -46,7 +47,8 @@ pub(crate) fn each_element(
     each_element_from(open_file(path)?, path, ask, each)
 }
 
-/// Calls `each` with the elements of the lists selected by `ask` in the document in `file`.
+/// Calls `each` with the position and value of every element of the lists that `ask` selects in the JSON document in
+/// `file`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -61,8 +63,8 @@ pub(crate) fn each_element_from(
     read_from(file, path, &stopped, Document(&mut lists))
 }
 
-/// Calls `each` with the entries of the object in the file at `path`, in order; does not call it if the document is not
-/// an object. `wanted`: keys of the values that are kept.
+/// Calls `each` with the key and value of every entry of the JSON object in the file at `path`, in order. Does not call
+/// it if the document is not an object. Of each value only the keys `wanted` are kept.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -75,14 +77,14 @@ pub(crate) fn each_entry(
     read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
 }
 
-/// State of a reading: the selection, the callback and the slot for its error.
+/// Selection of lists, callback for their elements, and place for an error of the callback.
 struct Lists<'a> {
     ask: ListSelection<'a>,
     each: &'a mut dyn FnMut(JsonPlace, SmallValue) -> Result<()>,
     stopped: &'a ParseAbort,
 }
 
-/// Visitor methods that ignore values that were not selected.
+/// Defines the visitor methods for values that were not selected; the methods ignore these values.
 macro_rules! ignore_scalars {
     () => {
         fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -128,7 +130,7 @@ macro_rules! seed_from_visitor {
     };
 }
 
-/// Visitor of a document that holds lists.
+/// Visitor of the whole document, which holds the selected lists.
 struct Document<'a, 'b>(&'a mut Lists<'b>);
 seed_from_visitor!(Document<'_, '_>);
 
@@ -154,7 +156,7 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     }
 }
 
-/// Visitor of a selected list.
+/// Visitor of one of the selected lists.
 struct List<'a, 'b> {
     lists: &'a mut Lists<'b>,
     key: usize,
@@ -184,7 +186,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// Visitor of an element that should be a list itself. Its own value is a description without its elements.
+/// Visitor of a list element that should be a list itself. Its own value is an empty list, without these elements.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,
@@ -245,7 +247,7 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
     }
 }
 
-/// Visitor of an object whose entries are selected.
+/// Visitor of an object; passes its entries to `each`.
 struct Entries<'a> {
     wanted: &'a [&'a str],
     each: &'a mut dyn FnMut(&str, SmallValue) -> Result<()>,

@@ -1,4 +1,4 @@
-//! JSON values of limited size: only the parts that a camera file can need are kept.
+//! JSON values of limited size: only the parts that a camera file can need are kept in memory.
 
 use std::fmt;
 
@@ -6,32 +6,32 @@ use serde::Deserialize;
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
-/// Maximum length in bytes of a string that is kept: no system has longer paths.
+/// Maximum length in bytes of a string that is kept; no system has longer paths.
 const MAX_TEXT: usize = 4096;
 /// Maximum length in bytes of a key that is kept.
 const MAX_KEY: usize = 64;
-/// Maximum number of keys kept of an object, in addition to the wanted ones.
+/// Maximum number of keys that are kept of an object in addition to the wanted keys.
 const MAX_KEYS: usize = 8;
-/// Maximum number of elements kept of a list, unless fewer are asked for.
+/// Maximum number of elements that are kept of a list, unless the caller asks for fewer.
 pub(crate) const MAX_ELEMENTS: usize = 16;
-/// Maximum number of values kept of one entry; a 4 × 4 matrix has 21.
+/// Maximum number of values that are kept of one entry; a 4 × 4 matrix takes 21.
 const MAX_VALUES: usize = 64;
 
-/// JSON value, or the part of it that is kept.
+/// JSON value of which only a part of limited size is kept.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum SmallValue {
     Null,
     Bool(bool),
     Number(Number),
     Text(Box<str>),
-    /// The first elements of a list, and its length.
+    /// First elements of a list, and the number of all its elements.
     List(Vec<SmallValue>, usize),
     Object(Object),
-    /// Value too large for a camera file, replaced by a description for messages.
+    /// Value larger than any in a camera file. It is replaced by a description for messages.
     Large(Box<str>),
 }
 
-/// Entries of a JSON object: the wanted ones, and a few others so that messages can describe the object.
+/// Entries of a JSON object: those with wanted keys, and a few others so that messages can describe the object.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Object {
     entries: Vec<(Box<str>, SmallValue)>,
@@ -39,7 +39,7 @@ pub(crate) struct Object {
 }
 
 impl Object {
-    /// Returns the value under `key`; the last one if the key is repeated.
+    /// Returns the value under `key`, or the last such value if the key is repeated.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
@@ -54,12 +54,12 @@ impl Object {
 }
 
 impl SmallValue {
-    /// Builds an object with one entry.
+    /// Builds a JSON object with the single entry `key`: `value`.
     pub(crate) fn from_entry(key: &str, value: SmallValue) -> SmallValue {
         SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
-    /// Returns the elements of a list if all were kept.
+    /// Returns the elements if this is a list whose elements were all kept.
     pub(crate) fn elements(&self) -> Option<&[SmallValue]> {
         match self {
             SmallValue::List(kept, total) if kept.len() == *total => Some(kept),
@@ -67,7 +67,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns the number as the nearest f64; `None` for other values.
+    /// Returns a number as the nearest f64; `None` for other values.
     pub(crate) fn as_f64(&self) -> Option<f64> {
         match self {
             SmallValue::Number(number) => number.as_f64(),
@@ -75,7 +75,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns a non-negative integer; `None` for other values.
+    /// Returns a non-negative integer as u64; `None` for other values.
     pub(crate) fn as_u64(&self) -> Option<u64> {
         match self {
             SmallValue::Number(number) => number.as_u64(),
@@ -83,7 +83,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns the value under `key` of an object.
+    /// Returns the value under `key` if this is an object with this key.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         match self {
             SmallValue::Object(object) => object.get(key),
@@ -91,7 +91,7 @@ impl SmallValue {
         }
     }
 
-    /// Describes the value for a message.
+    /// Returns a description of the value for messages.
     pub(crate) fn describe(&self) -> String {
         const LONGEST: usize = 120;
         match self {
@@ -114,7 +114,7 @@ impl SmallValue {
         }
     }
 
-    /// Converts the kept part to a JSON value.
+    /// Converts the kept part of the value to a JSON value.
     fn value(&self) -> Value {
         match self {
             SmallValue::Null => Value::Null,
@@ -131,12 +131,12 @@ impl SmallValue {
     }
 }
 
-/// Seed that reads any value as [`SmallValue`].
+/// Seed (builder) that reads any JSON value as [`SmallValue`].
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
-    /// Keys of objects that are always kept.
+    /// Keys that are always kept of an object.
     pub(crate) wanted: &'a [&'a str],
-    /// Maximum number of elements kept of a list.
+    /// Maximum number of elements that are kept of a list.
     pub(crate) elements: usize,
 }
 
@@ -148,16 +148,16 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
     }
 }
 
-/// Seed and visitor of a value within another one.
+/// Seed (builder) and visitor of a value inside an entry.
 struct NestedValue<'a> {
     keep: &'a Keep<'a>,
-    /// Number of values that may still be kept of the entry.
+    /// Number of values of the entry that may still be kept.
     remaining: &'a mut usize,
     depth: usize,
 }
 
 impl<'a> NestedValue<'a> {
-    /// Returns the seed of the next value one level deeper.
+    /// Returns the seed of the next value, which is nested one level deeper.
     fn next_level(&mut self) -> NestedValue<'_> {
         NestedValue { keep: self.keep, remaining: self.remaining, depth: self.depth + 1 }
     }
@@ -239,7 +239,7 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
                 }
                 object.others += 1;
             }
-            // Each entry of the document has a limit of its own, so that a large one cannot crowd out a wanted one.
+            // Give each entry of the document its own limit, so that a large entry cannot displace a wanted one.
             let value = match self.depth {
                 0 => {
                     map.next_value_seed(NestedValue { keep: self.keep, remaining: &mut MAX_VALUES.clone(), depth: 1 })?
@@ -252,7 +252,7 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
     }
 }
 
-/// Seed that reads a key and keeps its first bytes.
+/// Seed (builder) that reads an object key and keeps only its first bytes.
 #[derive(Debug)]
 pub(crate) struct ShortKey;
 
@@ -273,7 +273,7 @@ impl Visitor<'_> for ShortKey {
 
     fn visit_str<E>(self, key: &str) -> Result<String, E> {
         let end = (0..=key.len().min(MAX_KEY)).rev().find(|&end| key.is_char_boundary(end)).unwrap_or(0);
-        // Mark a cut key, so that it does not equal a wanted one.
+        // Append "…" to a key that was cut, so that it does not equal a wanted key.
         Ok(if end < key.len() { format!("{}…", &key[..end]) } else { key.to_owned() })
     }
 }

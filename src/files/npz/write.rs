@@ -1,8 +1,8 @@
-//! Writes a copy of a NumPy `.npz` archive with fewer rows.
+//! Writes a copy of a NumPy `.npz` archive with fewer Gaussians.
 //!
-//! In: an open archive, the axis of Gaussians of each of its arrays, and the rows to keep. Out: an archive with the
-//! same arrays in the same order and types, compressed as before. Memory: the rows of one frame. The output bytes
-//! depend only on the content: entries of the archive are dated 1980-01-01.
+//! Input: an open archive, the axis of each of its arrays that counts Gaussians, and the indices of the Gaussians to
+//! keep. Output: an archive with the same arrays in the same order and types, compressed as before. Memory: the values
+//! of one frame. The output bytes depend only on the content, because all files in the archive are dated 1980-01-01.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -15,26 +15,27 @@ use crate::error::{Error, Result};
 use crate::files::npz::{Npz, NpzArray};
 use crate::files::zip_output::ZipOutput;
 
-/// Size in bytes from which an entry of a zip archive needs 64-bit lengths.
+/// Size in bytes from which a file in a zip archive needs 64-bit lengths.
 const ZIP64_BYTES: usize = 1 << 32;
 
-/// Axis of an array that counts Gaussians.
+/// Axis along which an array counts Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum GaussianAxis {
-    /// No axis: the array is copied unchanged.
+    /// No axis counts Gaussians: the array is copied unchanged.
     None,
-    /// Axis 0.
+    /// Axis 0 counts Gaussians.
     First,
-    /// Axis 1; axis 0 counts frames.
+    /// Axis 1 counts Gaussians, axis 0 counts frames.
     Second,
 }
 
-/// Writes `template` to `path`, keeping only the rows `kept` of its arrays along `axis`. `change` may change the values
-/// of rows: it receives the name of the array, the frame and the values of all kept rows, and returns the indices of
-/// the rows it changed. All other rows keep their bytes.
+/// Writes a copy of `template` to `path` that keeps only the Gaussians `kept`; `axis` returns the axis of an array that
+/// counts Gaussians. `change` may change the values of the kept Gaussians: it receives the name of the array, the frame
+/// and the values at this frame, and returns the indices of the Gaussians that it changed. The values of all others
+/// keep their bytes.
 ///
 /// # Errors
-/// An array cannot be decoded; `change` fails; the file cannot be written.
+/// Fails if an array cannot be decoded, if `change` fails, or if the file cannot be written.
 pub(crate) fn write_like(
     template: &Npz,
     kept: &[u32],
@@ -102,7 +103,8 @@ pub(crate) fn write_like(
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-/// Returns the header of an array in version 1.0 of NumPy's format: a dictionary padded to a multiple of 64 bytes.
+/// Returns the header of a NumPy array file, in version 1.0 of the format: a dictionary padded to a multiple of 64
+/// bytes.
 fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
     let order = if is_fortran { "True" } else { "False" };
     let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();

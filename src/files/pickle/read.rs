@@ -1,4 +1,5 @@
-//! Executes the instructions of a pickle, with limits on their number, on nesting and on memory.
+//! Executes the instructions of a pickle to build its object tree. The number of instructions, the nesting depth and
+//! the memory are limited.
 
 use std::ops::Range;
 
@@ -6,14 +7,15 @@ use hashbrown::HashMap;
 
 use super::{MAX_DEPTH, Node, NodeId, Pickle, Wrong};
 
-/// Maximum number of instructions. One tensor takes about 35, so this is enough for 50,000 tensors.
+/// Maximum number of instructions in a pickle. One tensor takes about 35, so this is enough for 50,000 tensors.
 const MAX_INSTRUCTIONS: u32 = 1 << 21;
-/// Overhead of one heap allocation in bytes, rounded up.
+/// Bytes of memory added for each heap allocation, as an upper bound of the allocator's overhead.
 const ALLOCATION_BYTES: usize = 32;
-/// Memory of one entry of the memo in bytes, including the growth of the table.
+/// Bytes of memory per entry of the memo (table of nodes that the pickle refers to again), including the growth of the
+/// table.
 const MEMO_ENTRY_BYTES: usize = 32;
 
-/// Counter of allocated bytes that refuses allocations beyond the limit before they are made.
+/// Counter of allocated bytes. Refuses an allocation that would exceed the memory limit before it is made.
 #[derive(Debug)]
 struct AllocationCounter {
     limit: u64,
@@ -21,7 +23,7 @@ struct AllocationCounter {
 }
 
 impl AllocationCounter {
-    /// Counts `bytes` that are about to be allocated; `at` is the position in the pickle that requires them.
+    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
@@ -31,8 +33,8 @@ impl AllocationCounter {
         Ok(())
     }
 
-    /// Reserves memory for `more` elements of `list`. Counts the old and the new buffer while one is copied to the
-    /// other.
+    /// Reserves memory for `more` elements of `list`. While the list grows, the old and the new buffer exist together;
+    /// both are counted.
     fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
         let (needed, old) = (list.len() + more, list.capacity());
         if needed > old {
@@ -47,7 +49,7 @@ impl AllocationCounter {
     }
 }
 
-/// Virtual machine that executes a pickle and builds its nodes.
+/// Virtual machine that executes a pickle and builds the nodes of its object tree.
 pub(super) struct PickleMachine<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -55,7 +57,7 @@ pub(super) struct PickleMachine<'a> {
     allocations: AllocationCounter,
     nodes: Vec<Node>,
     /// Nesting depth of each node when it was last changed; 0 for a scalar. If a container grows later, the depths of
-    /// the nodes around it are not updated: code that follows the nodes counts depth itself.
+    /// the nodes that contain it are not updated, so code that follows the nodes must count the depth itself.
     depths: Vec<u8>,
     frames: Vec<Range<usize>>,
     stack: Vec<NodeId>,
@@ -64,7 +66,7 @@ pub(super) struct PickleMachine<'a> {
 }
 
 impl<'a> PickleMachine<'a> {
-    /// Returns a machine at the start of `bytes` that may allocate `memory` bytes.
+    /// Returns a machine that starts at the first instruction in `bytes` and may allocate `memory` bytes.
     pub(super) fn new(bytes: &'a [u8], memory: u64) -> PickleMachine<'a> {
         PickleMachine {
             bytes,
@@ -80,10 +82,10 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Executes all instructions.
+    /// Executes all instructions and returns the object tree.
     ///
     /// # Errors
-    /// The first instruction that is malformed or exceeds a limit.
+    /// Fails at the first instruction that is malformed or exceeds a limit.
     pub(super) fn read(mut self) -> Result<Pickle, Wrong> {
         loop {
             if let Some(root) = self.step()? {
@@ -92,13 +94,13 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Executes one instruction. Returns the root node after the last one.
+    /// Executes the next instruction. Returns the root node of the object tree after the last instruction, else `None`.
     fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
         let start = self.at;
         self.count_instruction(start)?;
         let [instruction] = self.take_bytes()?;
         match instruction {
-            // PROTO and FRAME build nothing.
+            // PROTO and FRAME build no value.
             0x80 => drop(self.take_bytes::<1>()?),
             0x95 => {
                 self.take_bytes::<8>()?;
@@ -156,7 +158,7 @@ impl<'a> PickleMachine<'a> {
                 let depth = self.container_depth([arguments, callee])?;
                 self.push(Node::Called { callee, arguments, items: Vec::new() }, depth)?;
             }
-            // BUILD: attributes of an object are not needed, only its items.
+            // BUILD sets attributes of an object. They are dropped, because only the items of an object are needed.
             b'b' => drop(self.pop()?),
             b'Q' => {
                 let what = self.pop()?;
@@ -185,7 +187,7 @@ impl<'a> PickleMachine<'a> {
         Ok(None)
     }
 
-    /// Counts one instruction, at byte `start`.
+    /// Counts one instruction, which begins at byte `start`. Fails if there are too many.
     fn count_instruction(&mut self, start: usize) -> Result<(), Wrong> {
         self.instructions += 1;
         if self.instructions > MAX_INSTRUCTIONS {
@@ -194,7 +196,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Executes an instruction that pushes a scalar, a text or opaque bytes. Refuses unknown instructions.
+    /// Executes an instruction that pushes a number, a text or other bytes without structure. Refuses unknown
+    /// instructions.
     fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
         match instruction {
             b'N' => self.push(Node::None, 0)?,
@@ -229,7 +232,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node and pushes it onto the stack.
+    /// Adds a node to the object tree and pushes it onto the stack.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
         self.allocations.reserve(&mut self.nodes, 1, self.at)?;
         self.allocations.reserve(&mut self.depths, 1, self.at)?;
@@ -240,19 +243,19 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node and inserts it into the stack at `place`.
+    /// Adds a node to the object tree and inserts it into the stack at index `place`.
     fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
         self.push(node, 1)?;
         self.stack[place..].rotate_right(1);
         Ok(())
     }
 
-    /// Pushes a number, with the position of its instruction that began at `start`.
+    /// Pushes an integer, with the byte range of its instruction, which began at `start`.
     fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
 
-    /// Returns the depth of a container that holds `nodes`.
+    /// Returns the nesting depth of a container that holds `nodes`. Fails if it is too deep.
     fn container_depth(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
         let deepest = nodes.into_iter().map(|id| self.depths[id as usize]).max().unwrap_or(0);
         match deepest < MAX_DEPTH {
@@ -261,12 +264,12 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the error for too many nested containers.
+    /// Returns the error for containers that are nested too deep.
     fn too_deep(&self) -> Wrong {
         Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
-    /// Begins a container: marks the top of the stack.
+    /// Begins a container by recording the present height of the stack.
     fn mark(&mut self, start: usize) -> Result<(), Wrong> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
@@ -276,17 +279,18 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Returns the start of the part of the stack that belongs to the innermost open container.
+    /// Returns the stack index at which the innermost open container begins.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
 
-    /// Returns the error for an instruction that needs more values than the stack has.
+    /// Returns the error for an instruction that needs more values than are on the stack.
     fn missing(&self) -> Wrong {
         Wrong::at(self.at, "a value that was never given")
     }
 
-    /// Removes and returns the top of the stack.
+    /// Removes the top value of the stack and returns it. Fails if the innermost open container has no value on the
+    /// stack.
     fn pop(&mut self) -> Result<NodeId, Wrong> {
         match self.stack.len() > self.floor() {
             true => Ok(self.stack.pop().expect("there is one")),
@@ -294,18 +298,18 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the place on the stack of the last `count` values, which must have another value below them.
+    /// Returns the stack index of the first of the last `count` values. Fails unless there is another value below them.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
 
-    /// Ends the innermost open container and returns the place on the stack of its first element.
+    /// Ends the innermost open container. Returns the stack index of its first element.
     fn unmark(&mut self) -> Result<usize, Wrong> {
         let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of a container that was never begun"))?;
         Ok(mark.min(self.stack.len()))
     }
 
-    /// Replaces the values from `first` on by one container that holds them.
+    /// Replaces the values from stack index `first` on by one container that holds them.
     fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
@@ -318,8 +322,8 @@ impl<'a> PickleMachine<'a> {
         self.push(make(elements), depth)
     }
 
-    /// Returns the container below `first` on the stack, after raising its depth above that of the values from `first`
-    /// on.
+    /// Returns the container that lies on the stack directly below index `first`. Raises the depth of the container
+    /// above the depths of the values from `first` on.
     fn container(&mut self, first: usize) -> Result<usize, Wrong> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
@@ -328,7 +332,7 @@ impl<'a> PickleMachine<'a> {
         Ok(top)
     }
 
-    /// Adds the values from `first` on to the list below them.
+    /// Removes the values from stack index `first` on and appends them to the list below them.
     fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
@@ -336,14 +340,14 @@ impl<'a> PickleMachine<'a> {
                 self.allocations.reserve(list, self.stack.len() - first, start)?;
                 list.extend(self.stack.drain(first..));
             }
-            // The elements of an object that behaves like a list are not needed.
+            // Drop the elements of an object that behaves like a list, because they are not needed.
             Node::Called { .. } => self.stack.truncate(first),
             _ => return Err(Wrong::at(start, "an element added to a value that is not a list")),
         }
         Ok(())
     }
 
-    /// Adds the keys and values from `first` on to the dict below them.
+    /// Removes the keys and values from stack index `first` on and adds them to the dict below them.
     fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         let (pairs, rest) = self.stack[first..].as_chunks::<2>();
@@ -361,7 +365,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Stores the top of the stack in the memo under `key`.
+    /// Stores the top value of the stack in the memo (table of nodes for later reference) under `key`.
     fn store_in_memo(&mut self, key: u32) -> Result<(), Wrong> {
         let top = self.stack.last().copied().filter(|_| self.stack.len() > self.floor());
         let top = top.ok_or_else(|| self.missing())?;
@@ -370,7 +374,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Pushes the node stored in the memo under `key`.
+    /// Pushes the node that is stored in the memo under `key`.
     fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
         let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;
@@ -379,13 +383,13 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Reads `N` bytes.
+    /// Reads the next `N` bytes of the pickle.
     fn take_bytes<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
         let taken = self.take_slice(N as u64)?;
         Ok(taken.try_into().expect("as many"))
     }
 
-    /// Reads `count` bytes.
+    /// Reads the next `count` bytes of the pickle.
     fn take_slice(&mut self, count: u64) -> Result<&[u8], Wrong> {
         let left = self.bytes.len() - self.at;
         let count = usize::try_from(count).ok().filter(|&count| count <= left);
@@ -394,12 +398,12 @@ impl<'a> PickleMachine<'a> {
         Ok(&self.bytes[self.at - count..self.at])
     }
 
-    /// Reads a whole number whose length in bytes precedes it in `length_bytes` bytes. Numbers that do not fit into
-    /// `i64` become opaque nodes.
+    /// Reads an integer of variable length and pushes it. Its length in bytes is stored before it, in `length_bytes`
+    /// bytes. Integers that do not fit into `i64` become opaque nodes.
     fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let digits = self.take_slice(length)?;
-        // A ninth byte of 0 only keeps the highest bit of the eighth from being taken for a sign.
+        // Ignore a ninth byte of 0, which only keeps the highest bit of the eighth byte from being taken for a sign.
         let digits = match digits {
             [eight @ .., 0] if eight.len() == 8 && eight[7] < 0x80 => eight,
             digits => digits,
@@ -413,14 +417,14 @@ impl<'a> PickleMachine<'a> {
         self.push_int(i64::from_le_bytes(wide), start)
     }
 
-    /// Reads a length stored in `bytes` bytes.
+    /// Reads a length that is stored in `bytes` bytes.
     fn length(&mut self, bytes: usize) -> Result<u64, Wrong> {
         let mut wide = [0; 8];
         wide[..bytes].copy_from_slice(self.take_slice(bytes as u64)?);
         Ok(u64::from_le_bytes(wide))
     }
 
-    /// Reads a text whose length precedes it.
+    /// Reads a text and pushes it. Its length in bytes is stored before it, in `length_bytes` bytes.
     fn text(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let start = self.at;
@@ -431,14 +435,14 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Text(text.into()), 0)
     }
 
-    /// Skips bytes whose length precedes them; they become an opaque node.
+    /// Skips bytes whose length is stored before them, in `length_bytes` bytes, and pushes an opaque node for them.
     fn blob(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         self.take_slice(length)?;
         self.push(Node::Opaque, 0)
     }
 
-    /// GLOBAL: reads module and name as two lines.
+    /// Executes GLOBAL: reads the module and the name of a function or class as two lines and pushes a node.
     fn global(&mut self, start: usize) -> Result<(), Wrong> {
         let (module, name) = (self.line()?, self.line()?);
         self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
@@ -450,8 +454,8 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// STACK_GLOBAL: takes module and name as two texts from the stack. The texts may be shared, so a long text may be
-    /// copied many times; each copy is counted.
+    /// Executes STACK_GLOBAL: replaces two texts on the stack, a module and a name, by a node. A long text may be used
+    /// many times, so each copy of it is counted as memory.
     fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
@@ -462,7 +466,7 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// Reads a line and returns its position without the line end.
+    /// Reads a line. Returns its byte range without the line end.
     fn line(&mut self) -> Result<Range<usize>, Wrong> {
         let start = self.at;
         let end = self.bytes[start..].iter().position(|&byte| byte == b'\n');

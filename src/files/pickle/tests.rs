@@ -24,7 +24,7 @@ fn values_pickled_by_python_are_read() {
 
 #[test]
 fn replaced_numbers_keep_their_positions() {
-    // pickle.dumps((7, "x", 7), 4): with a frame and a memo.
+    // pickle.dumps((7, "x", 7), 4): has a FRAME instruction and a memo (table of values for later reference).
     let bytes = b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00K\x07\x8c\x01x\x94K\x07\x87\x94.";
     let pickle = read(bytes);
     let elements = pickle.elements(pickle.root()).unwrap().to_vec();
@@ -72,7 +72,7 @@ fn nesting_is_limited_for_every_instruction() {
     }
 }
 
-/// Returns pickles of about `size` bytes that would take far more memory than that.
+/// Returns pickles of about `size` bytes that would take far more memory than `size` if they were read without limits.
 fn bombs(size: usize) -> Vec<(&'static str, Vec<u8>)> {
     let long = [&[b'X'][..], &(size as u32 / 2).to_le_bytes(), &b"x".repeat(size / 2)].concat();
     let flood = |piece: &[u8]| piece.repeat(size / piece.len());
@@ -98,7 +98,7 @@ fn memory_is_limited_before_it_is_allocated() {
     for (name, bytes) in bombs(300_000) {
         let memory = 1 << 20;
         match Pickle::read(&bytes, memory) {
-            // The bytes do not end with STOP.
+            // The bytes do not end with the instruction STOP.
             Err(Wrong::Malformed(at, found)) => {
                 assert!(at == bytes.len() && found.contains("end"), "{name}: {found}");
             }

@@ -1,6 +1,7 @@
-//! Converts text bodies to the equivalent binary bodies, so that one reader serves both.
+//! Converts the bodies of text PLY files to the equivalent binary bodies, so that one reader serves both.
 //!
-//! In: header and text. Out: little-endian rows of every element, appended to a scratch file. Memory: one line of text.
+//! Input: a header and the text after it. Output: little-endian rows of every element, appended to a scratch file.
+//! Memory: one line of text.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
@@ -11,44 +12,49 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// Maximum length of a line of text in bytes, not counting [`LINE_BYTES_PER_NUMBER`] for each number of its row.
+/// Maximum length in bytes of a line of a text PLY file. [`LINE_BYTES_PER_NUMBER`] bytes are allowed in addition for
+/// each number of the row.
 const LINE_BYTES: u64 = 1 << 20;
-/// Maximum number of bytes per number: the longest usual form of an f64 has 24 characters.
+/// Maximum number of bytes that a number in a text PLY file may take: the longest usual form of an f64 has 24
+/// characters.
 const LINE_BYTES_PER_NUMBER: u64 = 64;
 
-/// Anonymous scratch file for the binary rows of any number of text files; created when the first text file is read.
+/// Unnamed scratch file that holds the rows of any number of text PLY files in binary form. Created when the first text
+/// file is read.
 #[derive(Debug)]
 pub(crate) struct TextStore {
     folder: PathBuf,
     file: Mutex<Option<Arc<File>>>,
 }
 
-/// Binary rows of a text file.
+/// Rows of a text PLY file, converted to binary form.
 #[derive(Debug, Clone)]
 pub(crate) struct TextRows {
     pub(super) file: Arc<File>,
-    /// Range of the rows in the scratch file.
+    /// Byte range of the rows in the scratch file.
     pub(super) range: Range<u64>,
 }
 
 impl TextStore {
-    /// Returns a store whose scratch file will be in `folder`.
+    /// Returns a store that will create its scratch file in `folder`.
     pub(crate) fn new(folder: &Path) -> TextStore {
         TextStore { folder: folder.to_owned(), file: Mutex::new(None) }
     }
 
-    /// Converts the body of the text file `text`, read from `path`, whose header is `header`. There is one row per
-    /// line. Blank lines are skipped; text after the last row is ignored.
+    /// Converts the body of the text PLY file `text`, opened from `path`, to binary rows in the scratch file, and
+    /// returns where they are. `header` is the header of the file. There is one row per line. Blank lines are skipped;
+    /// text after the last row is ignored.
     ///
     /// # Errors
-    /// Too few rows, a row with too few or too many numbers, a word that is not a number of its type, a line far longer
-    /// than its numbers require; each error names the line. The scratch file cannot be written.
+    /// Fails, naming the line, if there are too few rows, if a row has too few or too many numbers, if a word is not a
+    /// number of its type, or if a line is far longer than its numbers require. Also fails if the scratch file cannot
+    /// be written.
     pub(super) fn convert(&self, path: &Path, header: &PlyHeader, mut text: File) -> Result<TextRows> {
         let failed = |action| Error::io(action, path);
         let whole = text.metadata().map_err(failed("read the size of"))?.len();
         check_counts(path, header, whole.saturating_sub(header.text.len() as u64))?;
         text.seek(SeekFrom::Start(header.text.len() as u64)).map_err(failed("read"))?;
-        // Locked until all rows are written, so that they are contiguous.
+        // Keep the scratch file locked until all rows are written, so that the rows of one file are contiguous.
         let mut slot = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = |action| Error::io(action, &self.folder);
         let file = match &*slot {
@@ -74,7 +80,8 @@ impl TextStore {
     }
 }
 
-/// Checks that `available` bytes of text can hold the declared rows: a number takes at least a digit and a separator.
+/// Checks that `available` bytes of text can hold the rows that the header declares: a number takes at least a digit
+/// and a separator.
 fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     for element in &header.elements {
         let least = element.count.checked_mul(2 * element.properties.len() as u64);
@@ -87,17 +94,18 @@ fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     Ok(())
 }
 
-/// Reader of the lines of a text body.
+/// Reader of the lines after the header of a text PLY file.
 struct AsciiLines<'a> {
     path: &'a Path,
     text: BufReader<File>,
-    /// Number of the last line read, counted from 1.
+    /// Number of the line read last, counted from 1.
     number: usize,
     line: Vec<u8>,
 }
 
 impl AsciiLines<'_> {
-    /// Reads row `row` of `element` from the next line that is not blank, and appends its numbers to `out`.
+    /// Reads row `row` of `element` from the next line that is not blank, and appends its numbers in binary form to
+    /// `out`.
     fn read_row(&mut self, element: &Element, row: u64, out: &mut Vec<u8>) -> Result<()> {
         let numbers = element.properties.len();
         if !self.read_line(numbers)? {
@@ -119,7 +127,8 @@ impl AsciiLines<'_> {
         Ok(())
     }
 
-    /// Reads the next line that is not blank. Returns false at the end of the file.
+    /// Reads the next line that is not blank, which should hold `numbers` numbers. Returns false at the end of the
+    /// file.
     fn read_line(&mut self, numbers: usize) -> Result<bool> {
         let most = LINE_BYTES + LINE_BYTES_PER_NUMBER * numbers as u64;
         loop {
@@ -142,19 +151,20 @@ impl AsciiLines<'_> {
     }
 }
 
-/// Returns the name of an element as a place in messages.
+/// Returns the text that names `element` as a place in error messages.
 fn place(element: &Element) -> String {
     format!("element {}", element.name)
 }
 
-/// Returns the error for a word that is not a number of the type of its property.
+/// Returns the error for `word` in a text PLY file, which is not a number of the type of `property`.
 fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Error {
     let expected = format!("a number of type {} for property {}", property.scalar.name(), quoted(&property.name));
     let word = String::from_utf8_lossy(&word[..word.len().min(60)]);
     Error::input(path, format!("line {line}"), expected, quoted(&word))
 }
 
-/// Appends the number written as `word` in binary; returns `None` if it is not a number of that type.
+/// Converts the number `word` to binary form, in the type `scalar`, and appends it to `out`. Returns `None` if `word`
+/// is not such a number.
 fn push_number(out: &mut Vec<u8>, word: &[u8], scalar: Scalar) -> Option<()> {
     let word = std::str::from_utf8(word).ok()?;
     match scalar {

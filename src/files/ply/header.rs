@@ -1,6 +1,6 @@
 //! Parses the header of a PLY file: encoding, elements, properties, comments.
 //!
-//! In: the bytes of a file. Out: [`PlyHeader`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
+//! Input: the bytes of a file. Output: [`PlyHeader`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
 
 use std::path::Path;
 
@@ -8,10 +8,11 @@ use hashbrown::HashSet;
 
 use crate::error::{Error, Result, quoted};
 
-/// Maximum length of a header in bytes: enough for about 50,000 properties. Gaussian models have 60 to a few hundred.
+/// Maximum length of a header in bytes: enough for about 50,000 properties. Gaussian models have 60 to a few hundred
+/// properties.
 const MAX_HEADER_BYTES: usize = 1 << 20;
 
-/// Encoding of the numbers in the body.
+/// Encoding of the numbers after the header of a PLY file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PlyEncoding {
     /// Text, one row per line.
@@ -23,7 +24,7 @@ pub enum PlyEncoding {
 }
 
 impl PlyEncoding {
-    /// Returns the encoding that a `format` line calls `name`.
+    /// Returns the encoding that the `format` line of a header calls `name`.
     fn parse(name: &str) -> Option<PlyEncoding> {
         match name {
             "ascii" => Some(PlyEncoding::Ascii),
@@ -34,7 +35,7 @@ impl PlyEncoding {
     }
 }
 
-/// Number type of a property.
+/// Number type of a PLY property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum Scalar {
@@ -49,7 +50,7 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// Returns the type that a header calls `name`, in the old or the sized spelling.
+    /// Returns the type that a header calls `name`, in the old (`float`) or the sized (`float32`) spelling.
     fn parse(name: &str) -> Option<Scalar> {
         Some(match name {
             "char" | "int8" => Scalar::I8,
@@ -64,7 +65,7 @@ impl Scalar {
         })
     }
 
-    /// Returns the name in the old spelling.
+    /// Returns the name of the type in the old spelling, such as `float`.
     pub fn name(self) -> &'static str {
         match self {
             Scalar::I8 => "char",
@@ -78,7 +79,7 @@ impl Scalar {
         }
     }
 
-    /// Returns the number of bytes of one value in a binary body.
+    /// Returns the number of bytes of one value in a binary file.
     pub fn bytes(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
@@ -89,18 +90,18 @@ impl Scalar {
     }
 }
 
-/// Property of an element: one column of its table.
+/// Property of a PLY element: one column of the element's table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
-    /// Name in the header.
+    /// Name of the property in the header.
     pub name: String,
-    /// Number type.
+    /// Number type of the values.
     pub scalar: Scalar,
-    /// Offset in a binary row, in bytes.
+    /// Offset in bytes of the value in a binary row.
     pub offset: usize,
 }
 
-/// Element of the file: a table of `count` rows.
+/// Element of a PLY file: a table of `count` rows. Each row has one value per property.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Element {
     pub(crate) name: String,
@@ -110,25 +111,26 @@ pub(crate) struct Element {
     pub(crate) stride: usize,
 }
 
-/// Parsed header. All elements have rows of fixed size.
+/// Parsed header of a PLY file. The rows of every element have a fixed size.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct PlyHeader {
     pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
-    /// Texts of the `comment` lines, in order.
+    /// Texts of the `comment` lines of the header, in order.
     pub(crate) comments: Vec<String>,
-    /// Bytes of the header, through the line end of `end_header`.
+    /// Bytes of the header, up to and including the line end of `end_header`.
     pub(crate) text: Vec<u8>,
     /// Number of lines of the header.
     pub(crate) lines: usize,
 }
 
 impl PlyHeader {
-    /// Parses the header at the start of `bytes`, the content of `path`. Lines may end in LF or CRLF.
+    /// Parses the header at the start of `bytes`, the content of the file at `path`. Lines may end in LF or CRLF.
     ///
     /// # Errors
-    /// Not a PLY; a header without `end_header` or of more than 1 MiB; an invalid line, type or count; a list property
-    /// (its rows have no fixed size); a name used twice. Each error names the line.
+    /// Fails if the file is not a PLY, if the header has no `end_header` or more than 1 MiB, if a line, type or count
+    /// is invalid, if there is a list property (its rows have no fixed size), or if a name is used twice. The error
+    /// names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<PlyHeader> {
         let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MAX_HEADER_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
@@ -220,8 +222,9 @@ impl PlyHeader {
         Err(missing_end(path, length))
     }
 
-    /// Returns the header text for `count` vertices. `name` returns the new name of a property, or `None` to remove it.
-    /// Everything else stays the same, except that a text format becomes little-endian binary.
+    /// Returns the bytes of this header changed to `count` Gaussians. `name` receives the name of a property and
+    /// returns its new name, or `None` to remove it. Everything else stays the same, except that a text format becomes
+    /// little-endian binary.
     pub(crate) fn text_for(&self, count: usize, name: impl Fn(&str) -> Option<String>) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.text.len() + 16);
         let mut in_vertex = false;
@@ -252,7 +255,7 @@ impl PlyHeader {
         out
     }
 
-    /// Returns the element that holds the Gaussians.
+    /// Returns the element `vertex`, which holds the Gaussians.
     pub(crate) fn vertex(&self) -> Option<&Element> {
         self.elements.iter().find(|element| element.name == "vertex")
     }
@@ -269,17 +272,18 @@ fn missing_end(path: &Path, length: usize) -> Error {
     Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again")
 }
 
-/// Returns word `at` of a header line; empty if there are fewer words.
+/// Returns the word with index `at` of a header line; empty if there are fewer words.
 fn word(line: &[u8], at: usize) -> &[u8] {
     excerpt(line).split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).nth(at).unwrap_or_default()
 }
 
-/// Returns the first bytes of a line, enough for any keyword with its arguments. Binary data may have no line ends.
+/// Returns the first bytes of a line, enough for any keyword with its arguments. A line of binary data may be very
+/// long.
 fn excerpt(line: &[u8]) -> &[u8] {
     &line[..line.len().min(1024)]
 }
 
-/// Returns a line as quoted in messages.
+/// Returns a header line as it is quoted in messages.
 fn found(line: &[u8]) -> String {
     let line = line.trim_ascii();
     match line.len() {

@@ -1,6 +1,7 @@
-//! Location of each plane of a Gaussian in a PLY row.
+//! Location of each plane (one component of an attribute, such as the x of the position) in the row of a Gaussian in a
+//! PLY file.
 //!
-//! In: the properties of element `vertex`. Out: [`PlyLayout`].
+//! Input: the properties of the element `vertex`. Output: [`PlyLayout`].
 
 use std::path::Path;
 
@@ -8,21 +9,22 @@ use super::header::{Element, Property};
 use crate::error::{Error, Result};
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 
-/// Natural log of the thickness given to a surfel (2DGS, no `scale_2`), relative to its smaller axis: a thousandth.
-/// Relative, so that results do not depend on the unit of the scene; thin enough to vanish under the rasterizer's 0.3
-/// px² dilation, thick enough to give a valid f32 covariance.
+/// Natural log of the ratio between the thickness given to a surfel and its smaller axis: a thousandth. (A surfel is a
+/// flat Gaussian of 2DGS, without `scale_2`.) The thickness is relative, so that results do not depend on the unit of
+/// the scene. It is thin enough to vanish under the rasterizer's dilation of 0.3 px², and thick enough to give a valid
+/// f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
-/// Source of one plane.
+/// Source of the values of one plane (component of an attribute, such as the x of the position).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum PlaneSource {
-    /// Property of the row.
+    /// Property of the row that holds the value.
     Property(Property),
-    /// Missing third scale of a surfel: min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
+    /// No property: the missing third log scale of a surfel is min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
     Thin,
 }
 
-/// Sources of the planes of every attribute, in the order of [`Gaussians`](crate::model::Gaussians).
+/// Sources of the planes (components) of every attribute, in the order of [`Gaussians`](crate::model::Gaussians).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
     pub(crate) sh_degree: usize,
@@ -30,10 +32,10 @@ pub(crate) struct PlyLayout {
 }
 
 impl PlyLayout {
-    /// Finds the planes among the properties of `vertex`; any others are ignored.
+    /// Finds the source of each plane among the properties of `vertex`. Other properties are ignored.
     ///
     /// # Errors
-    /// A missing property, or a number of `f_rest_*` properties that belongs to no SH degree.
+    /// Fails if a property is missing, or if the number of properties `f_rest_*` belongs to no SH degree.
     pub(crate) fn from_element(path: &Path, vertex: &Element) -> Result<PlyLayout> {
         let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
         let need = |name: &str| match find(name) {
@@ -54,7 +56,8 @@ impl PlyLayout {
             let expected = "0, 9, 24 or 45 properties f_rest_* (degree 0 to 3)";
             return Err(Error::input(path, "element vertex", expected, rest.to_string()));
         };
-        // The file stores all of red, then green, then blue; a plane has index 3 · coefficient + channel.
+        // The file stores the SH coefficients of red, then those of green, then those of blue. A plane has the index 3
+        // · coefficient + channel.
         let per_channel = rest / 3;
         for coefficient in 0..per_channel {
             for channel in 0..3 {
@@ -64,26 +67,26 @@ impl PlyLayout {
         Ok(PlyLayout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
     }
 
-    /// Returns the planes of a single attribute.
+    /// Returns the sources of the planes (components) of the attribute `column`.
     pub(crate) fn planes(&self, column: Attributes) -> &[PlaneSource] {
         let index = Attributes::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
     }
 }
 
-/// Returns the name of a property after the SH degree has been reduced from `from` to `to`; `None` if the property is
-/// removed.
+/// Returns the new name of the property `name` when the SH degree is reduced from `from` to `to`; `None` if the
+/// property is removed.
 pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<String> {
     let [old_count, new_count] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
     let Some(number) = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) else {
         return Some(name.to_owned());
     };
-    // `max(1)`: only a header with SH coefficients above degree 0 has such a name.
+    // Avoid a division by zero: only a header with SH coefficients above degree 0 has such a name.
     let (channel, coefficient) = (number / old_count.max(1), number % old_count.max(1));
     (coefficient < new_count).then(|| format!("f_rest_{}", channel * new_count + coefficient))
 }
 
-/// Returns the error for a missing property, with a hint about the kind of file.
+/// Returns the error for the missing property `name`, with a hint about the kind of file.
 fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
     let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();

@@ -1,12 +1,12 @@
 //! Reads Gaussians from a PLY file in the INRIA layout and its variants.
 //!
-//! In: a path. Out: planes of f32 for any list of Gaussians, and the stored rows for writers that copy them. Memory: 2
-//! MiB of a memory map of the file, or of a scratch file with the binary rows of a text file. Source: 3D Gaussian
-//! Splatting (Kerbl et al., 2023), `save_ply` of its public code.
+//! Input: a path. Output: the attributes of any Gaussians as f32, and the stored rows (one per Gaussian) for writers
+//! that copy them. Memory: 2 MiB of the mapped file; a text file is first converted to a scratch file, which is mapped
+//! instead. Source: 3D Gaussian Splatting (Kerbl et al., 2023), `save_ply` of its public code.
 //!
-//! Accepted: binary of either byte order and text; any number type per property; properties in any order, extra
+//! Accepted: text, and binary of either byte order; any number type per property; properties in any order, extra
 //! properties, no normals; comments; LF or CRLF; extra elements before or after `vertex`; no `scale_2` (2DGS, see
-//! [`THIN_LOG_SCALE`]); bytes after the last element. NaN values are accepted here.
+//! [`THIN_LOG_SCALE`]); bytes after the last element. This reader does not refuse NaN values.
 
 mod ascii;
 mod header;
@@ -34,19 +34,20 @@ use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::progress::Events;
 use crate::source::Ids;
 
-/// Maximum number of rows read together, so that all their planes are read from the cache: 32 KiB at degree 3.
+/// Maximum number of rows (Gaussians) read together. At SH degree 3 they take 32 KiB, so that all components are read
+/// from the processor's cache.
 const BLOCK_ROWS: usize = 128;
-/// Maximum number of bytes of rows read together.
+/// Maximum number of bytes of the rows that are read together.
 const BLOCK_BYTES: usize = 1 << 20;
 
 /// Options for reading PLY files.
 #[derive(Debug, Clone)]
 pub struct PlyOptions {
-    /// Folder for the scratch file that holds the rows of text files while they are open.
+    /// Folder for the scratch file, which holds the converted rows of text files as long as these are open.
     pub scratch: PathBuf,
-    /// Maximum memory for reading a whole file.
+    /// Maximum memory in bytes for reading a whole file.
     pub memory: ReadLimit,
-    /// Receiver of the progress of linking frames.
+    /// Receiver of progress events while frames are linked.
     pub events: Events,
 }
 
@@ -56,11 +57,11 @@ impl Default for PlyOptions {
     }
 }
 
-/// Parses the header at the start of `bytes`, the content of `path`, and returns the number of Gaussians it declares.
-/// Does not check the rows after it.
+/// Parses the header at the start of `bytes`, the content of the file at `path`, and returns the number of Gaussians
+/// that it declares. Does not check the rows after the header.
 ///
 /// # Errors
-/// The errors of [`Ply::open_with`] that depend only on the header.
+/// Fails like [`Ply::open_with`], as far as the errors depend only on the header.
 pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
     let header = PlyHeader::parse(path, bytes)?;
     let vertex = vertex_element(&header, path)?;
@@ -77,66 +78,67 @@ pub struct Ply {
     stride: usize,
     properties: Vec<Property>,
     body: PlyBody,
-    /// Range of the rows of `vertex` in the body.
+    /// Byte range of the rows of the element `vertex` in the body.
     rows: Range<usize>,
     count: usize,
     memory: ReadLimit,
 }
 
-/// Tables of a file, after its header.
+/// Body of a PLY file: the tables of all elements, after the header.
 #[derive(Debug)]
 struct PlyBody {
-    /// Memory map of the whole file, or of the converted rows of a text file.
+    /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
-    /// Offset of the tables in the map.
+    /// Offset in bytes of the tables in the map.
     start: usize,
-    /// Length of a text file in bytes, and its converted rows; `None` for a binary file.
+    /// For a text file, its length in bytes and its converted rows; `None` for a binary file.
     text: Option<(u64, TextRows)>,
 }
 
 impl PlyBody {
-    /// Returns the bytes of the body.
+    /// Returns the bytes of the body in binary form.
     fn bytes(&self) -> &[u8] {
         &self.map[self.start..]
     }
 
-    /// Converts a range of the body to a range of the map.
+    /// Converts a byte range of the body to a byte range of the memory map.
     fn range(&self, range: Range<usize>) -> Range<usize> {
         self.start + range.start..self.start + range.end
     }
 }
 
 impl Ply {
-    /// Opens the file at `path` and checks its header against its size. Converted rows of a text file are kept in the
-    /// system's folder for temporary files.
+    /// Opens the PLY file at `path` and checks that the file is as long as its header declares. Converted rows of a
+    /// text file are kept in the system's folder for temporary files.
     ///
     /// # Errors
-    /// The errors of [`Ply::open_with`].
+    /// Fails like [`Ply::open_with`].
     pub fn open(path: &Path) -> Result<Ply> {
         Self::open_with(path, &PlyOptions::default())
     }
 
-    /// Opens the file at `path` and checks its header against its size.
+    /// Opens the PLY file at `path` and checks that the file is as long as its header declares.
     ///
     /// # Errors
-    /// Not a PLY; a malformed header; a missing property; a list property; a number of `f_rest_*` that belongs to no SH
-    /// degree; more than `u32::MAX` Gaussians; fewer bytes than the header declares; in a text file, a row that cannot
-    /// be read.
+    /// Fails if the file is not a PLY, if its header is malformed, lacks a property or has a list property, if the
+    /// number of `f_rest_*` belongs to no SH degree, if there are more than `u32::MAX` Gaussians or fewer bytes than
+    /// the header declares, or if a row of a text file cannot be read.
     pub fn open_with(path: &Path, options: &PlyOptions) -> Result<Ply> {
         Self::open_into(path, options.memory, &TextStore::new(&options.scratch))
     }
 
-    /// Opens the file at `path`; converted rows of a text file are written to `texts`.
+    /// Opens the PLY file at `path`. The converted rows of a text file are added to the scratch file `texts`.
     pub(crate) fn open_into(path: &Path, memory: ReadLimit, texts: &TextStore) -> Result<Ply> {
         Self::with_text_rows(path, memory, |header| texts.convert(path, header, open_file(path)?))
     }
 
-    /// Opens the file at `path` again. `text` holds its converted rows if it is a text file.
+    /// Opens the PLY file at `path` again. If it is a text file, `text` holds the rows converted when it was first
+    /// opened.
     pub(crate) fn open_again(path: &Path, memory: ReadLimit, text: Option<&TextRows>) -> Result<Ply> {
         Self::with_text_rows(path, memory, |_| text.cloned().ok_or_else(|| encoding_changed(path)))
     }
 
-    /// Opens the file at `path`; `convert` provides the converted rows if it is a text file.
+    /// Opens the PLY file at `path`. If it is a text file, `convert` returns its converted rows.
     fn with_text_rows(
         path: &Path,
         memory: ReadLimit,
@@ -162,7 +164,7 @@ impl Ply {
         Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count, memory })
     }
 
-    /// Returns the converted rows of a text file, for [`Ply::open_again`]; `None` for a binary file.
+    /// Returns the converted rows of a text file, to be passed to [`Ply::open_again`]; `None` for a binary file.
     pub(crate) fn text_rows(&self) -> Option<&TextRows> {
         self.body.text.as_ref().map(|(_, rows)| rows)
     }
@@ -170,7 +172,7 @@ impl Ply {
     /// Reads all attributes of all Gaussians.
     ///
     /// # Errors
-    /// The memory limit is exceeded; the file was truncated since it was opened.
+    /// Fails if the memory limit for reading would be exceeded, or if the file was truncated since it was opened.
     pub(crate) fn whole(&self) -> Result<Gaussians> {
         let bytes = 4 * Attributes::all().width(self.sh_degree()) as u64 * self.count as u64;
         self.memory.check(&self.path, "element vertex", "the Gaussians of the file", bytes)?;
@@ -194,17 +196,17 @@ impl Ply {
         self.layout.sh_degree
     }
 
-    /// Returns the texts of the `comment` lines, in order.
+    /// Returns the texts of the `comment` lines of the header, in order.
     pub fn comments(&self) -> &[String] {
         &self.header.comments
     }
 
-    /// Returns the properties of the row of a Gaussian, in file order.
+    /// Returns the properties of a row (Gaussian), in file order.
     pub fn properties(&self) -> &[Property] {
         &self.properties
     }
 
-    /// Writes the attributes `want` of the Gaussians `range` into `out`, as [`Ply::gather`] does.
+    /// Writes the attributes `want` of the Gaussians with indices `range` into `out`, as [`Ply::gather`] does.
     pub fn gaussians(&self, range: Range<usize>, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.gather(&Ids::Range(range), want, out)
     }
@@ -213,7 +215,7 @@ impl Ply {
     /// number. f32 values keep their bits; values of other types are rounded to the nearest f32.
     ///
     /// # Errors
-    /// An id beyond the last Gaussian; a file truncated since it was opened.
+    /// Fails if an id is beyond the last Gaussian, or if the file was truncated since it was opened.
     pub fn gather(&self, ids: &Ids<'_>, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.check_unshrunk()?;
         check_ids(&self.path, ids, self.count)?;
@@ -228,7 +230,7 @@ impl Ply {
         let big_endian = self.header.encoding == PlyEncoding::BigEndian;
         let mut starts = Vec::with_capacity(BLOCK_ROWS);
         let mut ids_left = ids.iter();
-        // If rows have thousands of properties, fewer are read together, so that few of their pages are resident.
+        // Read fewer rows together if each has thousands of properties, so that few of their pages are in memory.
         let together = (BLOCK_BYTES / self.stride.max(1)).clamp(1, BLOCK_ROWS);
         for first in (0..ids.len()).step_by(together) {
             starts.clear();
@@ -254,10 +256,11 @@ impl Ply {
         Ok(())
     }
 
-    /// Returns the property `name` of all Gaussians, rounded to the nearest f32; `None` if there is no such property.
+    /// Returns the values of the property `name` for all Gaussians, rounded to the nearest f32; `None` if there is no
+    /// such property.
     ///
     /// # Errors
-    /// The file was truncated since it was opened.
+    /// Fails if the file was truncated since it was opened.
     pub(crate) fn values(&self, name: &str) -> Result<Option<Vec<f32>>> {
         self.check_unshrunk()?;
         let Some(property) = self.properties.iter().find(|property| property.name == name) else { return Ok(None) };
@@ -272,7 +275,8 @@ impl Ply {
         Ok(Some(values))
     }
 
-    /// Returns the number of bytes of the file that must be read for `rows` Gaussians: all bytes of a text file.
+    /// Returns the number of bytes of the file that must be read for `rows` Gaussians. For a text file, this is the
+    /// whole file.
     pub(crate) fn bytes_read_for(&self, rows: usize) -> u64 {
         match &self.body.text {
             None => (rows * self.stride) as u64,
@@ -280,49 +284,50 @@ impl Ply {
         }
     }
 
-    /// Returns the header, for writers.
+    /// Returns the parsed header, for writers that copy it.
     pub(crate) fn header(&self) -> &PlyHeader {
         &self.header
     }
 
-    /// Returns the layout of a row, for writers.
+    /// Returns the layout of a row, for writers that change attributes in it.
     pub(crate) fn layout(&self) -> &PlyLayout {
         &self.layout
     }
 
-    /// Returns the bytes of Gaussian `i` in a binary body.
+    /// Returns the bytes of the row of Gaussian `i` in binary form.
     pub(crate) fn row(&self, i: usize) -> &[u8] {
         self.touch(&[i * self.stride]);
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// Returns the number of bytes in a binary body before and after the rows of `vertex`.
+    /// Returns how many bytes of the binary body lie before and after the rows of `vertex`.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
         [self.rows.start, self.body.bytes().len() - self.rows.end]
     }
 
-    /// Writes the bytes of a binary body before the rows of `vertex`.
+    /// Writes the bytes of the binary body that lie before the rows of `vertex` to `out`.
     pub(crate) fn write_lead(&self, out: &mut dyn Write) -> io::Result<()> {
         self.body.map.pieces(self.body.range(0..self.rows.start), |piece| out.write_all(piece))
     }
 
-    /// Writes the bytes of a binary body after the rows of `vertex`.
+    /// Writes the bytes of the binary body that lie after the rows of `vertex` to `out`.
     pub(crate) fn write_tail(&self, out: &mut dyn Write) -> io::Result<()> {
         let end = self.body.bytes().len();
         self.body.map.pieces(self.body.range(self.rows.end..end), |piece| out.write_all(piece))
     }
 
-    /// Returns the maximum memory for reading the whole file.
+    /// Returns the maximum memory in bytes for reading the whole file.
     pub(crate) fn memory(&self) -> ReadLimit {
         self.memory
     }
 
-    /// Checks that the mapped file has not been truncated.
+    /// Checks that the mapped file has not been truncated since it was opened.
     pub(crate) fn check_unshrunk(&self) -> Result<()> {
         self.body.map.check()
     }
 
-    /// Records that the rows that begin at `starts` are about to be read.
+    /// Records that the rows at the byte offsets `starts` are about to be read, so that their pages can be released
+    /// later.
     fn touch(&self, starts: &[usize]) {
         let first = self.body.start + self.rows.start;
         for run in starts.chunk_by(|a, b| a + self.stride == *b) {
@@ -332,18 +337,18 @@ impl Ply {
     }
 }
 
-/// Returns the element that holds the Gaussians.
+/// Returns the element `vertex`, which holds the Gaussians. Fails if there is none.
 fn vertex_element<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
     header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
 }
 
-/// Returns the error for a file that was binary when it was first opened.
+/// Returns the error for a file that was binary when it was first opened and is a text file now.
 fn encoding_changed(path: &Path) -> Error {
     Error::input(path, "header", "a binary body, as before", "a text body")
         .hint("the file has changed since it was opened")
 }
 
-/// Checks that every id is below `count`.
+/// Checks that every index in `ids` is below the number of Gaussians `count`.
 pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> {
     let beyond = match ids {
         Ids::Range(range) => (range.end > count && !range.is_empty()).then(|| range.end - 1),
@@ -357,7 +362,7 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Returns the range of the rows of `vertex` in a binary body of `available` bytes.
+/// Returns the byte range of the rows of `vertex` in a binary body of `available` bytes.
 fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Range<usize>> {
     let mut end = 0u64;
     let mut rows = 0..0;
@@ -373,14 +378,14 @@ fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Rang
         };
         end = next;
         if element.name == "vertex" {
-            // Both fit into usize because they are at most `available`.
+            // Both values fit into usize, because they are at most `available`.
             rows = start as usize..next as usize;
         }
     }
     Ok(rows)
 }
 
-/// Reads one property of the rows that start at `starts`.
+/// Reads the values of one property into `out`, from the rows at the byte offsets `starts` in `rows`.
 pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
     let at = property.offset;
     match (property.scalar, big_endian) {
@@ -401,7 +406,7 @@ pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big
     }
 }
 
-/// Converts the `W` bytes at `offset` of each row.
+/// Converts, for each row, the `W` bytes at `offset` in the row to f32 and writes the results to `out`.
 fn fill<const W: usize>(
     rows: &[u8],
     starts: &[usize],

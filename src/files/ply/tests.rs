@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Returns the properties of a degree-1 model without normals, with one extra property among them.
+/// Returns the property names of a model of SH degree 1 without normals. One extra property is among them.
 pub(crate) fn names() -> Vec<String> {
     let mut names: Vec<String> = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();
     names.extend((0..9).map(|k| format!("f_rest_{k}")));
@@ -15,7 +15,8 @@ pub(crate) fn names() -> Vec<String> {
     names
 }
 
-/// Returns the value of property `p` of Gaussian `i` in these tests: exact in every number type but the 8-bit ones.
+/// Returns the value of property number `p` of Gaussian `i` in these tests. It is exact in every number type except the
+/// 8-bit ones.
 fn value(i: usize, p: usize) -> i16 {
     (100 * i + p) as i16 - 50
 }
@@ -26,7 +27,7 @@ fn header(format: &str, kind: &str, names: &[String], count: &str, line_end: &st
     (text + "end_header\n").replace('\n', line_end)
 }
 
-/// Returns a file of `count` Gaussians whose properties all have the type `kind`.
+/// Returns the bytes of a PLY file of `count` Gaussians whose properties all have the type `kind`.
 pub(crate) fn file(format: &str, kind: &str, names: &[String], count: usize, line_end: &str) -> Vec<u8> {
     let mut bytes = header(format, kind, names, &count.to_string(), line_end).into_bytes();
     for i in 0..count {
@@ -59,7 +60,7 @@ fn float_file(count: usize) -> Vec<u8> {
     file("binary_little_endian", "float", &names(), count, "\n")
 }
 
-/// Opens `bytes` as a file.
+/// Writes `bytes` to a file and opens it as a PLY.
 fn open(bytes: &[u8]) -> Result<Ply> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
@@ -79,7 +80,8 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// Returns the Gaussians that [`file`] writes, found by property name, independently of the layout under test.
+/// Returns the Gaussians that [`file`] writes, assembled by property name and so independently of the layout code under
+/// test.
 fn expected(count: usize, names: &[String]) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {
@@ -88,7 +90,7 @@ fn expected(count: usize, names: &[String]) -> Gaussians {
         out.rotation.set_row(i, [property("rot_0"), property("rot_1"), property("rot_2"), property("rot_3")]);
         out.log_scale.set_row(i, [property("scale_0"), property("scale_1"), property("scale_2")]);
         out.opacity_logit.set_row(i, [property("opacity")]);
-        // Coefficients 1, 2, 3 of red are f_rest_0..2, of green 3..5, of blue 6..8.
+        // For SH degree 1, coefficients 1, 2, 3 of red are f_rest_0..2, those of green 3..5, and those of blue 6..8.
         out.sh.set_row(
             i,
             [
@@ -109,7 +111,7 @@ fn every_encoding_type_order_and_line_end_reads_the_same() {
         for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
             for kind in ["float", "double", "int", "short"] {
                 for line_end in ["\n", "\r\n"] {
-                    // 130 rows: more than one block.
+                    // 130 rows are more than the reader reads together.
                     let ply = open(&file(format, kind, &names, 130, line_end)).unwrap();
                     assert_eq!((ply.count(), ply.sh_degree()), (130, 1));
                     assert_eq!(ply.comments(), ["SplatRenderMode: mip"]);
@@ -256,7 +258,8 @@ fn absurd_counts_are_refused_before_allocation() {
 #[test]
 fn invalid_words_in_text_are_named_with_their_line() {
     let good = String::from_utf8(file("ascii", "float", &names(), 3, "\n")).unwrap();
-    // The header has two lines before the element, one per property and one at its end; blank lines count.
+    // Number of the line: the header has two lines before the element, one per property and one at its end, and blank
+    // lines count.
     let row = 4 + names().len() + 1 + 1;
     let message = refusal(good.replace("\n50 ", "\n\nfifty ").as_bytes());
     assert!(message.contains(&format!("line {}", row + 2)) && message.contains("\"fifty\""), "{message}");
@@ -292,7 +295,8 @@ fn contradictory_headers_are_refused_with_the_line() {
     }
 }
 
-/// Opens and reads arbitrary `bytes` and returns whether they were accepted; only a panic or a hang fails.
+/// Writes `bytes` to `path`, opens and reads the file, and returns whether it was accepted. Only a panic or a hang
+/// fails the test.
 fn open_and_read(bytes: &[u8], path: &Path) -> bool {
     fs::write(path, bytes).unwrap();
     match Ply::open(path) {
@@ -315,7 +319,8 @@ fn truncated_files_are_refused() {
     let path = folder.path().join("a.ply");
     for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
         let bytes = file(format, "float", &names(), 3, "\n");
-        // A text file may lose the space and line end after its last number, and some of its digits.
+        // A text file that lacks the space and line end after its last number, or some digits of this number, is still
+        // valid.
         let whole = if format == "ascii" { bytes.len() - 4 } else { bytes.len() };
         for len in 0..whole {
             assert!(!open_and_read(&bytes[..len], &path), "{format} cut to {len} of {} bytes", bytes.len());

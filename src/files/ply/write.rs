@@ -1,7 +1,7 @@
 //! Writes Gaussians to PLY files.
 //!
-//! In: Gaussians, or an open PLY and the rows to keep of it. Out: a file at the given path. Memory: one row. Callers
-//! that use [`crate::files::atomic`] pass its temporary path.
+//! Input: Gaussians, or an open PLY file and a list of its rows (Gaussians) to keep. Output: a file at the given path.
+//! Memory: one row. Callers that use [`crate::files::atomic`] pass the temporary path that it gives them.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -15,16 +15,18 @@ use crate::files::ply::{
 };
 use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// One row of a smaller PLY.
+/// One row (Gaussian) of a compressed PLY file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutRow {
-    /// Gaussian of the template whose row is copied: the Gaussian itself, or the leader of its cluster.
+    /// Index of the Gaussian in the original file (template) whose row is copied: the Gaussian itself, or the leader
+    /// (most important Gaussian) of its merged cluster.
     pub source: u32,
-    /// Index of the proxy whose attributes replace those of the row, if any.
+    /// Index of the proxy (Gaussian that replaces a merged cluster) whose attributes replace those of the row; `None`
+    /// for a Gaussian that was not merged.
     pub proxy: Option<u32>,
 }
 
-/// Returns the rows to write for the compressed model `reduction`.
+/// Returns the rows of the PLY file to be written for the compressed model `reduction`.
 pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
     let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
@@ -33,20 +35,24 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
     rows
 }
 
-/// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends). Only the count
-/// changes, and SH coefficients above `sh_degree` are removed, so that `f_rest_*` are renumbered.
+/// Writes a PLY file with the `rows` of a compressed model. The header is that of the original file `template`
+/// (properties, order, types, comments, line ends). Only the number of Gaussians changes, and SH coefficients above
+/// `sh_degree` are removed, so that `f_rest_*` are renumbered.
 ///
-/// A row without a proxy keeps the bytes of the template, except that `change` is added to its values (zeros leave the
-/// bytes unchanged). A row with a proxy is the leader's row with position, rotation, log_scale, opacity_logit and sh
-/// replaced, each in the type of its property (integers: nearest, saturated); normals and extra properties stay the
-/// leader's. A template without `scale_2` cannot store the third scale of a proxy: order the axes largest first.
+/// A row without a proxy keeps the bytes of the template, except that `change` (parameter deltas) is added to its
+/// values; zeros leave the bytes unchanged. A row with a proxy (Gaussian that replaces a merged cluster) is a copy of
+/// the row of the cluster's leader (most important member) in which position, rotation, log_scale, opacity_logit and sh
+/// are replaced. Each is converted to the type of its property (integers: nearest, saturated). Normals and extra
+/// properties are those of the leader. A template without `scale_2` cannot store the third scale of a proxy, so callers
+/// must order the axes of proxies with the largest first.
 ///
-/// Other elements and bytes after the last one are copied. A text template becomes little-endian binary. Otherwise,
-/// writing all rows in order without proxies gives the bytes of the template.
+/// Other elements of the template and the bytes after the last element are copied. If the template is a text file, the
+/// output is little-endian binary. Otherwise, writing all rows in order without proxies and changes reproduces the
+/// template byte for byte.
 ///
 /// # Errors
-/// A source or proxy does not exist; proxies have another SH degree; `change` has another number of rows; the template
-/// was truncated since it was opened; the file cannot be written.
+/// Fails if a source or proxy does not exist, if the proxies have another SH degree, if `change` has another number of
+/// rows, if the template was truncated since it was opened, or if the file cannot be written.
 pub fn write_like(
     template: &Ply,
     rows: &[OutRow],
@@ -67,12 +73,13 @@ pub fn write_like(
     })
 }
 
-/// Writes the rows `sources` of `template`. `edit` receives the index of each output row and its bytes, and may change
-/// them. `name` returns the new name of a property, or `None` to remove it. Other elements and bytes after the last one
-/// are copied.
+/// Writes a PLY file with the rows (Gaussians) `sources` of the open file `template`. `edit` receives the index of each
+/// output row and its bytes, and may change the bytes. `name` receives the name of a property and returns its new name,
+/// or `None` to remove it. Other elements and the bytes after the last element are copied.
 ///
 /// # Errors
-/// A source does not exist; the template was truncated since it was opened; the file cannot be written.
+/// Fails if a source does not exist, if the template was truncated since it was opened, or if the file cannot be
+/// written.
 pub(crate) fn write_rows_like(
     template: &Ply,
     sources: &[u32],
@@ -111,7 +118,7 @@ pub(crate) fn write_rows_like(
 /// breaks in them become spaces). f32 values keep their bits.
 ///
 /// # Errors
-/// The file cannot be written; the SH width belongs to no degree from 0 to 3.
+/// Fails if the file cannot be written, or if the number of SH coefficients belongs to no degree from 0 to 3.
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
     let width = gaussians.sh.width();
     if !(0..=MAX_SH_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
@@ -123,7 +130,8 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     planes.extend((0..3).map(|c| gaussians.position.plane(c)));
     planes.extend([zeros.as_slice(); 3]);
     planes.extend((0..3).map(|c| gaussians.sh.plane(c)));
-    // The file stores all of red, then green, then blue; a plane has index 3 · coefficient + channel.
+    // The file stores the SH coefficients of red, then those of green, then those of blue. A plane (component) has the
+    // index 3 · coefficient + channel.
     planes.extend((0..3).flat_map(|channel| (1..=rest / 3).map(move |k| gaussians.sh.plane(3 * k + channel))));
     planes.push(gaussians.opacity_logit.plane(0));
     planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
@@ -139,7 +147,7 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     })
 }
 
-/// Returns the header of an INRIA file with `count` Gaussians and `rest` properties `f_rest_*`.
+/// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`.
 fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
@@ -155,23 +163,26 @@ fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     header + "end_header\n"
 }
 
-/// Returns the extra (non-Gaussian) properties of `rows` of `template`, one row after another, as stored.
+/// Returns the stored bytes of the extra properties (those that are no attribute of a Gaussian) in the `rows` of
+/// `template`, one row after another.
 pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
     let ranges = extra_ranges(template.properties(), template.layout());
     rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
         .collect()
 }
 
-/// Returns the number of bytes of the extra (non-Gaussian) properties of each row of `template`.
+/// Returns the number of bytes per row of the extra properties of `template` (those that are no attribute of a
+/// Gaussian).
 pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
     extra_ranges(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
 }
 
-/// Writes a PLY with `header`, read from `from`. The rows hold `cloud` and the extra properties `beside`; `lead` and
-/// `tail` are the bytes before and after the rows.
+/// Writes a PLY file to `path` with the header `header`, which was read from the file `from`. The rows hold the
+/// attributes of `cloud` and the extra properties in the bytes `beside`. `lead` and `tail` are the bytes before and
+/// after the rows.
 ///
 /// # Errors
-/// The header does not match the rows; the file cannot be written.
+/// Fails if the header does not match the rows, or if the file cannot be written.
 pub(crate) fn write_rows(
     from: &Path,
     header: &PlyHeader,
@@ -209,7 +220,7 @@ pub(crate) fn write_rows(
     })
 }
 
-/// Returns the byte ranges of a row that hold extra (non-Gaussian) properties.
+/// Returns the byte ranges of a row that hold extra properties (those that are no attribute of a Gaussian).
 fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
     for column in Attributes::all().iter() {
@@ -222,13 +233,13 @@ fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>
     beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
 }
 
-/// Creates the file at `path` and calls `fill` to write it.
+/// Creates the file at `path` and calls `fill` to write its content.
 fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
     let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// Checks that all sources and proxies exist and that the shapes of `proxies` and `change` match.
+/// Checks that all rows and proxies named in `rows` exist, and that the shapes of `proxies` and `change` match them.
 fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.columns().iter() {
         let changes = change.0.column(column).len();
@@ -256,7 +267,7 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Par
     Ok(())
 }
 
-/// Replaces the attributes in the bytes of a row by those of a proxy.
+/// Replaces the attributes in the bytes `row` of a row by those of the Gaussian with index `proxy` in `proxies`.
 fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
@@ -267,7 +278,7 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
     }
 }
 
-/// Adds the parameter delta of output row `place` to the bytes of that row.
+/// Adds the parameter delta (change of the stored values) of output row `place` to the bytes `row` of this row.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.columns().iter() {
@@ -281,19 +292,19 @@ fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     }
 }
 
-/// Returns a value in the bytes of a row, rounded to the nearest f32.
+/// Returns the value of `property` in the bytes `row` of a row, rounded to the nearest f32.
 pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
     let mut value = [0.0];
     read_plane(row, &[0], property, big_endian, &mut value);
     value[0]
 }
 
-/// Writes a value into the bytes of a row, in the type of its property.
+/// Writes `value` as `property` into the bytes `row` of a row, in the type of the property.
 pub(crate) fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
     let rounded = value.round();
     let mut bytes = [0; 8];
     let used = &mut bytes[..property.scalar.bytes()];
-    // `as` saturates and turns NaN into 0.
+    // The casts with `as` saturate and turn NaN into 0.
     match property.scalar {
         Scalar::F32 => used.copy_from_slice(&value.to_le_bytes()),
         Scalar::F64 => used.copy_from_slice(&f64::from(value).to_le_bytes()),

@@ -5,7 +5,7 @@ use crate::files::ply::write::write_inria;
 
 const N: usize = 7;
 
-/// Returns a frame state with values that depend on the frame and the position in the plane.
+/// Returns `count` Gaussians at frame `frame`. The values depend on the frame and on the index within each component.
 fn state(frame: usize, count: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for column in Attributes::all().iter() {
@@ -19,7 +19,7 @@ fn write(folder: &Path, name: &str, gaussians: &Gaussians) {
     write_inria(gaussians, &[], &folder.join(name)).unwrap();
 }
 
-/// Returns a folder of `frames` files `f_0.ply`, `f_1.ply`, …, written in reverse order.
+/// Returns a folder with the `frames` PLY files `f_0.ply`, `f_1.ply`, …, written in reverse order.
 fn folder(frames: usize) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     (0..frames).rev().for_each(|t| write(folder.path(), &format!("f_{t}.ply"), &state(t, N)));

@@ -1,9 +1,9 @@
-//! Rows of a `.splatv` file that players treat specially: padding, rows that no player draws, and unlimited temporal
-//! windows.
+//! Rows (Gaussians) of a `.splatv` file that players treat specially: padding, rows that no player draws, and unlimited
+//! temporal windows.
 //!
 //! splaTV and gsplat.js draw no row with a NaN position, none with a width of 0, and none whose quaternion is 0 at
-//! every time, because they divide by its length. They show a row with an infinite width at every time: exp(−(dt/∞)²) =
-//! 1.
+//! every time, because they divide by the length of the quaternion. They show a row with an infinite width at every
+//! time, because exp(−(dt/∞)²) = 1.
 
 use half::f16;
 use serde::{Deserialize, Serialize};
@@ -12,18 +12,18 @@ use super::{Splatv, SplatvGaussian, WORDS};
 use crate::error::{Error, Result};
 use crate::files::defects::Defects;
 
-/// Treatment of rows whose quaternion is 0 at every time.
+/// Treatment of rows (Gaussians) whose quaternion is 0 at every time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ZeroRotation {
-    /// Rows are left out: no player draws them.
+    /// The rows are left out, because no player draws them.
     #[default]
     Drop,
-    /// Rows are kept without a rotation, as in the training of SpacetimeGaussians.
+    /// The rows are kept with the identity as rotation, as SpacetimeGaussians does in training.
     Identity,
 }
 
-/// Kind of defect: its name, whether rows with it are left out, and the reason.
+/// Kind of defect: its name, whether rows with this defect are left out, and the reason.
 type Defect = (&'static str, bool, &'static str);
 
 const NON_FINITE_POSITION: Defect = ("NaN or infinite position", true, "no player draws them");
@@ -36,7 +36,7 @@ const KEPT_ZERO_QUATERNION: Defect = ("zero quaternion", false, "taken as the id
 const INFINITE_WIDTH: Defect =
     ("infinite temporal width", false, "visible at every time, as in players; written as the largest half");
 
-/// Returns the defects of a row.
+/// Returns the defects of a row (Gaussian).
 fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
     let is_finite = |values: &[f32]| values.iter().all(|x| x.is_finite());
     let others = [&row.motion[..], &row.rotation, &row.omega, &row.scale, &[row.center]];
@@ -54,17 +54,17 @@ fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
     all.into_iter().filter_map(|(is_there, defect)| is_there.then_some(defect)).collect()
 }
 
-/// Returns whether the quaternion of a row is 0 at every time. A quaternion that is 0 at only one instant is not a
-/// defect.
+/// Returns whether the quaternion of a row (Gaussian) is 0 at every time. A quaternion that is 0 at only one instant is
+/// not a defect.
 pub(crate) fn has_zero_quaternion(row: &SplatvGaussian) -> bool {
     row.rotation == [0.0; 4] && row.omega == [0.0; 4]
 }
 
-/// Checks every row of `file`. Returns the defects found and, if some rows are left out, the indices of the other rows
-/// in increasing order.
+/// Checks every row (Gaussian) of `file`. Returns the defects found and, if some rows have to be left out, the indices
+/// of the other rows in increasing order.
 ///
 /// # Errors
-/// All rows of the file would be left out.
+/// Fails if all rows of the file would be left out.
 pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, Option<Vec<u32>>)> {
     let count = file.count();
     let mut found = Defects::new(count);
@@ -73,7 +73,7 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
         let row_defects = defects(&SplatvGaussian::from_words(&file.words(row as usize)), zero_rotation);
         found.add(row, &row_defects);
         match (row_defects.iter().any(|&(_, dropped, _)| dropped), &mut rows) {
-            // First row that is left out: all rows before it are kept.
+            // This is the first row that is left out: all rows before it are kept.
             (true, None) => rows = Some((0..row).collect()),
             (false, Some(rows)) => rows.push(row),
             _ => (),
@@ -91,8 +91,8 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
     Ok((found, rows))
 }
 
-/// Repairs the words of a row that is kept: an infinite width becomes the largest finite half-precision value, a
-/// quaternion that is 0 at every time becomes the identity.
+/// Repairs the words that store a row (Gaussian) that is kept: an infinite width becomes the largest finite
+/// half-precision value, and a quaternion that is 0 at every time becomes the identity.
 pub fn repair(words: &mut [u32; WORDS]) {
     let row = SplatvGaussian::from_words(words);
     if row.width == f32::INFINITY {
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
     use crate::files::splatv::write::{words, write};
 
-    /// Returns a row without defects.
+    /// Returns a row (Gaussian) without defects.
     fn sound(x: f32) -> SplatvGaussian {
         SplatvGaussian {
             position: [x, 0.5, 2.0],
@@ -124,7 +124,8 @@ mod tests {
         }
     }
 
-    /// Returns a file with one row for each edit. Edits set half-precision values as other programs write them.
+    /// Returns a file with one row (Gaussian) for each of `edits`. An edit may set half-precision values that only
+    /// other programs write.
     fn file(folder: &std::path::Path, edits: &[fn(&mut [u32; WORDS])]) -> Splatv {
         let path = folder.join("rows.splatv");
         let rows: Vec<[u32; WORDS]> = edits
@@ -157,9 +158,9 @@ mod tests {
         |row| set_high(&mut row[13], NAN),
         |row| row[3] = 0,
         |row| set_high(&mut row[15], INFINITE),
-        // Zero only at its temporal center.
+        // The quaternion is zero only at the center of the temporal window.
         |row| (row[3], row[13]) = (0, 0x3c00),
-        // NaN position, zero quaternion and infinite width at once.
+        // The row has a NaN position, a zero quaternion and an infinite width at once.
         |row| {
             (row[0], row[3]) = (f32::NAN.to_bits(), 0);
             set_high(&mut row[15], INFINITE);

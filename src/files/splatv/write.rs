@@ -1,7 +1,7 @@
 //! Writes Gaussians on cubic paths to a `.splatv` file ([`crate::files::splatv`] describes the layout).
 //!
-//! Memory: one row. Values in half precision are rounded to the nearest, values in bytes are rounded down, as in
-//! splaTV.
+//! Memory: one row (Gaussian). Values that are stored in half precision are rounded to the nearest; values that are
+//! stored as bytes are rounded down, as in splaTV.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -17,16 +17,19 @@ use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS, WORDS};
 use crate::model::RobustBox;
 use crate::model::{AttributeValues, Camera};
 
-/// Index of a camera of the virtual rig that is neither at the top nor at the bottom of the scene.
+/// Index of the camera of the virtual rig that is used as the default view; it is neither at the top nor at the bottom
+/// of the scene.
 const DEFAULT_CAMERA: usize = 4;
-/// Distance from the temporal center, in temporal widths, at which an opacity of 1 has fallen to 1/255.
+/// Distance in time from the center of the temporal window, as a multiple of its width, at which an opacity of 1 has
+/// fallen to 1/255.
 const VISIBLE_WIDTHS: f64 = 2.36;
-/// Number of texels per Gaussian.
+/// Number of texels of the texture that store one Gaussian.
 const TEXELS_PER_GAUSSIAN: usize = 4;
 
-/// Returns the words that store `row` for a viewer. Values beyond the range of half precision become the largest finite
-/// value; NaN becomes 0. If half precision would turn the quaternion and its rate to 0, they are scaled so that the
-/// quaternion has length 1, or the quaternion becomes the identity, because players divide by its length.
+/// Returns the 32-bit words that store the Gaussian `row` in a file for viewers. Values beyond the range of half
+/// precision become the largest finite value; NaN becomes 0. If half precision would turn the quaternion and its rate
+/// of change into 0, both are scaled so that the quaternion has length 1, or the quaternion becomes the identity,
+/// because players divide by the length of the quaternion.
 pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
@@ -34,7 +37,7 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
         u32::from(f16::from_f32(held).to_bits())
     };
     let pair = |low: f32, high: f32| half(low) | half(high) << 16;
-    // `as` truncates, saturates and turns NaN into 0.
+    // The cast with `as` truncates, saturates and turns NaN into 0.
     let byte = |value: f64| u32::from((255.0 * value) as u8);
     let SplatvGaussian { position, motion: m, scale: s, rgb: [r, g, b], opacity, center, width, .. } = *row;
     let (mut q, mut o) = (row.rotation, row.omega);
@@ -67,8 +70,8 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     ]
 }
 
-/// Adds the error between `row` and its stored form, as Gaussian `id`, to `to`. The error of the path is taken as far
-/// from its center in time as the Gaussian is visible.
+/// Adds the errors between `row` and the values stored for it to `to`, as Gaussian `id`. The error of the path is
+/// measured over the times around its center at which the Gaussian is visible.
 pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
     let held = SplatvGaussian::from_words(&words(row));
     let drawn = |row: &SplatvGaussian| RenderedAttributes {
@@ -86,7 +89,8 @@ pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
     to.add(id, &wanted, &found);
 }
 
-/// Returns a camera as the file lists it; `rotation` has the rows of camera to world.
+/// Returns the JSON of a camera as it is listed in the file. The rows of `rotation` are those of the camera-to-world
+/// matrix.
 pub fn camera(camera: &Camera) -> Value {
     let to_world = camera.rotation.transpose();
     let position = -(to_world * camera.translation);
@@ -97,7 +101,7 @@ pub fn camera(camera: &Camera) -> Value {
     })
 }
 
-/// Returns the list of cameras for a model without cameras: one that sees most of the Gaussians at `positions`.
+/// Returns the list of cameras for a model without cameras: one camera that sees most of the Gaussians at `positions`.
 pub fn default_cameras(positions: &AttributeValues) -> Value {
     let found = RobustBox::from_positions(positions);
     virtual_rig(found.middle, found.extent())
@@ -106,10 +110,10 @@ pub fn default_cameras(positions: &AttributeValues) -> Value {
         .map_or(json!([]), |camera| json!([self::camera(camera)]))
 }
 
-/// Writes `count` rows as the file at `path`, which a viewer opens at the first of `cameras`.
+/// Writes `count` rows (Gaussians, as words) to a `.splatv` file at `path`. Viewers begin at the first of `cameras`.
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub fn write(path: &Path, count: usize, rows: impl Iterator<Item = [u32; WORDS]>, cameras: &Value) -> Result<()> {
     let height = (TEXELS_PER_GAUSSIAN * count).div_ceil(TEXELS).max(1);
     let size = TEXELS * height * ROW_BYTES / TEXELS_PER_GAUSSIAN;
@@ -139,7 +143,7 @@ mod tests {
     use super::*;
     use crate::files::splatv::Splatv;
 
-    /// Returns a row of values that are exact in half precision and in bytes.
+    /// Returns a Gaussian whose values are exact in half precision or as bytes, as they are stored.
     fn row(seed: u16) -> SplatvGaussian {
         let value = |k: u16| f16::from_bits(0x3000 + (seed.wrapping_mul(31).wrapping_add(k * 977)) % 0x1000).to_f32();
         let byte = |k: u16| f64::from((seed.wrapping_mul(7).wrapping_add(k)) % 255 + 1) / 255.0 + 1e-4;
@@ -210,7 +214,7 @@ mod tests {
         let made = camera(&Camera::look_at(from, glam::DVec3::ZERO, 1.0, (8, 6)));
         for (c, expected) in from.to_array().into_iter().enumerate() {
             assert!((made["position"][c].as_f64().unwrap() - expected).abs() < 1e-12, "{made}");
-            // The third column is the view direction.
+            // The third column of the rotation is the view direction.
             let forward = made["rotation"][c][2].as_f64().unwrap();
             assert!((forward + expected / from.length()).abs() < 1e-12, "{made}");
         }
@@ -225,7 +229,8 @@ mod tests {
         let header = 8 + u32::from_le_bytes(whole[4..8].try_into().unwrap()) as usize;
         for length in (0..200).chain((200..whole.len()).step_by(997)) {
             std::fs::write(&path, &whole[..length]).unwrap();
-            // A file that ends after a whole row is not padded; one that ends within a row is truncated.
+            // A file may end after a whole row (then only the padding is missing); one that ends within a row is
+            // truncated.
             let rows = length.checked_sub(header).filter(|bytes| *bytes > 0 && bytes % ROW_BYTES == 0);
             if let Some(bytes) = rows {
                 let file = Splatv::open(&path).unwrap();

@@ -1,4 +1,4 @@
-//! Reads and writes PyTorch state dicts (`.pth`): tensors are read as f32.
+//! Reads and writes PyTorch state dicts (`.pth`), which map names to tensors. Tensors are read as f32.
 
 mod write;
 
@@ -12,22 +12,23 @@ use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, TensorView};
 use crate::limits::ReadLimit;
 pub(crate) use write::{StoredTensor, TensorValues, write_state_dict};
 
-/// Maximum ratio of the bytes of all tensors to the size of the file. A view may repeat its storage (stride 0), so a
-/// small file can declare any number of values. No trained state dict is smaller than a quarter of its tensors.
+/// Maximum ratio of the bytes of all tensors to the size of the file. A tensor may repeat stored values (stride 0), so
+/// a small file can declare any number of values. No trained state dict is smaller than a quarter of its tensors.
 pub(crate) const MAX_EXPANSION: u64 = 4;
-/// Maximum number of bytes of a tensor's name.
+/// Maximum length of the name of a tensor in bytes.
 const MAX_NAME_BYTES: usize = 1024;
-/// Memory of one tensor without its name and values, in bytes.
+/// Bytes of memory of one tensor, without its name and values.
 const TENSOR_BYTES: u64 = 512;
 
 /// Reads every floating-point tensor of the state dict at `path`, widened or rounded to f32. Integer and boolean
 /// tensors are left out.
 ///
-/// Memory: the tensors, at most four times the file, and the bytes of one storage; both within `memory`.
+/// Memory: the tensors (at most four times the size of the file) and the bytes of one storage (block of tensor values);
+/// together at most `memory`.
 ///
 /// # Errors
-/// The file is not a state dict, is truncated or damaged, declares more values than it can hold, or takes more memory
-/// than allowed.
+/// Fails if the file is not a state dict, is truncated or damaged, declares more values than it can hold, or takes more
+/// memory than allowed.
 pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     let dict = StateDict::open(path, memory)?;
@@ -64,16 +65,16 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
 /// Returns the names of the tensors of the state dict at `path`, in order. No values are read.
 ///
 /// # Errors
-/// The file is not a state dict.
+/// Fails if the file is not a state dict.
 pub(crate) fn names(path: &Path, memory: ReadLimit) -> Result<Vec<String>> {
     Ok(StateDict::open(path, memory)?.tensors.into_keys().collect())
 }
 
-/// Returns whether [`read_state_dict`] reads every tensor of the state dict at `path`, that is, whether all are
-/// floating-point.
+/// Returns whether all tensors of the state dict at `path` are floating-point, so that [`read_state_dict`] leaves out
+/// none.
 ///
 /// # Errors
-/// The file is not a state dict.
+/// Fails if the file is not a state dict.
 pub(crate) fn is_floating(path: &Path, memory: ReadLimit) -> Result<bool> {
     Ok(StateDict::open(path, memory)?.tensors.values().all(|tensor| tensor.kind.is_float()))
 }
@@ -87,7 +88,8 @@ pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
     })
 }
 
-/// Tensors of a checkpoint, by name. Names of nested dicts, lists and tuples are joined by dots.
+/// Tensors of a checkpoint by name. The name of a tensor in nested dicts, lists or tuples consists of all keys, joined
+/// by dots.
 struct StateDict {
     checkpoint: Checkpoint,
     tensors: BTreeMap<String, TensorView>,
@@ -97,7 +99,7 @@ impl StateDict {
     /// Opens the checkpoint at `path` and finds its tensors.
     ///
     /// # Errors
-    /// The checkpoint is invalid or not a dict; a value seems to be a tensor of an unknown kind.
+    /// Fails if the checkpoint is invalid or not a dict, or if a value seems to be a tensor of an unknown kind.
     fn open(path: &Path, memory: ReadLimit) -> Result<StateDict> {
         let checkpoint = Checkpoint::open(path, memory)?;
         let (root, nodes) = (checkpoint.pickle().root(), checkpoint.pickle().ids().len());
@@ -106,7 +108,8 @@ impl StateDict {
                 .wrong("data.pkl", "a state dict written by torch.save", checkpoint.describe(root))
                 .hint("save the model again with torch.save(model.state_dict(), path)"));
         }
-        // A shared value is visited once for each of its names, and a pickle can give it any number of names.
+        // Limit the number of visits: a shared value is visited once for each of its names, and a pickle can give a
+        // value any number of names.
         let mut search =
             TensorSearch { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
         search.visit(root, &mut String::new(), 0)?;
@@ -115,18 +118,18 @@ impl StateDict {
     }
 }
 
-/// State of the search for tensors in a tree of values.
+/// State of the search for tensors in the object tree of a pickle.
 struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
-    /// Number of nodes that may still be visited.
+    /// Number of nodes of the object tree that may still be visited.
     left: usize,
-    /// Memory of the tensors found so far, in bytes.
+    /// Bytes of memory of the tensors found so far, without their values.
     name_bytes: u64,
     found: BTreeMap<String, TensorView>,
 }
 
 impl TensorSearch<'_> {
-    /// Adds the tensors at and below node `id`, whose name is `name`.
+    /// Adds the tensors at and below node `id` of the object tree. `name` is the name of this node.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
         self.left =
@@ -159,7 +162,7 @@ impl TensorSearch<'_> {
                 self.visit_part(element, name, &index.to_string(), depth)?;
             }
         } else if let Some((callee, arguments)) = pickle.call(id) {
-            // A tensor of an unknown kind must be reported, not left out.
+            // Report a tensor of an unknown kind instead of leaving it out.
             let is_unsigned = callee == "torch._utils._rebuild_tensor_v3";
             if !is_unsigned && arguments.iter().any(|&id| self.holds_values(id)) {
                 let place = format!("tensor {}", named(name));
@@ -169,7 +172,7 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Visits the child `part` of the node called `name`.
+    /// Visits node `id`, which is the child `part` of the node called `name`.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {
@@ -181,13 +184,13 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Returns whether a node is a tensor or a storage.
+    /// Returns whether node `id` is a tensor or a storage (block of tensor values).
     fn holds_values(&self, id: NodeId) -> bool {
         matches!(self.checkpoint.pickle().node(id), Node::Outside(_)) || self.checkpoint.tensor(id).is_some()
     }
 }
 
-/// Returns a name as quoted in messages.
+/// Returns the name of a tensor as it is quoted in messages.
 fn named(name: &str) -> String {
     if name.is_empty() { "the root".to_owned() } else { quoted(name).to_string() }
 }

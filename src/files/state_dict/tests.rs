@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// Tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
+/// Tensor as a pickle describes it: storage class, bytes of the storage (block of values), offset, shape, strides.
 struct Entry {
     name: &'static str,
     class: &'static str,
@@ -39,7 +39,8 @@ fn tuple(items: &[i32]) -> Vec<u8> {
     [b"(".to_vec(), items.iter().flat_map(|&i| int(i)).collect(), b"t".to_vec()].concat()
 }
 
-/// Returns the pickle that torch.save writes for an OrderedDict of tensors, without memo.
+/// Returns the pickle that torch.save writes for an OrderedDict of tensors, but without a memo (table for repeated
+/// values).
 fn pickle(entries: &[Entry]) -> Vec<u8> {
     let mut out = b"\x80\x02ccollections\nOrderedDict\n)R(".to_vec();
     for (key, e) in entries.iter().enumerate() {
@@ -62,7 +63,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     })
 }
 
-/// Returns a zip archive of uncompressed files.
+/// Returns the bytes of a zip archive with uncompressed `files`, given as (name, content).
 fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, bytes) in files {
@@ -148,7 +149,7 @@ fn float_tensors_become_f32_and_others_are_left_out() {
         stride: vec![1],
     };
     let le16 = |values: &[u16]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-    // 1, −2, smallest subnormal, largest, infinity; and 1, −2, 2⁻¹³³ (subnormal) in bfloat16.
+    // float16 values 1, −2, smallest subnormal, largest, infinity; then 1, −2, 2⁻¹³³ (subnormal) in bfloat16.
     let half = le16(&[0x3C00, 0xC000, 0x0001, 0x7BFF, 0x7C00]);
     let tensors = TempStateDict::new()
         .read(&state_dict(&[
@@ -210,7 +211,7 @@ fn random_bytes_are_refused() {
 #[test]
 fn a_small_file_cannot_declare_huge_tensors() {
     let temp = TempStateDict::new();
-    // A million values from one by stride 0; then a shape whose size overflows.
+    // First shape: a million values that repeat one stored value by stride 0. Second shape: its size overflows.
     for shape in [vec![1000, 1000], vec![i32::MAX, i32::MAX, i32::MAX]] {
         let stride = vec![0; shape.len()];
         temp.read(&state_dict(&[f32_entry("t", &[1.0], &shape, &stride)])).expect_err("must be refused");

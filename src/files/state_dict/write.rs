@@ -1,8 +1,8 @@
-//! Writes state dicts in the format of `torch.save`: a zip archive of uncompressed entries, a pickle that names every
-//! tensor, and one entry with the values of each tensor.
+//! Writes state dicts in the format of `torch.save`: a zip archive of uncompressed files, of which one is a pickle that
+//! names every tensor, and the others hold the values of one tensor each.
 //!
-//! In: tensors in the layout to be stored. Out: a file of version 3 of PyTorch's zip format, which `torch.load` opens,
-//! with `weights_only` or without. Memory: the pickle. Source: the files that PyTorch 1.6 and later writes.
+//! Input: tensors in the layout to be stored. Output: a file of version 3 of PyTorch's zip format, which `torch.load`
+//! opens, with or without `weights_only`. Memory: the pickle. Source: the files that PyTorch 1.6 and later writes.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -16,36 +16,36 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 
-/// Alignment of the values of each tensor in the file, in bytes, as in PyTorch.
+/// Alignment in bytes of the values of each tensor in the file, as in files that PyTorch writes.
 const ALIGNMENT: u16 = 64;
 
-/// Tensor in its stored layout: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
-/// be 0 and elements may share values.
+/// Tensor in the layout in which it is stored: the element with indices `i` is value `offset + Σ i·stride` of `values`.
+/// Strides may be 0, and elements may share values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct StoredTensor {
-    /// Dotted name.
+    /// Name of the tensor; the keys of nested dicts are joined by dots.
     pub(crate) name: String,
-    /// Values of the storage.
+    /// Stored values, which the elements refer to.
     pub(crate) values: TensorValues,
-    /// Index of the first element in the storage.
+    /// Index in `values` of the first element.
     pub(crate) offset: usize,
-    /// Extents, outermost first; empty for a scalar.
+    /// Length of each axis, the slowest axis first; empty for a scalar.
     pub(crate) shape: Vec<usize>,
-    /// Distance in values from an element to the next, along each extent.
+    /// For each axis, the distance in `values` from an element to the next one along this axis.
     pub(crate) stride: Vec<usize>,
 }
 
-/// Values of a tensor.
+/// Stored values of a tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum TensorValues {
-    /// IEEE 754 binary32.
+    /// 32-bit floating-point values (IEEE 754 binary32).
     F32(Vec<f32>),
-    /// IEEE 754 binary16.
+    /// 16-bit floating-point values (IEEE 754 binary16).
     F16(Vec<f16>),
 }
 
 impl TensorValues {
-    /// Returns the number of values.
+    /// Returns the number of stored values.
     pub(crate) fn len(&self) -> usize {
         match self {
             TensorValues::F32(values) => values.len(),
@@ -53,7 +53,7 @@ impl TensorValues {
         }
     }
 
-    /// Returns the number of bytes of each value.
+    /// Returns the number of bytes of one value.
     pub(crate) fn width(&self) -> usize {
         match self {
             TensorValues::F32(_) => size_of::<f32>(),
@@ -61,7 +61,7 @@ impl TensorValues {
         }
     }
 
-    /// Returns the name of the storage class in the pickle.
+    /// Returns the name of PyTorch's storage class for this type of values, as written in the pickle.
     fn class(&self) -> &'static str {
         match self {
             TensorValues::F32(_) => "FloatStorage",
@@ -69,7 +69,7 @@ impl TensorValues {
         }
     }
 
-    /// Returns the values in the byte order of this machine.
+    /// Returns the bytes of the values, in the byte order of this machine.
     fn bytes(&self) -> &[u8] {
         match self {
             TensorValues::F32(values) => bytemuck::cast_slice(values),
@@ -79,7 +79,7 @@ impl TensorValues {
 }
 
 impl StoredTensor {
-    /// Returns a tensor whose `values` are contiguous, with the last extent fastest.
+    /// Returns a tensor whose `values` are contiguous, with the last axis fastest.
     pub(crate) fn dense(name: String, shape: Vec<usize>, values: TensorValues) -> StoredTensor {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
@@ -92,12 +92,12 @@ impl StoredTensor {
 /// Writes a state dict of `tensors`, in the given order.
 ///
 /// # Errors
-/// The file cannot be written.
+/// Fails if the file cannot be written.
 pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<()> {
     let write = || {
         let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
-        // The pickle comes first and all entries are in one folder: readers find the other entries by the pickle's
-        // folder.
+        // Write the pickle first, and all files into one folder: readers find the other files by the folder of the
+        // pickle.
         add(&mut archive, "data.pkl", &pickle(tensors))?;
         add(&mut archive, "byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
         for (key, tensor) in tensors.iter().enumerate() {
@@ -109,7 +109,7 @@ pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<
     write().map_err(Error::io("write", path))
 }
 
-/// Adds an uncompressed, aligned entry to the archive.
+/// Adds an uncompressed file `name` to the archive, with its content aligned to 64 bytes.
 fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &[u8]) -> io::Result<()> {
     let options = FileOptions::default()
         .compression_method(CompressionMethod::Stored)
@@ -119,15 +119,15 @@ fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &
     archive.write_all(bytes)
 }
 
-/// Returns the pickle, of protocol 2, of an ordered dictionary of the tensors by name. Storages are referred to by
-/// number.
+/// Returns the pickle (protocol 2) of an ordered dictionary of the tensors by name. It refers to the values of each
+/// tensor by a number.
 fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
     const DICTIONARY: &[u8] = b"ccollections\nOrderedDict\n)R";
     let mut out = [b"\x80\x02", DICTIONARY, b"("].concat();
     for (key, tensor) in tensors.iter().enumerate() {
         text(&mut out, &tensor.name);
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n(");
-        // Storage: kind, class, key, device, number of values.
+        // Persistent id of the storage (block of values): kind, class, key, device, number of values.
         out.extend(b"(");
         text(&mut out, "storage");
         out.extend(format!("ctorch\n{}\n", tensor.values.class()).bytes());
@@ -141,21 +141,21 @@ fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
             extents.iter().for_each(|&extent| number(&mut out, extent));
             out.extend(b"t");
         }
-        // `requires_grad` is false and there are no hooks.
+        // The tensor's `requires_grad` is false, and it has no hooks.
         out.extend([b"\x89", DICTIONARY, b"tR"].concat());
     }
     out.extend(b"u.");
     out
 }
 
-/// Appends a text to the pickle.
+/// Appends the text `text` to the pickle `out`.
 fn text(out: &mut Vec<u8>, text: &str) {
     out.push(b'X');
     out.extend((text.len() as u32).to_le_bytes());
     out.extend(text.bytes());
 }
 
-/// Appends a whole number to the pickle in the shortest form.
+/// Appends the whole number `number` to the pickle `out` in the shortest form.
 fn number(out: &mut Vec<u8>, number: usize) {
     match number {
         0..=0xFF => out.extend([b'K', number as u8]),
@@ -164,7 +164,7 @@ fn number(out: &mut Vec<u8>, number: usize) {
             out.push(b'J');
             out.extend((number as i32).to_le_bytes());
         }
-        // Nine bytes, of which the last is 0, so that the number is not negative.
+        // Write nine bytes, of which the last is 0, so that the number is not negative.
         _ => {
             out.extend([0x8A, 9]);
             out.extend((number as u64).to_le_bytes());
@@ -182,7 +182,7 @@ mod tests {
     use super::super::read_state_dict;
     use super::*;
 
-    /// Returns the element at `index`, by the definition.
+    /// Returns the element of `tensor` with the indices `index`, computed by the definition of strides.
     fn element(tensor: &StoredTensor, index: &[usize]) -> f32 {
         let at = tensor.offset + index.iter().zip(&tensor.stride).map(|(i, stride)| i * stride).sum::<usize>();
         match &tensor.values {
@@ -191,7 +191,7 @@ mod tests {
         }
     }
 
-    /// Returns all elements, with the last index fastest.
+    /// Returns all elements of `tensor`, with the last index fastest.
     fn elements(tensor: &StoredTensor) -> Vec<f32> {
         let mut indices = vec![Vec::new()];
         for &extent in &tensor.shape {
@@ -200,7 +200,7 @@ mod tests {
         indices.iter().map(|index| element(tensor, index)).collect()
     }
 
-    /// Generates tensors of any shape and strides, with a few unused values before and after in the storage.
+    /// Generates tensors of any shape and strides. Their storage has a few unused values before and after.
     fn tensor() -> impl Strategy<Value = StoredTensor> {
         let extents = proptest::collection::vec((1..5usize, 0..7usize), 0..4);
         (extents, 0..4usize, 0..3usize, any::<bool>(), any::<u64>()).prop_map(
@@ -229,7 +229,7 @@ mod tests {
             prop_assert_eq!(read.len(), tensors.len());
             for tensor in &tensors {
                 let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
-                // All NaNs count as equal, because widening may change their bits.
+                // Treat all NaNs as equal, because converting them to a wider type may change their bits.
                 let plain = |values: Vec<f32>| {
                     bits(&values.into_iter().map(|x| if x.is_nan() { f32::NAN } else { x }).collect::<Vec<_>>())
                 };
@@ -240,7 +240,7 @@ mod tests {
         }
     }
 
-    /// Returns the name, offset and bytes of every entry of an archive, read by the definition of the zip format.
+    /// Returns the name, offset and content of every file in a zip archive, read by the definition of the zip format.
     fn entries(bytes: &[u8]) -> Vec<(String, usize, Vec<u8>)> {
         let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]) as usize;
         let long = |at: usize| word(at) | word(at + 2) << 16;

@@ -1,4 +1,5 @@
-//! Named parts of an archive other than entropy-coded values, among them those of a PLY.
+//! Named parts of an archive (`.gsz`) that are not entropy coded, among them the parts of a PLY file besides its
+//! attributes.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -8,28 +9,29 @@ use crate::error::{Error, Result};
 use crate::files::ply::write::{beside, extra_bytes_per_row, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
-/// Name of the part with the header of the PLY.
+/// Name of the archive part with the header of the PLY file.
 pub(crate) const HEADER: &str = "ply.header";
-/// Name of the part with the bytes between the header and the rows.
+/// Name of the archive part with the bytes of the PLY file between the header and the rows of the Gaussians.
 const LEAD: &str = "ply.lead";
-/// Name of the part with the bytes after the rows.
+/// Name of the archive part with the bytes of the PLY file after the rows of the Gaussians.
 const TAIL: &str = "ply.tail";
-/// Name of the part with the configuration of a model folder. An archive without this part holds a single PLY.
+/// Name of the archive part with the configuration (`cfg_args`) of a model folder. An archive without this part holds a
+/// single PLY.
 pub(crate) const CFG_ARGS: &str = "cfg_args";
-/// Name of the part with the training iteration of a model folder, as text.
+/// Name of the archive part with the training iteration of a model folder, as text.
 pub(crate) const ITERATION: &str = "iteration";
 
-/// Adds to `content` everything of the PLY `template` that is not an attribute: the extra properties of `rows`, and the
-/// bytes before and after the rows.
+/// Adds to `content` all data of the PLY file `template` that are not attributes: the extra properties of the Gaussians
+/// `rows`, and the bytes before and after the rows of Gaussians.
 ///
 /// # Errors
-/// Fails if the template was cut short since it was opened, or needs more memory than allowed.
+/// Fails if the template was cut short since it was opened, or if its data need more memory than allowed.
 pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     let [lead, tail] = template.bytes_around();
     let what = "the data that the archive keeps beside the attributes of Gaussians";
     let bytes = lead + tail + extra_bytes_per_row(template) * content.cloud.len();
-    // Counted twice: the content and the archive encoded from it.
+    // Counted twice: for the content and for the archive encoded from it.
     template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;
     content.beside = beside(template, rows);
     let around = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| {
@@ -46,7 +48,7 @@ pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterat
     Ok(())
 }
 
-/// Writes the PLY of an archive, read from `path`, to `to`.
+/// Writes the PLY file that `content` describes to the path `to`. The content was read from the archive at `path`.
 pub(super) fn write_cloud(content: &Content, path: &Path, to: &Path) -> Result<()> {
     let part = |name: &str| {
         let missing = || Error::input(path, "blobs", format!("a part named {name}"), "none");

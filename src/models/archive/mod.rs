@@ -1,8 +1,8 @@
-//! Archives (`.gsz`) as a model format. The content is decoded into a scratch folder and opened as a model of its own
-//! format.
+//! Archives (`.gsz`) as a model format. The content of an archive is decoded into a temporary folder and opened there
+//! as a model of its own format.
 //!
-//! Specified in `format/ARCHIVE.md`. Names in an archive are never used as paths: this module decides which files are
-//! written.
+//! The file format is specified in `format/ARCHIVE.md`. Names in an archive are never used as paths: this module
+//! decides which files are written.
 
 pub(super) mod files;
 
@@ -29,13 +29,13 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Archive (`.gsz`).
+/// Archive of a compressed model (`.gsz`).
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
 
-/// Reads an archive and returns its content and its bytes by part.
+/// Reads an archive. Returns its decoded content, and its size in bytes divided by purpose.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`.
@@ -43,7 +43,7 @@ pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveS
     archive::decode(&load(path, memory)?, path, memory)
 }
 
-/// Reads the bytes of the archive at `path`. Checks the head before reading the rest.
+/// Reads the bytes of the archive at `path`. Checks the header before reading the rest.
 fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let failed = |error| Error::io("read", path)(error);
     let mut file = open_file(path)?;
@@ -51,14 +51,14 @@ fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
     archive::check_head(&bytes, length, path, memory)?;
-    // `check_head` compared the length of the file with the head, so the length is safe to allocate.
+    // `check_head` compared the length of the file with the header, so the length is safe to allocate.
     bytes.reserve_exact((length - bytes.len() as u64) as usize);
     file.take(length - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
 }
 
-/// Writes the content of an archive read from `path` as the original files: a model folder into `to`, or a single PLY
-/// to the new file `to`.
+/// Writes the content of an archive, which was read from `path`, as the original files: a model folder into the folder
+/// `to`, or a single PLY to the new file `to`.
 ///
 /// # Errors
 /// Fails if the content is not a complete model or a write fails.
@@ -81,9 +81,9 @@ pub fn is_folder(content: &Content) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
-/// Open archive.
+/// Opened archive, decoded into a temporary folder.
 struct OpenArchive {
-    /// Model decoded into `scratch`.
+    /// Model opened from the files in the folder `scratch`.
     inner: Box<dyn InputModel>,
     scratch: ScratchFolder,
     digest: String,
@@ -91,7 +91,7 @@ struct OpenArchive {
 }
 
 impl OpenArchive {
-    /// Reads the archive at `path`, writes its files to a scratch folder and opens them.
+    /// Reads the archive at `path`, writes its files to a temporary folder and opens them.
     fn open(path: &Path, options: &OpenOptions) -> Result<OpenArchive> {
         options.refuse_for(path)?;
         let bytes = load(path, options.memory)?;

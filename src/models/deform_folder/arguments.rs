@@ -1,4 +1,4 @@
-//! Training arguments in `cfg_args`.
+//! Training arguments in the file `cfg_args` of a model folder.
 
 use std::path::{Path, PathBuf};
 
@@ -14,7 +14,7 @@ pub(in crate::models) struct Arguments {
 }
 
 impl Arguments {
-    /// Reads the file at `path`.
+    /// Reads the `cfg_args` file at `path`.
     ///
     /// # Errors
     /// Fails if the file cannot be read or its text is not a `Namespace(…)`.
@@ -24,12 +24,12 @@ impl Arguments {
         Ok(Arguments { keys, path: path.to_owned() })
     }
 
-    /// Returns the path of the file.
+    /// Returns the path of the `cfg_args` file.
     pub(in crate::models) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns the last value of `name`; `None` if the key is missing.
+    /// Returns the key `name` with its last value in the file, or without a value if the key is missing.
     pub(in crate::models) fn get(&self, name: &'static str) -> ConfigKey<'_> {
         let found = self.keys.iter().rev().find(|key| key.name == name);
         ConfigKey { name, value: found.map_or(&Literal::None, |key| &key.value), path: &self.path }

@@ -1,9 +1,10 @@
 //! Model folders with a subfolder `deform`: canonical Gaussians and a network that deforms them.
 //!
-//! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A
-//! model format provides the computation of states from the network's outputs ([`NetworkMotionModel`]); reading files, proxies
-//! and writing are shared. The output is a folder of the same layout with a smaller point cloud file. The network is
-//! copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
+//! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. Each
+//! model format implements how states follow from the network's outputs ([`NetworkMotionModel`]); reading files,
+//! merging Gaussians into proxies and writing are shared. The output is a folder of the same layout with a smaller
+//! point cloud file. The network is copied byte for byte, and so is the configuration, except for the SH degree if that
+//! is lowered.
 
 mod arguments;
 mod paths;
@@ -38,43 +39,43 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Minimum scale, so that its logarithm is finite.
+/// Minimum scale of a Gaussian in scene units, so that its logarithm is finite.
 pub(super) const MIN_SCALE: f64 = 1e-7;
 
-/// Motion model that computes states from the outputs of a network.
+/// Motion model that computes the states of Gaussians at a time from the outputs of a network.
 pub(super) trait NetworkMotionModel: MotionModel {
     /// Name of the model format, shown to users.
     const KIND: &'static str;
-    /// Whether a quaternion is normalized before the network's output is added to it.
+    /// Whether a stored quaternion is normalized before the network's output is added to it.
     const NORMALIZES_ROTATION: bool;
 
-    /// Returns the bytes per Gaussian of the values prepared by [`MotionModel::prepare`].
+    /// Returns the bytes of memory per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
 
-    /// Returns the bytes that do not depend on the number of Gaussians, in addition to the network.
+    /// Returns the bytes of memory that do not depend on the number of Gaussians, in addition to those of the network.
     fn bytes(&self) -> usize {
         0
     }
 
-    /// Returns the approximate CPU seconds on one core to compute one state.
+    /// Returns the approximate CPU seconds on one core to compute the state of one Gaussian at one frame.
     fn seconds_per_state(&self) -> f64;
 }
 
-/// Parts from which a model format creates its motion model.
+/// Data read from a model folder, from which a model format creates its motion model.
 pub(super) struct ModelParts<'a> {
-    /// Training arguments of `cfg_args`.
+    /// Training arguments from the file `cfg_args`.
     pub(super) arguments: &'a Arguments,
-    /// Tensors of the network.
+    /// Tensors of the network, by name.
     pub(super) tensors: &'a Tensors,
-    /// Path of the file of `tensors`.
+    /// Path of the file with the network's tensors.
     pub(super) file: &'a Path,
-    /// Number of properties `fea_*` in the point cloud file.
+    /// Number of features of a Gaussian (properties `fea_*` in the point cloud file).
     pub(super) features: usize,
-    /// Path of the point cloud file.
+    /// Path of the point cloud file, for error messages.
     pub(super) cloud: &'a Path,
 }
 
-/// Open model folder.
+/// Opened model folder with a subfolder `deform`.
 pub(super) struct DeformFolder<L> {
     paths: Paths,
     model: MotionModelFrames<L>,
@@ -85,7 +86,7 @@ pub(super) struct DeformFolder<L> {
 }
 
 impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
-    /// Opens the model at `root`. `make` returns its motion model and notes for the user.
+    /// Opens the model folder `root`. `make` returns its motion model and notes for the user.
     ///
     /// # Errors
     /// Fails if files are missing or damaged, or if `make` refuses the model.
@@ -116,12 +117,12 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         }))
     }
 
-    /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
+    /// Returns the text of `cfg_args`, with the SH degree lowered to `sh_degree` if it is higher.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
     }
 
-    /// Writes the compressed model as a folder at `path`.
+    /// Writes the compressed model as a model folder at `path`.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let to = Paths::new(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
@@ -138,7 +139,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let mut rows = rows_of_model(reduction);
         for cluster in &reduction.clusters {
-            // A proxy gets the features of its heaviest member.
+            // A proxy gets the features of its member (merged Gaussian) with the largest weight.
             rows[cluster.output as usize].source = heaviest(cluster);
         }
         let template = Ply::open(&self.paths.point_cloud)?;
@@ -146,14 +147,14 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     }
 }
 
-/// Returns the member with the largest weight, the first of several.
+/// Returns the member of `cluster` with the largest weight; the first one in a tie.
 fn heaviest(cluster: &Cluster) -> u32 {
     let first = (cluster.leader, f64::NEG_INFINITY);
     cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0
 }
 
-/// Reads the parameters of all Gaussians, with the properties `fea_0`, `fea_1`, … as format-specific planes. Fails if
-/// values that the network reads or that are decomposed are not finite.
+/// Reads the stored parameters of all Gaussians; the properties `fea_0`, `fea_1`, … become format-specific parameters
+/// ([`StoredParams::own`]). Fails if a value is not finite that the network reads or that is needed for the covariance.
 fn raw(ply: &Ply) -> Result<StoredParams> {
     let count = ply.count();
     let gaussians = ply.whole()?;
@@ -167,7 +168,7 @@ fn raw(ply: &Ply) -> Result<StoredParams> {
             read_plane(ply.row(row), &[0], property, big_endian, std::slice::from_mut(value));
         }
     }
-    // Check the columns that the network reads or that are decomposed.
+    // Check the parameters that the network reads or that are needed for the covariance.
     let read = [&gaussians.position, &gaussians.rotation, &gaussians.log_scale, &own];
     for (column, name) in read.into_iter().zip(["x y z", "rot", "scale", "fea"]) {
         if let Some(at) = column.planes().iter().position(|value| !value.is_finite()) {
@@ -184,7 +185,7 @@ fn raw(ply: &Ply) -> Result<StoredParams> {
     Ok(StoredParams { gaussians, own })
 }
 
-/// Returns the sizes of the files that a renderer opens.
+/// Returns the size in bytes of the files that a renderer opens, divided into parts.
 fn size_of(paths: &Paths) -> Result<Size> {
     let (cloud, field) = (bytes_read_for([&*paths.point_cloud])?, bytes_read_for([&*paths.network])?);
     Ok(Size { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..Size::default() })
@@ -224,14 +225,15 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         let whole = state_bytes(self.model.info().sh_degree, Attributes::all()) + features;
         MemoryProfile {
             per_gaussian: whole,
-            // Normals and other extra properties are stored beside the attributes.
+            // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             opening: whole + 24,
-            // A copy of the parameters, values prepared from them, and the deltas of a block.
+            // A copy of the stored parameters, the values prepared from them, and the network's outputs for a block of
+            // Gaussians.
             reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
             file: whole + 24,
-            // Tensors as read and as used.
+            // Two copies of the network's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes + motion_model.bytes() as u64,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
@@ -245,7 +247,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         Timing::Continuous
     }
 
-    /// Uses camera times unchanged, since the network was trained with them.
+    /// Leaves camera times unchanged, since the network was trained with them.
     fn clock(&self) -> Clock {
         Clock::Given
     }

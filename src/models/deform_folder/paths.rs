@@ -1,4 +1,4 @@
-//! Files of a model folder with a subfolder `deform`.
+//! Paths and tensors of a model folder with a subfolder `deform`.
 
 use std::path::{Path, PathBuf};
 
@@ -11,38 +11,38 @@ use crate::files::state_dict::{is_pair, names, read_state_dict};
 use crate::limits::ReadLimit;
 use crate::models::iterations::iteration_numbers;
 
-/// Name of the folder of point cloud files.
+/// Name of the subfolder that holds the point cloud files.
 const POINT_CLOUD_FOLDER: &str = "point_cloud";
-/// Name of the folder of networks.
+/// Name of the subfolder that holds the networks.
 const NETWORK_FOLDER: &str = "deform";
-/// Name of the network file in an iteration folder.
+/// Name of the file with the network in a folder `iteration_K`.
 const NETWORK_FILE: &str = "deform.pth";
 
 /// Paths of the files of a model folder.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Paths {
     pub(super) root: PathBuf,
-    /// K of both folders `iteration_K`.
+    /// Training iteration K of both folders `iteration_K`.
     pub(super) iteration: u32,
     pub(super) cfg_args: PathBuf,
     pub(super) point_cloud: PathBuf,
-    /// State dict of the network.
+    /// Path of the state dict (tensors by name) of the network.
     pub(super) network: PathBuf,
 }
 
-/// Returns whether a folder contains a network `deform/iteration_K/deform.pth`.
+/// Returns whether the folder `root` contains a network in a file `deform/iteration_K/deform.pth`.
 pub(in crate::models) fn has_network(root: &Path) -> bool {
     iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).is_ok_and(|found| !found.is_empty())
 }
 
-/// Returns the tensor names of the last network of a folder; empty if the file cannot be read. Opening the model then
-/// reports the error.
+/// Returns the names of the tensors in the network of the largest iteration; empty if the file cannot be read. Opening
+/// the model then reports the error.
 pub(in crate::models) fn network_tensor_names(root: &Path, memory: ReadLimit) -> Vec<String> {
     let last = iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).ok().and_then(|found| found.last().copied());
     last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
-/// Returns the number K of each folder `iteration_K` in `within` that contains `file`, in increasing order.
+/// Returns the number K of each subfolder `iteration_K` of `within` that contains `file`, in increasing order.
 fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
     let mut found = iteration_numbers(within)?;
     found.retain(|k| within.join(format!("iteration_{k}")).join(file).is_file());
@@ -50,8 +50,8 @@ fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
 }
 
 impl Paths {
-    /// Finds the files of the model at `root`: of `iteration`, or of the largest iteration that has both a point cloud
-    /// and a network.
+    /// Finds the files of the model folder `root`, of the requested `iteration`, or of the largest one that has both a
+    /// point cloud file and a network.
     ///
     /// # Errors
     /// Fails if a folder or file is missing.
@@ -89,7 +89,7 @@ impl Paths {
         }
     }
 
-    /// Returns the paths of training iteration `k` in `root`.
+    /// Returns the paths of the files of training iteration `k` in the model folder `root`.
     pub(super) fn new(root: &Path, k: u32) -> Paths {
         let within = |folder: &str| root.join(folder).join(format!("iteration_{k}"));
         Paths {
@@ -104,7 +104,7 @@ impl Paths {
     /// Reads the tensors of the network.
     ///
     /// # Errors
-    /// Fails if the file is not a state dict, or belongs to Grid4D.
+    /// Fails if the file is not a state dict (tensors by name), or belongs to a Grid4D model.
     pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
         let grid4d_hint = "hash grids are not supported: export the Gaussians of each frame as a PLY with the model's \
                            own code, and give the folder of these files";
@@ -121,8 +121,8 @@ impl Paths {
         })
     }
 
-    /// Returns the xxh3-128 hash of the bytes of point cloud, network and `cfg_args`, as 32 hex digits. Fails if a file
-    /// cannot be read.
+    /// Returns the xxh3-128 hash of the bytes of the point cloud file, the network and `cfg_args`, as 32 hex digits.
+    /// Fails if a file cannot be read.
     pub(super) fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         [&self.point_cloud, &self.network, &self.cfg_args]

@@ -1,9 +1,10 @@
-//! Proxies of Gaussians that a network deforms.
+//! Computes proxies (Gaussians that replace merged ones) for models where a network deforms the Gaussians.
 //!
 //! The network's output depends on the canonical position of a Gaussian, so the position of a proxy is searched for and
-//! not averaged. Candidates are the positions of the heaviest members and their mean. The candidate whose path is
-//! nearest to the moment match of the members is improved by Gauss-Newton steps. Scale and rotation are then the target
-//! values minus the network's output at that position, on average over sampled frames.
+//! not averaged. Candidates are the positions of the members (merged Gaussians) with the largest weights, and the mean
+//! of all members. The target at a frame is the moment match of the members. The candidate whose path is nearest to the
+//! target is improved by Gauss-Newton steps. Scale and rotation are then the target values minus the network's output
+//! at that position, on average over sampled frames.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -18,19 +19,20 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::{Deformation, FrameSource};
 
-/// Maximum number of frames at which positions are compared, and over which scales and rotations are averaged.
+/// Maximum number of frames at which a proxy is compared with its target.
 const SAMPLED_FRAMES: usize = 16;
-/// Maximum number of members whose positions are candidates.
+/// Maximum number of members of a cluster whose positions are candidates for the position of the proxy.
 const MAX_CANDIDATES: usize = 4;
-/// Number of Gauss-Newton steps of the position.
+/// Number of Gauss-Newton steps that improve the position of a proxy.
 const STEPS: usize = 2;
-/// Number of corrections of scale and rotation.
+/// Number of times that the scale and rotation of a proxy are corrected toward the target.
 const CORRECTIONS: usize = 3;
-/// Damping of a Gauss-Newton step: added to the diagonal, relative to its mean. If all frames move alike the matrix is
-/// well conditioned; otherwise a shorter step is better.
+/// Damping of a Gauss-Newton step: this fraction of the mean of the matrix's diagonal is added to the diagonal. If the
+/// position moves alike in all frames, the matrix is well conditioned; otherwise a shorter step is better.
 const DAMPING: f64 = 1e-3;
 
-/// Returns the parameters of the proxies of `clusters`, one row each, that approximate the motion of their members.
+/// Returns the stored parameters of the proxies of `clusters`, one row each. They approximate the motion of the
+/// members.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -60,7 +62,7 @@ pub(super) fn propose<L: NetworkMotionModel>(
         by_weight.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         by_weight.truncate(MAX_CANDIDATES);
         candidates.extend(by_weight.into_iter().map(|(id, _)| id));
-        // The last candidate is moved to the mean below.
+        // The position of the last candidate is set to the mean of the members below.
         candidates.push(cluster.leader);
         candidate_rows.push(first..candidates.len());
         features.resize(candidates.len(), heaviest(cluster));
@@ -99,12 +101,13 @@ pub(super) fn propose<L: NetworkMotionModel>(
     Ok(made)
 }
 
-/// Returns the position of a Gaussian.
+/// Returns the position of the Gaussian in row `row` of `state`.
 fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for every row of `raw` the sum over frames of its squared distance from the position that `wanted` returns.
+/// Returns for every Gaussian of `raw` the squared distance from the position that `wanted` returns, summed over
+/// `frames`.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -121,7 +124,7 @@ fn squared_distances<L: NetworkMotionModel>(
     Ok(off)
 }
 
-/// Returns `raw` with every position improved by one Gauss-Newton step.
+/// Returns `raw` with the position of every proxy moved by one Gauss-Newton step toward its targets `wanted`.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -135,7 +138,7 @@ fn gauss_newton_step<L: NetworkMotionModel>(
         let slopes = Deformation::jacobian(model, frame, raw, Attributes::POSITION)?;
         let slopes = slopes.column(Attributes::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
-            // Plane 3·i + j is the derivative of component i by component j, so reading columns gives the transpose.
+            // Plane 3·i + j holds the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
             *matrix += transposed * transposed.transpose();
             *vector += transposed * (position(wanted, row) - position(&state, row));
@@ -153,9 +156,10 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all parameters except the position. Starts from the leader and adds the mean difference between target and
-/// state, [`CORRECTIONS`] times. One correction suffices if the network's output is simply added; quaternions that are not
-/// normalized need several. Keeps the best scale and rotation.
+/// Sets all stored parameters of the proxies `made` except their positions. Starts with the parameters of the leaders
+/// and, [`CORRECTIONS`] times, adds the mean over `frames` of target `wanted` minus state. One correction suffices if
+/// the network's output is simply added; quaternions that are not normalized need several. Each proxy keeps the scale
+/// and rotation with the smallest difference.
 fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,
@@ -175,7 +179,7 @@ fn shape<L: NetworkMotionModel>(
             Deformation::state(model, frame, made, Attributes::all(), &mut state)?;
             all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
             if wanted.sh.len() == made.len() {
-                // SH coefficients are compared at one frame: their change over time is the same at all frames.
+                // SH coefficients are compared at one frame only: their change over time is the same at all frames.
                 for c in 0..state.sh.width() {
                     let more = wanted.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
                     made.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
@@ -192,23 +196,23 @@ fn shape<L: NetworkMotionModel>(
             }
         }
     }
-    // Opacities and SH coefficients are right after the first correction.
+    // Opacities and SH coefficients agree with the target after the first correction.
     (made.gaussians.rotation, made.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
     Ok(())
 }
 
-/// Difference between target and state of one row, summed over frames.
+/// Target state minus state of one proxy, summed over frames.
 #[derive(Clone, Copy, Default)]
 struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Sum of squared differences of log scales and of unit quaternions.
+    /// Squared differences of log scales and of unit quaternions, summed over frames.
     off: f64,
 }
 
 impl StateDifference {
-    /// Adds the difference between `wanted` and `state` at one frame.
+    /// Adds `wanted` (the target) minus `state` in row `row`, at one frame.
     fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
@@ -227,20 +231,20 @@ impl StateDifference {
         self.opacity += to - from;
     }
 
-    /// Adds the mean difference to the parameters of a row. `share` is 1 / number of frames.
+    /// Adds the mean difference to the stored parameters in row `row` of `to`. `share` is 1 / number of frames.
     fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);
         to.log_scale.set_row(row, scale);
         let own = to.rotation.row::<4>(row).map(f64::from);
-        // If quaternions are normalized first, the correction is scaled by their length.
+        // If stored quaternions are normalized first, the correction is multiplied by their length.
         let long = if L::NORMALIZES_ROTATION { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
         let rotation = [0, 1, 2, 3].map(|c| (own[c] + long * share * self.rotation[c]) as f32);
         if rotation.iter().all(|x| x.is_finite()) {
             to.rotation.set_row(row, rotation);
         }
         let alpha = (opacity(to.opacity_logit.plane(0)[row]) + share * self.opacity).clamp(1e-6, 1.0 - 1e-6);
-        // An opacity without difference keeps its bits.
+        // An opacity without a difference keeps its exact bits.
         if self.opacity != 0.0 {
             to.opacity_logit.set_row(row, [logit(alpha) as f32]);
         }

@@ -1,4 +1,5 @@
-//! Tests of both formats with random models: states against the formulas in f64, outputs read back, and refused inputs.
+//! Tests of Deformable-3D-Gaussians and SC-GS with random models: states against the formulas in f64, outputs read
+//! back, and refused inputs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,7 +26,7 @@ use crate::source::FrameSource;
 const COUNT: usize = 40;
 const TIMES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 
-/// Content of a model folder to be written.
+/// Model folder that a test writes.
 struct TestModel {
     folder: TempDir,
     cfg_args: String,
@@ -50,7 +51,7 @@ impl TestModel {
         }
     }
 
-    /// Creates a model of SC-GS with 12 nodes, 2 hyper dimensions and a mask.
+    /// Creates a model of SC-GS with 12 control nodes, 2 features per Gaussian (`hyper_dim`) and a motion mask.
     fn sc_gs(kind: DeepVariant) -> TestModel {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
@@ -78,7 +79,7 @@ impl TestModel {
         self.path().join(folder).join(format!("iteration_{k}")).join(name)
     }
 
-    /// Writes all files as training iteration `k`.
+    /// Writes all files of the model folder as training iteration `k`.
     fn write(&self, k: u32) {
         let [network, cloud] = ["deform", "point_cloud"].map(|folder| self.file(folder, k));
         for file in [&network, &cloud] {
@@ -98,7 +99,7 @@ impl TestModel {
         fs::write(cloud, bytes).unwrap();
     }
 
-    /// Writes the model, opens it and sets frame times.
+    /// Writes the model folder, opens it and sets frame times.
     fn open(&self) -> Box<dyn InputModel> {
         self.write(7);
         open(&self.path()).unwrap()
@@ -116,7 +117,7 @@ impl TestModel {
     }
 }
 
-/// Scales the weights of the last layers so that Gaussians move by some tenths of a unit.
+/// Scales the weights of the network's last layers so that Gaussians move by some tenths of a scene unit.
 fn small(mut tensor: Tensor) -> Tensor {
     // Heads are recognized by their few outputs.
     if tensor.shape[0] < 5 {
@@ -149,7 +150,7 @@ fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
     (0..TIMES.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
 }
 
-/// Returns R·S²·Rᵀ by the formula of the rasterizer, which accepts any quaternion.
+/// Returns the covariance R·S²·Rᵀ by the formula of the rasterizer, which accepts quaternions of any length.
 fn covariance(scales: [f64; 3], [w, x, y, z]: [f64; 4]) -> DMat3 {
     let rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -175,7 +176,7 @@ fn relative_difference(a: DMat3, b: DMat3) -> f64 {
     most(a - b) / most(b)
 }
 
-/// Returns the network's output for canonical positions at a time.
+/// Returns the network's output for the canonical positions `places` at `time`.
 fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> PredictedMotion {
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();
@@ -309,7 +310,7 @@ fn jacobian_agrees_with_finite_differences() {
             deformation.state(3, raw, want, &mut out).unwrap();
             out
         };
-        // Small compared to 1/512, large compared to the f32 error of a difference.
+        // The step is small compared to 1/512 and large compared to the f32 error of a difference.
         let step = 3e-5f32;
         let (mut wrong, mut all) = (0, 0);
         for column in want.difference(Attributes::SH).iter() {
@@ -342,7 +343,7 @@ fn jacobian_agrees_with_finite_differences() {
     }
 }
 
-/// Returns a compressed model with two proxies and parameter deltas.
+/// Returns a compressed model with two proxies (Gaussians that replace merged ones) and parameter deltas.
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let mut reduction = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
@@ -350,7 +351,7 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
         Cluster { output: 1, leader: 4, members: vec![(3, 0.6), (4, 0.4)] },
         Cluster { output: 3, leader: 12, members: vec![(12, 0.5), (17, 0.25), (39, 0.25)] },
     ];
-    // Random motion exceeds any drift limit, so the limit is lifted to test the writing of proposed proxies.
+    // Random motion exceeds any drift limit, so the limit is lifted to test how proposed proxies are written.
     let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
     let reference = Reference { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
@@ -431,7 +432,7 @@ fn proxy_of_equal_members_equals_them() {
         let (shown, all) = (model.reduced(&reduction).unwrap(), states(model.source()));
         for (frame, state) in states(&*shown).iter().enumerate() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
-            // Scales and rotations are right on average only; random quaternions have any length.
+            // Scales and rotations of proxies are right on average only; random quaternions have any length.
             let found = relative_difference(state_covariance(state, 0), state_covariance(&all[frame], 0));
             assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.kind());
         }
@@ -476,7 +477,7 @@ fn models_that_are_not_read_are_refused_by_name() {
     let mut made = TestModel::sc_gs(KINDS[0]);
     made.cfg_args = made.cfg_args.replace("K=3", "max_d_scale=1.5");
     assert!(made.message().contains("max_d_scale"));
-    // A file with two state dicts.
+    // A file that contains two state dicts.
     let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     let mut archive = zip::ZipWriter::new(fs::File::create(made.file("deform", 7)).unwrap());

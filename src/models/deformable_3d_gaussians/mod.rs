@@ -1,11 +1,11 @@
-//! Deformable-3D-Gaussians as a model format: canonical Gaussians that a network of position and time deforms.
+//! Deformable-3D-Gaussians as a model format: a network of position and time deforms canonical Gaussians.
 //!
-//! State at time t, from the network's output at the canonical position: x = xyz + warp, or the screw motion of xyz;
-//! scale = exp(scale) + d_scaling, of which only the square matters; rotation = rot/|rot| + d_rotation, not normalized
-//! again. For a quaternion of length n the rasterizer's formula gives R(q) = (1 − n²)·I + n²·R(q/n), which is not a
-//! rotation, so the covariance R(q)·S²·R(q)ᵀ is decomposed here. Opacity and SH coefficients are constant. Source: Yang
-//! et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024, and its public
-//! code.
+//! At time t, the network's output at the canonical position `xyz` gives the state of a Gaussian. Position: xyz + warp,
+//! or the screw motion of xyz. Scale: exp(scale) + d_scaling, of which only the square matters. Rotation: rot/|rot| +
+//! d_rotation, not normalized again. For a quaternion of length n the rasterizer's formula gives R(q) = (1 − n²)·I +
+//! n²·R(q/n), which is not a rotation, so the covariance R(q)·S²·R(q)ᵀ is decomposed here. Opacity and SH coefficients
+//! are constant. Source: Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene
+//! Reconstruction", 2024, and its public code.
 
 mod screw;
 
@@ -18,13 +18,13 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Deformable-3D-Gaussians model folder.
+/// Model folder of Deformable-3D-Gaussians.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_network(found.path),
     open: |path, options| DeformFolder::open(path, options, DeformableMotion::new),
 };
 
-/// Columns that follow from the covariance.
+/// Attributes that are computed from the covariance.
 const SHAPE: Attributes = Attributes::ROTATION.union(Attributes::LOG_SCALE);
 
 /// Motion model of Deformable-3D-Gaussians.
@@ -34,7 +34,8 @@ struct DeformableMotion {
 }
 
 impl DeformableMotion {
-    /// Reads the network, and adds a note where `cfg_args` contradicts its weights.
+    /// Creates the motion model from the network. Also returns a note for each key of `cfg_args` that contradicts the
+    /// network's weights.
     fn new(parts: &ModelParts<'_>) -> Result<(DeformableMotion, Vec<String>)> {
         if !parts.tensors.contains_key("linear.0.weight") {
             let names: Vec<&str> = parts.tensors.keys().map(String::as_str).take(6).collect();
@@ -60,7 +61,7 @@ impl DeformableMotion {
 }
 
 impl DeformableMotion {
-    /// Returns the network's output for the columns `want` of a block.
+    /// Returns the network's outputs at `time` that are needed for the attributes `want` of a block of Gaussians.
     fn motion(&self, time: f64, encoded: &Encoded, want: Attributes) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Attributes::empty() } else { SHAPE };
@@ -132,7 +133,7 @@ impl MotionModel for DeformableMotion {
     }
 
     /// Returns the derivative of positions only. The covariance depends on scales and rotations too, but its
-    /// decomposition is not continuous from frame to frame.
+    /// decomposition into scales and rotation is not continuous from frame to frame.
     fn jacobian(&self, time: f64, raw: &StoredParams, encoded: &Encoded, want: Attributes) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Attributes::POSITION) {
@@ -155,7 +156,7 @@ impl MotionModel for DeformableMotion {
                         }
                         false => unit + along(0),
                     };
-                    // If the network has no derivative, use the identity.
+                    // If the network's output has no finite derivative, use the identity.
                     let change = if change.is_finite() { change } else { unit };
                     (0..3).for_each(|i| out.plane_mut(3 * i + axis)[row] = change[i] as f32);
                 }
@@ -174,23 +175,24 @@ impl NetworkMotionModel for DeformableMotion {
         Network::BYTES_PER_GAUSSIAN
     }
 
-    /// Returns the seconds measured by `benches/families.rs`, as a function of the size of the network.
+    /// Returns the CPU seconds per state, measured by `benches/families.rs`, as a function of the size of the network.
     fn seconds_per_state(&self) -> f64 {
         1e-6 + 2e-11 * self.network.multiplications() as f64
     }
 }
 
-/// Returns position, axis w and translation v of a screw motion as vectors.
+/// Returns the position, the axis w and the translation v of a screw motion as vectors.
 fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }
 
-/// Returns R(q)·S²·R(q)ᵀ of the values that a renderer passes to the rasterizer: xx xy xz yy yz zz.
+/// Returns the covariance R(q)·S²·R(q)ᵀ of a deformed Gaussian as xx xy xz yy yz zz. `by` holds the network's outputs
+/// for scale and rotation.
 fn covariance(scales: [f64; 3], rotation: [f64; 4], by: ([f32; 3], [f32; 4])) -> [f64; 6] {
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-12);
     let [w, x, y, z] = [0, 1, 2, 3].map(|c| rotation[c] / length + f64::from(by.1[c]));
     let scales = DVec3::from([0, 1, 2].map(|c| scales[c] + f64::from(by.0[c])));
-    // The formula for unit quaternions, applied to a quaternion of any length as the rasterizer does.
+    // The formula for unit quaternions, applied to a quaternion of any length as in the rasterizer.
     let turn = DMat3::from_cols(
         DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         DVec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),

@@ -1,19 +1,19 @@
-//! Screw motions, used by the variant with six degrees of freedom.
+//! Screw motions, by which the variant of Deformable-3D-Gaussians with six degrees of freedom moves positions.
 //!
-//! The network outputs w and v. θ = |w|; w ← w/θ + 1e-5 and v ← v/θ + 1e-5 in every component, so that w is not exactly
-//! unit. With W the matrix of w×: x′ = (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v.
-//! Source: `exp_se3` of the authors' code.
+//! The network outputs w and v, from which θ = |w|. Then w becomes w/θ + 1e-5 and v becomes v/θ + 1e-5 in every
+//! component, so that w is not exactly unit. With W the matrix of the cross product with w, the moved position is x′ =
+//! (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v. Source: `exp_se3` of the authors' code.
 
 use glam::DVec3;
 
-/// Value added to every component of the normalized vectors.
+/// Value added to every component of w/θ and v/θ.
 const EPSILON: f64 = 1e-5;
-/// Minimum angle; below it the limit x + v is used, where the original divides by zero.
+/// Minimum angle θ = |w|. Below it, the limit x + v is used, where the original code divides by zero.
 const MIN_ANGLE: f64 = 1e-30;
-/// Half step of numerical derivatives for values of size 1: the cube root of the f64 precision.
+/// Half step of numerical derivatives with respect to values of size 1: the cube root of the f64 precision.
 const HALF_STEP: f64 = 6e-6;
 
-/// Returns the position of `x` after the screw motion.
+/// Returns the position `x` moved by the screw motion with the network's outputs `w` and `v`.
 pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     let angle = w.length();
     if angle < MIN_ANGLE {
@@ -25,10 +25,10 @@ pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     turned + angle * v + rest * w.cross(v) + (angle - sine) * w.cross(w.cross(v))
 }
 
-/// Returns the derivative of the moved position along an axis of x, where w and v change with derivatives `of_w` and
-/// `of_v`. Uses central differences of all three together.
+/// Returns the derivative of the moved position when x moves along `axis` and w and v change with the derivatives
+/// `of_w` and `of_v`. Uses central differences in which x, w and v change together.
 pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
-    // Screws may change fast with x, so the step is shortened accordingly.
+    // Screw motions may change fast with x, so the step is shortened accordingly.
     let step = HALF_STEP / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
     let at = |by: f64| apply_screw(x + by * axis, w + by * of_w, v + by * of_v);
     (at(step) - at(-step)) / (2.0 * step)
@@ -40,7 +40,7 @@ mod tests {
 
     use super::*;
 
-    /// Computes the motion by the matrix formula.
+    /// Returns the moved position, computed from the matrix formula.
     fn by_matrices(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
         let angle = w.length();
         let (w, v) = (w / angle + DVec3::splat(1e-5), v / angle + DVec3::splat(1e-5));
@@ -66,7 +66,7 @@ mod tests {
         let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
         let slopes = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
         let wide = |by: f64| apply_screw(x + by * DVec3::Y, w + by * slopes[0], v + by * slopes[1]);
-        // Reference value: Richardson extrapolation of wider differences.
+        // Reference value: Richardson extrapolation of two wider differences.
         let [one, two] = [1e-3, 2e-3].map(|by| (wide(by) - wide(-by)) / (2.0 * by));
         let expected = (4.0 * one - two) / 3.0;
         let found = slope(x, w, v, DVec3::Y, slopes);

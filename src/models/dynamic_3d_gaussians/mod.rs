@@ -1,7 +1,7 @@
-//! Dynamic3DGaussians as a model format: explicit trajectories in a `params.npz`.
+//! Dynamic3DGaussians as a model format: explicit trajectories in a file `params.npz`.
 //!
-//! The output is a folder with a `params.npz` of the same arrays in the same order and types. Unchanged values keep
-//! their bytes.
+//! The output is a folder with a `params.npz` that has the same arrays in the same order and with the same types.
+//! Unchanged values keep their bytes.
 
 mod params;
 mod proxies;
@@ -27,10 +27,10 @@ use crate::source::{FrameSource, Ids};
 use params::{COLORS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
 use proxies::MergedSource;
 
-/// Name of the file in a model folder.
+/// Name of the file that holds the model.
 const FILE: &str = "params.npz";
 
-/// `params.npz`, or the folder that holds it.
+/// File `params.npz` of Dynamic3DGaussians, or the folder that contains it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
@@ -71,7 +71,7 @@ impl InputModel for Params {
             per_gaussian: 0,
             opening: 0,
             reader: 8,
-            // Scales and opacities of proxies, and their indices.
+            // Scales and opacities of proxies (Gaussians that replace merged ones), and their indices.
             reduced: state_bytes(0, Attributes::all()) + 16,
             jacobian: 0,
             file: 0,
@@ -92,7 +92,7 @@ impl InputModel for Params {
         Ok(Box::new(Params::with_times(*self, times)?))
     }
 
-    /// Returns black, which the authors' training uses.
+    /// Returns black as the background color, which the authors' training uses.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }
@@ -136,7 +136,7 @@ impl InputModel for Params {
 }
 
 impl Params {
-    /// Writes the compressed model as the file `path`.
+    /// Writes the compressed model as a `params.npz` file to `path`.
     fn write_params(&self, reduction: &CompressedModel, path: PathBuf) -> Result<()> {
         let merged = MergedSource::new(self, reduction);
         let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
@@ -153,7 +153,7 @@ impl Params {
                     COLORS => Attributes::SH,
                     LOG_SCALES => Attributes::LOG_SCALE,
                     OPACITIES => Attributes::OPACITY,
-                    // Proxies keep the segment of their leader.
+                    // Proxies keep the segment color of their leader (the Gaussian that the others were merged with).
                     _ => return Ok(Vec::new()),
                 };
                 let (width, is_color) = (column.width(0), column == Attributes::SH);

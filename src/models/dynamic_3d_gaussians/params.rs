@@ -1,10 +1,10 @@
-//! `params.npz` of Dynamic3DGaussians: position, rotation and color of every Gaussian at every frame; scale and opacity
-//! constant in time.
+//! File `params.npz` of Dynamic3DGaussians: position, rotation and color of every Gaussian at every frame; scale and
+//! opacity constant in time.
 //!
-//! Arrays, with T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], wxyz of any
-//! length; `rgb_colors` [T, N, 3], a color independent of direction; `log_scales` [N, 3]; `logit_opacities` [N, 1];
-//! `seg_colors` [N, 3], red above ½ in the foreground. Other arrays do not affect renders. Source: `load_scene_data` of
-//! the authors' visualizer.
+//! Arrays, with T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], quaternions
+//! wxyz of any length; `rgb_colors` [T, N, 3], colors independent of direction; `log_scales` [N, 3]; `logit_opacities`
+//! [N, 1]; `seg_colors` [N, 3], where a red value above ½ marks the foreground. Other arrays do not affect renders.
+//! Source: `load_scene_data` of the authors' visualizer.
 
 use std::path::{Path, PathBuf};
 
@@ -14,23 +14,23 @@ use crate::files::npz::{Floats, Npz, NpzArray};
 use crate::model::{Attributes, Gaussians, SequenceInfo, harmonic};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
-/// Array of positions.
+/// Name of the array of positions.
 pub(super) const MEANS: &str = "means3D";
-/// Array of quaternions.
+/// Name of the array of quaternions.
 pub(super) const ROTATIONS: &str = "unnorm_rotations";
-/// Array of colors.
+/// Name of the array of colors.
 pub(super) const COLORS: &str = "rgb_colors";
-/// Array of log scales.
+/// Name of the array of log scales.
 pub(super) const LOG_SCALES: &str = "log_scales";
-/// Array of opacity logits.
+/// Name of the array of opacity logits.
 pub(super) const OPACITIES: &str = "logit_opacities";
-/// Array of segment colors.
+/// Name of the array of segment colors, whose red value tells foreground from background.
 const SEGMENTS: &str = "seg_colors";
 
-/// Red value of a segment color above which a Gaussian is foreground.
+/// Red value of the segment color above which a Gaussian belongs to the foreground.
 const FOREGROUND: f32 = 0.5;
 
-/// Open `params.npz`.
+/// Opened `params.npz` file.
 #[derive(Debug)]
 pub(super) struct Params {
     npz: Npz,
@@ -45,11 +45,12 @@ pub(super) struct Params {
 }
 
 impl Params {
-    /// Opens `path`. Frame i of T has time i / (T − 1). Arrays that are compressed or not f32 are decoded into
-    /// `scratch`.
+    /// Opens the file at `path`. Frame i of T frames has the time i / (T − 1). Arrays that are compressed or not f32
+    /// are decoded into temporary files in the folder `scratch`.
     ///
     /// # Errors
-    /// Fails if the file is not an archive, if arrays are missing or have other shapes, or if the model is static.
+    /// Fails if the file is not an `.npz` archive, if arrays are missing or have other shapes, or if the model is
+    /// static.
     pub(super) fn open(path: &Path, scratch: &Path) -> Result<Params> {
         let npz = Npz::open(path)?;
         let [frames, count] = match npz.entry(MEANS).map(|entry| &entry.shape[..]) {
@@ -74,7 +75,7 @@ impl Params {
             (SEGMENTS, &[count, 3]),
         ];
         let expected = &expected[..if has_segments { 6 } else { 5 }];
-        // Check all shapes and types before decoding any array.
+        // Check the shapes and types of all arrays before decoding any.
         for &(name, shape) in expected {
             if let Some(entry) = npz.entry(name).filter(|entry| entry.shape != shape) {
                 return Err(Error::input(path, name, shape_text(shape), shape_text(&entry.shape))
@@ -105,31 +106,31 @@ impl Params {
         })
     }
 
-    /// Returns the same frames at other times.
+    /// Returns the model with the same frames at other `times`.
     ///
     /// # Errors
-    /// Fails if the number of times is not T, or if times are not finite or do not increase.
+    /// Fails if the number of times is not the number of frames, or if times are not finite or do not increase.
     pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Params> {
         self.info = self.info.with_times(times)?;
         Ok(self)
     }
 
-    /// Returns the open file.
+    /// Returns the opened file with its arrays.
     pub(super) fn npz(&self) -> &Npz {
         &self.npz
     }
 
-    /// Returns the path of the file.
+    /// Returns the path of the `params.npz` file.
     pub(super) fn path(&self) -> PathBuf {
         self.npz.path().to_owned()
     }
 
-    /// Returns whether a Gaussian belongs to the foreground; `None` if the model has no segments.
+    /// Returns whether Gaussian `id` belongs to the foreground; `None` if the file has no segment colors.
     pub(super) fn is_foreground(&self, id: usize) -> Option<bool> {
         self.segments.as_ref().map(|segments| segments.row::<1>(3 * id)[0] > FOREGROUND)
     }
 
-    /// Returns the axis of an array that counts Gaussians.
+    /// Returns which axis of the array `entry` counts the Gaussians.
     pub(super) fn axis(entry: &NpzArray) -> GaussianAxis {
         match entry.name.as_str() {
             MEANS | ROTATIONS | COLORS => GaussianAxis::Second,
@@ -157,7 +158,7 @@ impl FrameSource for Params {
     }
 }
 
-/// Reader of some Gaussians.
+/// Reader of some Gaussians, frame by frame.
 struct TrajectoryBlock<'a> {
     params: &'a Params,
     ids: Vec<usize>,

@@ -1,7 +1,8 @@
-//! Proxies of a model whose positions, rotations and colors vary freely, but whose scales and opacities are constant.
+//! Computes proxies (Gaussians that replace merged ones) for a model where positions, rotations and colors vary freely,
+//! but scales and opacities are constant in time.
 //!
-//! Position, rotation and color of a proxy are the moment match of its members at every frame. Scale and opacity are
-//! the means of the moment matches over time.
+//! Position, rotation and color of a proxy are the moment match of its members (merged Gaussians) at every frame. Scale
+//! and opacity are means over time of those of the moment matches.
 
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
@@ -13,13 +14,13 @@ use crate::passes::{WithDelta, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Maximum number of frames over which scales and opacities are averaged.
+/// Maximum number of frames over which the scales and opacities of proxies are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// Columns that are constant in time.
+/// Attributes that are constant in time.
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
-/// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]: geometric means of
-/// scales, arithmetic means of opacities.
+/// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. They are geometric means
+/// of scales and arithmetic means of opacities over sampled frames.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -47,7 +48,7 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
     Ok(Proxies { raw: Some(raw.into()), ..Proxies::default() })
 }
 
-/// Returns the frames of the compressed model `reduction`.
+/// Returns the frames of the compressed model that `reduction` describes.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
     Box::new(WithDelta::new(
         Box::new(MergedSource::new(params, reduction)),
@@ -57,7 +58,7 @@ pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) ->
     ))
 }
 
-/// Merged sequence whose proxies have the scales and opacities computed by [`solve`].
+/// Frames of the compressed model; proxies have the constant scales and opacities computed by [`solve`].
 pub(super) struct MergedSource<'a> {
     merged: MergedSequence<'a>,
     reduction: &'a CompressedModel,
@@ -65,13 +66,14 @@ pub(super) struct MergedSource<'a> {
 }
 
 impl<'a> MergedSource<'a> {
-    /// Merges `params` as `reduction` says.
+    /// Creates the compressed model of `params` as `reduction` says.
     pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
         MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Returns the proxies among the output indices `places`: position in `places` and number of the proxy.
+    /// Returns, for each of the output indices `places` that is a proxy (merged Gaussian), its position in `places` and
+    /// the index of its cluster.
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =
@@ -81,7 +83,8 @@ impl<'a> MergedSource<'a> {
         places.enumerate().filter_map(|(row, place)| Some((row, by_output[found(place)?].1))).collect()
     }
 
-    /// Wraps a reader of the merged sequence so that proxies get their constant scales and opacities.
+    /// Returns a reader that reads the Gaussians `ids` from `reader` and sets the constant scales and opacities of
+    /// proxies.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
         let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
         Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
@@ -107,10 +110,10 @@ impl FrameSource for MergedSource<'_> {
     }
 }
 
-/// Reader that replaces the scales and opacities of proxies.
+/// Reader that replaces the scales and opacities of proxies (merged Gaussians) by their constant values.
 struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// Row and number of each proxy that is read.
+    /// For each proxy that is read, its row in the output and the index of its cluster.
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }

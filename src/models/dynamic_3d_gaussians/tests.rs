@@ -17,7 +17,7 @@ use crate::recipe::Recipe;
 /// Name, shape and values of each array of a model.
 type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;
 
-/// Returns three frames of five Gaussians; the last two are in the foreground.
+/// Returns the arrays of a model with three frames of five Gaussians; the last two Gaussians are in the foreground.
 fn arrays() -> Arrays {
     let ramp = |n: usize, from: f32, by: f32| (0..n).map(|i| from + by * (i % 17) as f32).collect::<Vec<f32>>();
     vec![

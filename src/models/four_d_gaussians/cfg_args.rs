@@ -1,4 +1,5 @@
-//! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`. It is parsed and never evaluated.
+//! File `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`. The text is parsed and never
+//! evaluated.
 
 use std::path::Path;
 
@@ -9,55 +10,57 @@ use crate::model::Attributes;
 use crate::files::open::read_small;
 use crate::files::python_literal::{Literal, parse_call};
 
-/// Maximum bytes of a file; larger than any namespace that an argument parser prints.
+/// Maximum bytes of a `cfg_args` file, more than any namespace that an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
-/// Name of the Python call in the file.
+/// Name of the Python call that a `cfg_args` file consists of.
 pub(in crate::models) const CALL_NAME: &str = "Namespace";
-/// Key of the SH degree.
+/// Key of the SH degree in `cfg_args`.
 const SH_DEGREE: &str = "sh_degree";
 
-/// Hyperparameters of a model, with the defaults of the original for keys that `cfg_args` lacks.
+/// Hyperparameters of a 4DGaussians model. Keys that `cfg_args` lacks have the defaults of the original code.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelConfig {
-    /// Maximum SH degree; default 3.
+    /// Maximum SH degree of the Gaussians; default 3.
     pub sh_degree: i64,
-    /// Folder of the training data.
+    /// Path of the folder with the training data.
     pub source_path: Option<String>,
-    /// Whether the background is white rather than black; default false.
+    /// Whether the background of the training images is white rather than black; default false.
     pub white_background: bool,
-    /// Width of the network; default 64. The shapes of the tensors take precedence.
+    /// Width of the deformation network; default 64. The shapes of the tensors take precedence.
     pub net_width: i64,
-    /// Number of layers of the trunk; default 1, and 0 means 1. The shapes of the tensors take precedence.
-    pub defor_depth: i64,
-    /// Spatial resolution of each level as a multiple; default `[1, 2, 4, 8]`. The shapes of the tensors take
+    /// Number of layers of the trunk, which all heads share; default 1, and 0 means 1. The shapes of the tensors take
     /// precedence.
+    pub defor_depth: i64,
+    /// Spatial resolution of each level of feature planes, as a multiple of `resolution`; default `[1, 2, 4, 8]`. The
+    /// shapes of the tensors take precedence.
     pub multires: Vec<i64>,
-    /// Resolution of the planes along x, y, z, t at level multiple 1; default `[64, 64, 64, 25]`. The shapes of the
-    /// tensors take precedence.
+    /// Resolution of the feature planes along x, y, z, t at multiple 1 (see `multires`); default `[64, 64, 64, 25]`.
+    /// The shapes of the tensors take precedence.
     pub resolution: Vec<i64>,
-    /// Number of channels of a plane; default 32. The shapes of the tensors take precedence.
+    /// Number of channels of a feature plane; default 32. The shapes of the tensors take precedence.
     pub channels: i64,
-    /// Half size of the initial box of the field; default 1.6. The stored box takes precedence.
+    /// Half the side of the initial box of space that the field covers, scene units; default 1.6. The stored box takes
+    /// precedence.
     pub bounds: f64,
-    /// Whether the position head is missing.
+    /// Whether the network does not deform positions (has no head for them).
     pub no_dx: bool,
-    /// Whether the scale head is missing.
+    /// Whether the network does not deform scales (has no head for them).
     pub no_ds: bool,
-    /// Whether the rotation head is missing.
+    /// Whether the network does not deform rotations (has no head for them).
     pub no_dr: bool,
-    /// Whether the opacity head is missing; default true.
+    /// Whether the network does not deform opacities (has no head for them); default true.
     pub no_do: bool,
-    /// Whether the SH head is missing; default true.
+    /// Whether the network does not deform SH coefficients (has no head for them); default true.
     pub no_dshs: bool,
-    /// Whether the network reads positions instead of planes.
+    /// Whether the network reads positions instead of features from planes.
     pub no_grid: bool,
-    /// Whether a network masks the raw parameters.
+    /// Whether a network computes a mask for the stored parameters of each Gaussian.
     pub static_mlp: bool,
-    /// Whether a voxel grid masks the raw parameters.
+    /// Whether a voxel grid provides a mask for the stored parameters of each Gaussian.
     pub empty_voxel: bool,
-    /// Number of sine and cosine frequencies added to the features; default 0, none.
+    /// Number of frequencies whose sines and cosines are added to the features; default 0, none.
     pub grid_pe: i64,
-    /// Whether the rotation delta multiplies the raw quaternion instead of being added.
+    /// Whether the field's rotation delta multiplies the stored quaternion instead of being added to it.
     pub apply_rotation: bool,
 }
 
@@ -70,7 +73,7 @@ impl ModelConfig {
         Self::parse(&read(path)?, path)
     }
 
-    /// Parses the text of `cfg_args`; `path` is for error messages.
+    /// Parses the text of a `cfg_args` file; `path` is for error messages.
     ///
     /// Unknown keys may hold any text whose brackets and quotes are balanced.
     pub fn parse(text: &str, path: &Path) -> Result<Self> {
@@ -107,7 +110,8 @@ impl ModelConfig {
         Ok(config)
     }
 
-    /// Returns a note for each hyperparameter that contradicts the shapes of the weights. The weights take precedence.
+    /// Returns a note for each hyperparameter that contradicts the shapes of the weights `tensors`, which take
+    /// precedence.
     pub(super) fn contradicted_by(&self, tensors: &Tensors) -> Vec<String> {
         const TRUNK: &str = "deformation_net.feature_out.";
         const GRIDS: &str = "deformation_net.grid.grids.";
@@ -126,7 +130,7 @@ impl ModelConfig {
         if !self.no_grid {
             let least = |list: &[i64]| list.first().copied().unwrap_or(1);
             let x = self.resolution.first().copied().unwrap_or(0) * least(&self.multires);
-            // Planes xy, xz, xt, yz, yt, zt; the first axis is the last dimension.
+            // Planes xy, xz, xt, yz, yt, zt; the first of the two axes is the last dimension of the tensor.
             found.extend([
                 (
                     "multires (levels)",
@@ -148,7 +152,7 @@ impl ModelConfig {
         found.into_iter().filter_map(differs).collect()
     }
 
-    /// Returns the settings that determine the evaluation of the deformation field.
+    /// Returns those hyperparameters that determine how the deformation field is evaluated.
     pub fn field(&self) -> FieldConfig {
         let off = [
             (self.no_dx, Attributes::POSITION),
@@ -177,8 +181,8 @@ pub(in crate::models) fn read(path: &Path) -> Result<String> {
     })
 }
 
-/// Returns `text` with SH degree `degree` and all other bytes unchanged. If `text` does not give the degree, it becomes
-/// the first key. `path` is for error messages.
+/// Returns `text`, the content of a `cfg_args` file, with the SH degree `degree` and all other bytes unchanged. If
+/// `text` does not give the SH degree, it becomes the first key. `path` is for error messages.
 pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
     let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
@@ -192,16 +196,16 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
     Ok([&text[..place.start], &value, &text[place.end..]].concat())
 }
 
-/// Returns the text of the `cfg_args` file at `path`, for an output with SH degree `degree` of a model with SH degree
-/// `own`. The text is unchanged unless the degree becomes lower.
+/// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `own` is the SH degree of
+/// the model; the text is unchanged unless `degree` is lower.
 pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
     if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
 }
 
-/// Returns `text`, the content of `path`, without the folders of the training machine. Used for archives, which are
-/// made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute paths, are
-/// replaced by their last components; all other bytes are unchanged.
+/// Returns `text`, the content of the `cfg_args` file at `path`, without the folders of the training machine, because
+/// archives are made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute
+/// paths, are replaced by their last path components; all other bytes are unchanged.
 pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<String> {
     let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (mut out, mut end) = (String::with_capacity(text.len()), 0);
@@ -213,8 +217,8 @@ pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<Stri
     Ok(out + &text[end..])
 }
 
-/// Replaces strings in a Python expression by their last path components: all strings if `all`, else absolute paths
-/// only.
+/// Returns a Python expression in which strings are replaced by their last path components: all strings if `all`, else
+/// only absolute paths.
 fn without_paths(expression: &str, all: bool) -> String {
     let mut out = String::with_capacity(expression.len());
     let mut rest = expression;
@@ -227,7 +231,7 @@ fn without_paths(expression: &str, all: bool) -> String {
             is_escaped = c == '\\' && !is_escaped;
             ends
         });
-        // A quote without an end does not begin a string.
+        // A quote without a closing quote does not begin a string.
         let Some(end) = end else { break };
         let string = &content[..end];
         let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
@@ -243,7 +247,7 @@ fn without_paths(expression: &str, all: bool) -> String {
     out + rest
 }
 
-/// Key and its value. A missing key has the value `None`, which selects the default.
+/// Key of a `cfg_args` file with its value. A missing key has the value `None`, which selects the default.
 #[derive(Clone, Copy)]
 pub(in crate::models) struct ConfigKey<'a> {
     pub(in crate::models) name: &'static str,
@@ -252,12 +256,12 @@ pub(in crate::models) struct ConfigKey<'a> {
 }
 
 impl<'a> ConfigKey<'a> {
-    /// Returns the error that the value is not what was `expected`.
+    /// Returns the error that the value of this key is not what was `expected`.
     pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }
 
-    /// Returns the value as a boolean; 0 and 1 count as booleans.
+    /// Returns the value as a boolean, or `default` if the key is missing; 0 and 1 count as booleans.
     pub(in crate::models) fn bool(&self, default: bool) -> Result<bool> {
         match self.value {
             Literal::None => Ok(default),
@@ -267,8 +271,8 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as an integer. Accepts booleans: Python's `True` is the integer 1, and some forks write
-    /// `grid_pe=False`.
+    /// Returns the value as an integer, or `default` if the key is missing. Accepts booleans: Python's `True` is the
+    /// integer 1, and some forks write `grid_pe=False`.
     pub(in crate::models) fn int(&self, default: i64) -> Result<i64> {
         match self.value {
             Literal::None => Ok(default),
@@ -278,7 +282,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a number.
+    /// Returns the value as a number, or `default` if the key is missing.
     pub(in crate::models) fn float(&self, default: f64) -> Result<f64> {
         match self.value {
             Literal::None => Ok(default),
@@ -288,7 +292,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a string, if there is one.
+    /// Returns the value as a string; `None` if the key is missing.
     pub(in crate::models) fn string(&self) -> Result<Option<String>> {
         match self.value {
             Literal::None => Ok(None),
@@ -297,7 +301,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a list of integers.
+    /// Returns the value as a list of integers, or `default` if the key is missing.
     fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
         match self.value {
             Literal::None => Ok(default.to_vec()),
@@ -308,7 +312,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value of `name` in this dictionary.
+    /// Returns the entry `name` of this key's value, which is a dictionary.
     fn entry(&self, name: &'static str) -> Result<ConfigKey<'a>> {
         let value = match self.value {
             Literal::None => &Literal::None,
@@ -463,7 +467,7 @@ mod tests {
     #[test]
     fn nesting_is_bounded() {
         assert!(refusal(&format!("Namespace(a={})", "[".repeat(100_000))).contains("32 levels"));
-        // Values that are not interpreted may nest deeply without using the stack.
+        // Values that are not interpreted may be nested deeply without using the stack.
         parse(&format!("Namespace(a=f{}{})", "(".repeat(100_000), ")".repeat(100_000))).unwrap();
     }
 

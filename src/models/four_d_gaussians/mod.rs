@@ -1,4 +1,4 @@
-//! 4DGaussians model folders as a model format: canonical Gaussians and a field that deforms them.
+//! 4DGaussians model folders as a model format: canonical Gaussians and a deformation field that moves them.
 //!
 //! The output is a folder of the same layout with a smaller point cloud file. The configuration is copied byte for
 //! byte, except for the SH degree if that is lowered. The field is copied too, or written in half precision with the
@@ -34,7 +34,7 @@ use crate::recipe::{MergeParams, Precision};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
-/// 4DGaussians model folder.
+/// Model folder of 4DGaussians.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
@@ -59,7 +59,8 @@ impl InputModel for ModelFolder {
         Ok(self.size()?.whole())
     }
 
-    /// Excludes `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has them.
+    /// Does not count `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has
+    /// them.
     fn size(&self) -> Result<Size> {
         let paths = self.paths();
         size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
@@ -72,7 +73,7 @@ impl InputModel for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            // Archives and `.splatv` are written elsewhere.
+            // Other functions write archives and `.splatv` files.
             _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
@@ -81,20 +82,20 @@ impl InputModel for ModelFolder {
         let whole = state_bytes(self.info().sh_degree, Attributes::all());
         MemoryProfile {
             per_gaussian: whole,
-            // Normals and other extra properties are stored beside the attributes.
+            // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             opening: whole + 24,
-            // A copy of the canonical values, values prepared from them, and their deltas.
+            // A copy of the canonical values, the values prepared from them, and the field's deltas.
             reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
             // The canonical values of the compressed model, and a copy while they are computed.
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             file: whole + 24,
-            // Tensors as read and as used.
+            // Two copies of the field's tensors: as read from the file, and as used.
             fixed: 2 * self.tensor_bytes(),
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            // Measured by `benches/deform.rs`, as a function of the size of the network.
+            // Seconds measured by `benches/deform.rs`, as a function of the size of the network.
             seconds_per_state: 1e-7 + 2e-11 * self.field().multiplications() as f64,
             decoded: 0,
         }
@@ -148,7 +149,7 @@ impl InputModel for ModelFolder {
         let tensors = read_state_dict(&paths.deformation, self.memory())?;
         let role = |(name, tensor): (&String, &Tensor)| {
             let role = match role(self.config().field(), name) {
-                // The tensor does not have the shape of a plane, so the field does not read it as one.
+                // The field does not read the tensor as a feature plane, because its shape is not that of one.
                 Role::Plane(_) | Role::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => Role::Exact,
                 role => role,
             };
@@ -238,12 +239,12 @@ impl InputModel for ModelFolder {
 }
 
 impl ModelFolder {
-    /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
+    /// Returns the text of `cfg_args`, with the SH degree lowered to `sh_degree` if it is higher.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         cfg_args::read_for_degree(&self.paths().cfg_args, self.info().sh_degree, sh_degree)
     }
 
-    /// Writes the state dict of the field with the given precision.
+    /// Writes the tensors of the deformation field as a state dict with the given precision to `path`.
     fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
         let own = &self.paths().deformation;
         match precision {
@@ -255,7 +256,8 @@ impl ModelFolder {
         }
     }
 
-    /// Writes the point cloud file of the compressed model with the properties and comments of the input's.
+    /// Writes the Gaussians of the compressed model to the PLY file `path`, with the properties and comments of the
+    /// input's point cloud file.
     fn write_cloud(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
@@ -264,18 +266,18 @@ impl ModelFolder {
     }
 }
 
-/// Returns the folder of a training iteration in the model folder `root`.
+/// Returns the path of the folder of a training iteration in the model folder `root`.
 pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
-/// Returns the sizes of the files of a model.
+/// Returns the size in bytes of the three files of a model, divided into parts.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
     let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
     Ok(Size { cloud, field, rest, ..Size::default() })
 }
 
-/// Returns the role of a tensor in the evaluation of the field.
+/// Returns how the deformation field uses the tensor called `name`.
 fn role(config: FieldConfig, name: &str) -> Role {
     let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
     let part = name.split('.').next().unwrap_or_default();
@@ -299,12 +301,12 @@ fn role(config: FieldConfig, name: &str) -> Role {
         "shs_deform" => reads(config.active.contains(Attributes::SH), Role::Weights),
         "static_mlp" => reads(config.static_mlp, Role::Weights),
         "empty_voxel" => reads(config.empty_voxel, Role::Exact),
-        // The tensor belongs to a version of the trainer that is not known here.
+        // The tensor belongs to an unknown version of the trainer.
         _ => Role::Exact,
     }
 }
 
-/// Writes the tensors of a field as a state dict in single precision.
+/// Writes the tensors of a deformation field as a state dict in single precision to `path`.
 pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
     let stored = tensors.iter().map(|(name, tensor)| {
         StoredTensor::dense(name.clone(), tensor.shape.clone(), TensorValues::F32(tensor.data.clone()))

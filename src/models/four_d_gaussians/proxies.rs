@@ -1,5 +1,6 @@
-//! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is the merged state
-//! (method.md, section 5.6).
+//! Computes proxies (Gaussians that replace merged ones) for a model with a deformation field. The stored parameters of
+//! a proxy are chosen such that its state at the reference frame is the merged state of its members (method.md, section
+//! 5.6).
 
 use super::ModelFolder;
 use crate::compressed_model::{Cluster, Proxies, Reference};
@@ -11,15 +12,15 @@ use crate::passes::{BLOCK, gather};
 use crate::recipe::{MergeParams, Placement};
 use crate::source::FrameSource;
 
-/// Maximum number of frames at which proxies are compared with their members.
+/// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
 const SAMPLED_FRAMES: usize = 16;
 
-/// Returns the raw parameters of the proxies of `clusters`: their states at the reference frame minus the field's
-/// deltas at the canonical positions of their leaders.
+/// Returns the stored parameters of the proxies of `clusters`: their states at the reference frame minus the changes
+/// (deltas) that the field makes at the canonical positions of their leaders.
 ///
-/// A proxy placed at the mean is moved by the field at the mean, not by the field of its members. If it drifts further
-/// than `max_drift` from its members, it is placed at its leader's canonical position; its shape about the mean stays
-/// the same. A proxy without a finite solution gets all parameters of its leader.
+/// A proxy placed at the mean of its members is moved by the field at the mean, not by the field at the members. If it
+/// drifts further than `max_drift` from its members, it is placed at its leader's canonical position; its shape about
+/// the mean stays the same. A proxy without a finite solution gets all parameters of its leader.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -36,7 +37,7 @@ pub(super) fn solve(
     if leaders.is_empty() {
         return Ok(Proxies { raw: Some(raw.into()), notes, ..Proxies::default() });
     }
-    // A proxy placed at its leader has the canonical position of the leader to the bit, and so the same path.
+    // A proxy placed at its leader has exactly the canonical position of the leader, and so the same path.
     let solved = match merge.placement {
         Placement::Mean => Attributes::all(),
         Placement::Leader => Attributes::all().difference(Attributes::POSITION),
@@ -75,7 +76,7 @@ pub(super) fn solve(
     Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })
 }
 
-/// Returns the states of the proxies of `clusters` at the reference frame.
+/// Returns the states of the proxies of `clusters` at the reference frame, merged from the states of their members.
 fn merged_states(
     model: &ModelFolder,
     reference: Reference,
@@ -99,14 +100,14 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns the merged states with quaternions of the same length as those of their leaders at that frame. The field
-/// adds its delta to the raw quaternion, so the angle of rotation depends on the length.
+/// Returns `states` with quaternions of the same length as those of the leaders at the same frame. The field adds its
+/// delta to the stored quaternion, so the angle of rotation depends on the length.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);
     for row in 0..states.len() {
         let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
-        // If the leader's quaternion has no direction, the proxy keeps its unit quaternion.
+        // If the leader's quaternion has zero length, the proxy keeps its unit quaternion.
         if length > 0.0 && length.is_finite() {
             states.rotation.set_row(row, states.rotation.row::<4>(row).map(|x| x * length));
         }
@@ -114,7 +115,8 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
     states
 }
 
-/// Replaces rows that have a value that is not finite by the parameters of their leaders. Returns their number.
+/// Replaces each row of `raw` that has a value that is not finite by the row of its leader. Returns the number of
+/// replaced rows.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     let columns: Vec<Attributes> = Attributes::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
@@ -137,9 +139,9 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// Returns the largest distance of each proxy from its expected position over sampled frames, scene units. A proxy
-/// placed at the mean is expected at the weighted mean of its members; one placed at its leader, at the offset from
-/// that mean that it has at the reference frame.
+/// Returns for each proxy the largest distance from its expected position over sampled frames, in scene units. A proxy
+/// placed at the mean is expected at the weighted mean of its members. A proxy placed at its leader is expected at the
+/// same offset from that mean as at the reference frame.
 fn deviations(
     model: &ModelFolder,
     reference: Reference,
@@ -183,7 +185,8 @@ fn deviations(
     Ok(largest)
 }
 
-/// Returns at most [`SAMPLED_FRAMES`] of `frames`, evenly spread, with the first and last among them.
+/// Returns the indices of at most [`SAMPLED_FRAMES`] of `frames` frames, evenly spread, with the first and last among
+/// them.
 fn sampled(frames: usize) -> impl Iterator<Item = usize> {
     let count = frames.min(SAMPLED_FRAMES);
     (0..count).map(move |k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) })

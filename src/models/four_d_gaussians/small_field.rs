@@ -1,8 +1,8 @@
-//! Compact form of the field's state dict: half precision, constant tensors stored as one value, and only the rows of
-//! time planes that are read.
+//! Compact form of the state dict of a deformation field: half precision, constant tensors stored as one value, and
+//! only those rows of time planes (feature planes over time) that are read.
 //!
 //! Input: the tensors of a state dict. Output: tensors of the same names and shapes, as a file stores them; the loader
-//! of the original copies them into its own single-precision parameters. Memory: one copy of the tensors.
+//! of the original code copies them into its own single-precision parameters. Memory: one copy of the tensors.
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
@@ -11,14 +11,14 @@ use half::vec::HalfFloatVecExt;
 use crate::deform::{Tensor, Tensors, unread_rows};
 use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
-/// Number of values below which a tensor stays in single precision. Biases, the last layers of heads and the box of the
-/// field take few bytes, and every value of the field depends on them.
+/// Number of values below which a tensor stays in single precision. Biases, the last layers of heads and the box of
+/// space that the field covers take few bytes, and every value of the field depends on them.
 const MIN_HALF_VALUES: usize = 1024;
-/// Maximum root mean square error of a tensor in half precision, relative to its root mean square. Rounding of values
-/// within range stays below it; values too large or too small for half precision exceed it.
+/// Maximum root mean square error of a tensor in half precision, as a fraction of the root mean square of the tensor.
+/// Rounding of values within range stays below it; values too large or too small for half precision exceed it.
 const MAX_ERROR: f64 = 1.0 / 2048.0;
 
-/// Returns the tensors with the values that they have after storage in half precision.
+/// Returns the tensors with the values that remain after storage in half precision.
 pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     for tensor in tensors.values_mut() {
         if let Some(halves) = halves(tensor) {
@@ -28,8 +28,8 @@ pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     tensors
 }
 
-/// Returns the tensors in compact form. If `from_zero`, no time below 0 is read; rows of time planes that are then
-/// never read share the storage of other rows.
+/// Returns the tensors in compact form. `from_zero` states that the field is never read at times below 0; rows of time
+/// planes that are then never read share the storage of other rows.
 pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     let pack = |shares: bool| -> Vec<StoredTensor> {
         let pack = |(name, tensor): (&String, &Tensor)| match shares {
@@ -42,11 +42,11 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     let bytes = |values: usize, tensor: &StoredTensor| (values * tensor.values.width()) as u64;
     let stored_bytes: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
     let expanded_bytes: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
-    // Readers limit the ratio of expanded to stored bytes; beyond the limit, tensors are written out in full.
+    // Readers limit the ratio of expanded to stored bytes; if it would be exceeded, all tensors are written in full.
     if expanded_bytes > MAX_EXPANSION * stored_bytes { pack(false) } else { small }
 }
 
-/// Returns the compact form of one tensor.
+/// Returns the compact form of the tensor called `name`.
 fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
     if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {
@@ -60,7 +60,7 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
         return dense(&tensor.data);
     }
     // The unread first rows of each channel share storage with the last rows of the channel before. The first channel
-    // has rows of its own.
+    // has unread rows of its own.
     let mut data = tensor.data[..unread * columns].to_vec();
     for channel in tensor.data.chunks_exact(rows * columns) {
         data.extend(&channel[unread * columns..]);
@@ -71,7 +71,7 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     stored
 }
 
-/// Returns `data`, some of the values of `tensor`, in the precision in which `tensor` is stored.
+/// Returns `data`, some of the values of `tensor`, in the precision (half or single) in which `tensor` is stored.
 fn values(tensor: &Tensor, data: &[f32]) -> TensorValues {
     match halves(tensor) {
         Some(_) => TensorValues::F16(Vec::from_f32_slice(data)),
@@ -79,7 +79,8 @@ fn values(tensor: &Tensor, data: &[f32]) -> TensorValues {
     }
 }
 
-/// Returns the tensor in half precision; `None` if it has few values or would lose too much.
+/// Returns the tensor in half precision; `None` if it has fewer than [`MIN_HALF_VALUES`] values or its error would
+/// exceed [`MAX_ERROR`].
 fn halves(tensor: &Tensor) -> Option<Vec<f16>> {
     let halves = Vec::<f16>::from_f32_slice(&tensor.data);
     let square = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>();
@@ -100,7 +101,7 @@ mod tests {
         Tensor { shape: shape.to_vec(), data }
     }
 
-    /// Expands a stored tensor by the definition of strides.
+    /// Returns a stored tensor in full, expanded by the definition of strides.
     fn read(stored: &StoredTensor) -> Tensor {
         let mut data = vec![stored.offset];
         for (&extent, &stride) in stored.shape.iter().zip(&stored.stride) {
@@ -113,7 +114,7 @@ mod tests {
         Tensor { shape: stored.shape.clone(), data: data.into_iter().map(value).collect() }
     }
 
-    /// Name of a time plane.
+    /// Name of a time plane (feature plane over a spatial axis and time).
     const TIME: &str = "deformation_net.grid.grids.1.4";
 
     #[test]

@@ -1,8 +1,9 @@
 //! Motion model of FreeTimeGS: Gaussians that move along straight lines and fade with the distance in time.
 //!
-//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4) with s = max(exp(durations),
-//! 0.02) + 1e-8. Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer
-//! applies neither bound.
+//! With dt = t − times: x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4), where s =
+//! max(exp(durations), 0.02) + 1e-8 is the standard deviation in time and σ(o) is the stored opacity. Source:
+//! `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer does without the bounds
+//! 1e-4 and 0.02.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -15,44 +16,44 @@ use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Plane of [`StoredParams::own`] with the center in time.
+/// Index in [`StoredParams::own`] of the time at which a Gaussian is most opaque.
 pub(super) const TIME: usize = 0;
-/// Plane of [`StoredParams::own`] with the logarithm of the standard deviation in time.
+/// Index in [`StoredParams::own`] of the logarithm of the standard deviation in time.
 pub(super) const DURATION: usize = 1;
-/// First of three planes of [`StoredParams::own`] with the velocity.
+/// First of three indices in [`StoredParams::own`] of the velocity along x, y, z.
 pub(super) const VELOCITY: usize = 2;
-/// Number of planes of [`StoredParams::own`].
+/// Number of parameters per Gaussian that only this model format has; they are stored in [`StoredParams::own`].
 pub(super) const OWN: usize = 5;
 
-/// Minimum standard deviation in time, and the value added to it.
+/// Minimum standard deviation in time, and a value that is then added to it.
 const DEVIATION_FLOOR: [f64; 2] = [0.02, 1e-8];
-/// Minimum opacity.
+/// Minimum opacity of a Gaussian at any time.
 const MIN_OPACITY: f64 = 1e-4;
 
-/// Motion model of FreeTimeGS.
+/// Motion model of FreeTimeGS: straight lines and a temporal window.
 #[derive(Debug)]
 pub(super) struct FreeTime;
 
-/// Time-independent values of the temporal windows of some Gaussians.
+/// Values of some Gaussians that do not depend on time, for computing their temporal windows.
 #[derive(Debug)]
 pub(super) struct Windows {
-    /// 1/(2s²) of each Gaussian.
+    /// For each Gaussian 1/(2s²), where s is the standard deviation in time.
     rates: Vec<f64>,
-    /// exp(−o) of each opacity logit o.
+    /// For each Gaussian exp(−o), where o is the stored opacity logit.
     inverse_odds: Vec<f64>,
 }
 
-/// Returns the standard deviation s in time from a stored duration.
+/// Returns the standard deviation s in time that belongs to a stored duration (its logarithm).
 fn deviation(duration: f32) -> f64 {
     f64::from(duration).exp().max(DEVIATION_FLOOR[0]) + DEVIATION_FLOOR[1]
 }
 
-/// Returns 1/(2s²) from a stored duration.
+/// Returns 1/(2s²), where s is the standard deviation in time that belongs to a stored duration.
 fn rate(duration: f32) -> f64 {
     0.5 / deviation(duration).powi(2)
 }
 
-/// Returns the logit of the minimum opacity.
+/// Returns the opacity logit that belongs to the minimum opacity of a Gaussian.
 fn min_logit() -> f64 {
     (MIN_OPACITY / (1.0 - MIN_OPACITY)).ln()
 }
@@ -142,7 +143,7 @@ impl ProxyRule for FreeTime {
         let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
         let matched = match_proxies(model, clusters, rule, line, window, Attributes::SH, |seen| {
-            // SH coefficients are the same at every frame.
+            // The SH coefficients of a proxy are the same at every frame.
             if sh[seen.proxy].is_empty() {
                 let sh_at_frame = &seen.state.sh;
                 sh[seen.proxy] = (0..sh_at_frame.width()).map(|c| sh_at_frame.plane(c)[seen.row]).collect();

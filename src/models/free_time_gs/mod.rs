@@ -1,10 +1,10 @@
-//! Checkpoints of gsplat: static models, or FreeTimeGS.
+//! Checkpoints of gsplat as a model format: static models, or FreeTimeGS.
 //!
-//! Input: `ckpts/ckpt_K.pt` in a result folder, or the file itself: `{"step", "splats": state dict, "optimizers":
+//! Input: `ckpts/ckpt_K.pt` in a result folder, or the checkpoint itself: `{"step", "splats": state dict, "optimizers":
 //! {name: Adam state}}`. `splats` holds `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length,
 //! `opacities` [N] logit, `sh0` [N, 1, 3], `shN` [N, K, 3]; for FreeTimeGS also `times` [N, 1], `durations` [N, 1] log,
-//! `velocities` [N, 3]. Output: the same checkpoint with fewer rows. Cameras must be those of the trainer's parser: it
-//! normalizes the world and does not store how.
+//! `velocities` [N, 3]. Output: the same checkpoint with fewer Gaussians. Cameras must be those of the trainer's
+//! parser: it normalizes the coordinates of the scene and does not store how.
 
 mod frame_state;
 
@@ -45,7 +45,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns the checkpoints of a result folder, or of a folder of checkpoints, in order of iteration.
+/// Returns the checkpoints, each with its training iteration, of a result folder or of a folder of checkpoints, in
+/// increasing order of iteration.
 fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
     let in_folder = |folder: &Path| {
         let (mut one, first) = (numbered_files(folder, "ckpt_", ".pt"), numbered_files(folder, "ckpt_", "_rank0.pt"));
@@ -57,10 +58,11 @@ fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
     if inner.is_empty() { in_folder(path) } else { inner }
 }
 
-/// Returns the checkpoint of the requested iteration, or the last one with a note.
+/// Returns the path of the checkpoint of the requested iteration. Without a request, returns the last one and a note
+/// for the user.
 ///
 /// # Errors
-/// Fails if there is no such checkpoint, or if the model is divided among several ranks.
+/// Fails if there is no such checkpoint, or if the model is divided among several processes (ranks) of the training.
 fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(path);
     let names = || found.iter().map(|(k, _)| k.to_string()).collect::<Vec<_>>().join(", ");
@@ -80,7 +82,7 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
     Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
 }
 
-/// Returns whether the checkpoint at `path` holds Gaussians under the names of gsplat.
+/// Returns whether the checkpoint at `path` holds Gaussians in tensors with the names that gsplat uses.
 fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
@@ -165,7 +167,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     })
 }
 
-/// Returns the name of a tensor for messages.
+/// Returns the place of the tensor `name` in the checkpoint, for error messages.
 fn place(name: &str) -> String {
     format!("splats[{}]", quoted(name))
 }

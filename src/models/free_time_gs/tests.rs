@@ -19,7 +19,7 @@ fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// Name, shape of a row, and values of each tensor.
+/// Name, shape of a row, and values of each tensor of a checkpoint.
 type Splats = Vec<(&'static str, Vec<usize>, Vec<f32>)>;
 
 fn splats() -> Splats {
@@ -124,7 +124,7 @@ fn states_follow_the_formulas() {
         }
     }
     assert!(clamped[0] > 0 && clamped[1] > 0, "{clamped:?}");
-    // The folder of checkpoints and the file open as the same model.
+    // The folder of checkpoints and the checkpoint itself open as the same model as the result folder.
     for name in ["result/ckpts", "result/ckpts/ckpt_59999.pt"] {
         assert_eq!(states(&*open(&folder.path(name)).unwrap()), states(&*model));
     }
@@ -140,7 +140,7 @@ fn kept_rows_stay_in_splats_and_optimizers() {
     let [before, after] = [folder.path("result"), result]
         .map(|root| Checkpoint::open(&root.join("ckpts/ckpt_59999.pt"), ReadLimit::NONE).unwrap());
     let shapes: Vec<Vec<usize>> = after.tensors().map(|tensor| tensor.shape).collect();
-    // Nine tensors each of parameters, steps and two averages; only the steps have no rows.
+    // There are nine tensors each of parameters, steps and two averages; only the steps have no rows.
     assert_eq!(shapes.len(), 36);
     assert_eq!(shapes.iter().filter(|shape| shape.first() == Some(&2)).count(), 27);
     assert_eq!(before.storage("20").unwrap(), after.storage("20").unwrap());

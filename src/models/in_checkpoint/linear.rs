@@ -1,9 +1,10 @@
-//! Proxies of Gaussians that move along straight lines and fade with the distance in time.
+//! Computes proxies (Gaussians that replace merged ones) for models whose Gaussians move along straight lines and fade
+//! with the distance in time.
 //!
-//! Paths are blended exactly: members are re-centered to the proxy's time and averaged by weight, so that the proxy is
-//! at the weighted mean of its members at every time. Windows are blended by their moments, each with its weight times
-//! its duration. Shape and opacity are fitted to the moment matches of the members at sampled frames (least squares).
-//! Source: method.md, section 5.6, for the match at a frame.
+//! Paths are blended exactly: the members (merged Gaussians) are re-centered to the proxy's time and averaged by
+//! weight, so that the proxy is at the weighted mean of its members at every time. The temporal windows of the members
+//! are blended by their moments, each with its weight times its duration. Shape and opacity are fitted to the moment
+//! matches of the members at sampled frames (least squares). Source: method.md, section 5.6, for the match at a frame.
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -13,29 +14,29 @@ use crate::passes::{BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum number of frames at which proxies are matched.
+/// Maximum number of frames at which proxies are compared with their members.
 const SAMPLED_FRAMES: usize = 48;
-/// Minimum opacity times window of a proxy at a frame that is used for matching.
+/// Minimum product of opacity and temporal window of a proxy at a frame; other frames are not used for matching.
 const MIN_VISIBLE: f64 = 1e-4;
-/// Range of proxy opacities, which bounds their logits.
+/// Minimum and maximum opacity of a proxy. They bound its opacity logit.
 const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
-/// Straight path with a Gaussian window: x(t) = position + velocity·(t − center), window exp(−½((t −
-/// center)/deviation)²).
+/// Straight path with a Gaussian window in time. Position: x(t) = position + velocity·(t − center). Factor of the
+/// opacity: exp(−½((t − center)/deviation)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::models) struct LinearPath {
-    /// Position at the center, scene units.
+    /// Position at the time `center`, scene units.
     pub(in crate::models) position: [f64; 3],
     /// Velocity, scene units per unit of time.
     pub(in crate::models) velocity: [f64; 3],
-    /// Center of the window in time.
+    /// Center of the window in time, where its value is 1.
     pub(in crate::models) center: f64,
-    /// Standard deviation of the window in time.
+    /// Standard deviation of the window in time, in the model's time unit.
     pub(in crate::models) deviation: f64,
 }
 
 impl LinearPath {
-    /// Returns the weighted blend of `members`, whose weights sum to 1.
+    /// Returns the weighted mean of the paths and windows of `members`, whose weights sum to 1.
     pub(in crate::models) fn blended(members: &[(f64, LinearPath)]) -> LinearPath {
         let total_duration: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
         let mean = |value_of: &dyn Fn(&LinearPath) -> f64| {
@@ -55,34 +56,35 @@ impl LinearPath {
     }
 }
 
-/// Result of matching a proxy to its members over the sampled frames.
+/// Path, window and shape of a proxy that were matched to its members over the sampled frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
-    /// Blended path and window.
+    /// Weighted mean of the members' paths and windows.
     pub(in crate::models) line: LinearPath,
-    /// Opacity logit at the center of the window, and covariance (xx xy xz yy yz zz); `None` if the proxy is visible at
-    /// no sampled frame.
+    /// Opacity logit at the center of the window, and spatial covariance (xx xy xz yy yz zz). `None` if the proxy is
+    /// visible at no sampled frame.
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// Moment match of a proxy's members at one frame.
+/// State that one proxy should have at one frame: the moment match of its members.
 pub(in crate::models) struct ProxyAtFrame<'a> {
-    /// Number of the proxy.
+    /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
-    /// Path and window of the proxy.
+    /// Path and temporal window of the proxy.
     pub(in crate::models) line: &'a LinearPath,
-    /// Time of the frame.
+    /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of the frame: window times opacity.
+    /// Weight of the frame: window of the proxy times opacity of the moment match.
     pub(in crate::models) weight: f64,
-    /// States of the moment matches of a block of proxies.
+    /// Moment matches of a block of proxies at this frame.
     pub(in crate::models) state: &'a Gaussians,
     /// Row of this proxy in `state`.
     pub(in crate::models) row: usize,
 }
 
-/// Matches the proxies of `clusters` to their members. `line_of` returns the path of a member, `window` the window of a
-/// path at a time. Calls `visit` for every sampled frame at which a proxy is visible, with the columns `wanted`.
+/// Matches the proxies of `clusters` to their members. `line_of` returns the path and window of a member by its id;
+/// `window` returns the value of a window at a time. Calls `visit` with the moment match of each proxy at each sampled
+/// frame at which it is visible. The moment match has the attributes `wanted`, rotation, scale and opacity.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -125,19 +127,19 @@ pub(in crate::models) fn match_proxies(
     Ok(matched)
 }
 
-/// Sums over frames for one proxy, with m the window and α the opacity.
+/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match.
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
-    /// Σ m·α.
+    /// Sum over the frames of m·α: window times opacity of the moment match.
     product: f64,
-    /// Σ m².
+    /// Sum over the frames of m², the square of the window.
     square: f64,
-    /// Sum of the covariances, each weighted by m·α.
+    /// Sum over the frames of the spatial covariances, each weighted by m·α (window times opacity).
     covariance: [f64; 6],
 }
 
 impl FrameSums {
-    /// Adds a frame.
+    /// Adds the moment match in row `row` of `state`, at a frame where the window is `m` and the opacity is `alpha`.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -146,7 +148,7 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns the opacity logit and the mean covariance; `None` without visible frames.
+    /// Returns the opacity logit at the center of the window and the mean covariance; `None` if no frame was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));
@@ -154,8 +156,8 @@ impl FrameSums {
     }
 }
 
-/// Returns R diag(s)² Rᵀ as xx xy xz yy yz zz. The quaternion wxyz may have any length; length 0 counts as the
-/// identity.
+/// Returns the covariance R diag(s)² Rᵀ as xx xy xz yy yz zz, for the scales s and the rotation R of a quaternion wxyz.
+/// The quaternion may have any length; length 0 counts as the identity.
 pub(in crate::models) fn covariance(scales: [f64; 3], quaternion: [f64; 4]) -> [f64; 6] {
     let length = quaternion.iter().map(|x| x * x).sum::<f64>().sqrt();
     let [w, x, y, z] = if length > 0.0 { quaternion.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
@@ -190,7 +192,7 @@ mod tests {
                 assert!((at(&blended) - mean).abs() < 1e-12, "{time} {c}: {} {mean}", at(&blended));
             }
         }
-        // A single member, or equal members, are returned unchanged.
+        // The path of a single member, or of equal members, is returned unchanged.
         assert_eq!(LinearPath::blended(&[(1.0, line(2.0))]), line(2.0));
         let twice = LinearPath::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
         assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.center - 0.2).abs() < 1e-15);

@@ -1,4 +1,5 @@
-//! Models whose Gaussians are rows of the tensors of a checkpoint: shared by several formats.
+//! Models whose Gaussians are stored in the tensors of a training checkpoint, one row per Gaussian. Several model
+//! formats share this module.
 //!
 //! The output is the same checkpoint with fewer rows, and copies of the small files beside it.
 
@@ -30,12 +31,13 @@ use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 pub(super) use rows::{CheckpointReader, RowElement, RowTensors, row_count};
 
-/// Maximum bytes of a file beside the checkpoint that is copied to the output.
+/// Maximum bytes of a file beside the checkpoint; larger files are not copied to the output.
 const MAX_COPIED_BYTES: u64 = 1 << 20;
 
-/// Motion model that can compute the raw parameters of proxies.
+/// Motion model that can compute the stored parameters of proxies (Gaussians that replace merged ones).
 pub(super) trait ProxyRule: MotionModel {
-    /// Returns the raw parameters of the proxies of `clusters`, before they are checked against their members.
+    /// Returns the stored parameters of one proxy per cluster. They have not been compared with the members (merged
+    /// Gaussians) yet.
     ///
     /// # Errors
     /// Fails if frames cannot be evaluated.
@@ -43,10 +45,10 @@ pub(super) trait ProxyRule: MotionModel {
     where
         Self: Sized;
 
-    /// Adds to `hash` the settings that determine frame states but are not in the file.
+    /// Adds those settings to `hash` that determine the states of Gaussians but are not stored in the checkpoint.
     fn hash_settings(&self, hash: &mut Xxh3);
 
-    /// Returns the motion model for frames at `times` if it depends on them.
+    /// Returns the motion model to use for frames at `times`; `None` if it does not depend on the times.
     fn for_times(&self, times: &[f64]) -> Option<Self>
     where
         Self: Sized,
@@ -55,7 +57,7 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Returns notes for the user.
+    /// Returns notes for the user about the motion model; by default none.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
@@ -66,26 +68,26 @@ pub(super) trait ProxyRule: MotionModel {
     }
 }
 
-/// Description of a model other than its Gaussians.
+/// Properties of a model besides its Gaussians.
 #[derive(Debug, Default)]
 pub(super) struct ModelDescription {
     /// Name of the model format, shown to users.
     pub(super) kind: &'static str,
-    /// Folder that the user gave; `None` if the user gave the file.
+    /// Path of the model folder if the user gave one; `None` if the user gave the checkpoint.
     pub(super) root: Option<PathBuf>,
-    /// Path of the checkpoint.
+    /// Path of the checkpoint file.
     pub(super) file: PathBuf,
     /// Notes for the user.
     pub(super) notes: Vec<String>,
-    /// Folder of the training data.
+    /// Path of the folder with the training data.
     pub(super) data_folder: Option<String>,
-    /// Whether the training background is white.
+    /// Whether the background of the training images is white.
     pub(super) white_background: bool,
-    /// CPU seconds on one core to read one state (`benches/families.rs`).
+    /// CPU seconds on one core to compute the state of one Gaussian at one frame (`benches/families.rs`).
     pub(super) seconds_per_state: f64,
 }
 
-/// Open model whose Gaussians are rows of the tensors of a checkpoint.
+/// Opened model whose Gaussians are rows of the tensors of a checkpoint.
 #[derive(Debug)]
 pub(super) struct CheckpointModel<L: MotionModel> {
     tensors: RowTensors,
@@ -94,8 +96,8 @@ pub(super) struct CheckpointModel<L: MotionModel> {
 }
 
 impl<L: ProxyRule> CheckpointModel<L> {
-    /// Creates a model from the read parameters. Its states are computed by `motion_model`. A model that does not vary with time
-    /// gets one frame at time 0.
+    /// Creates a model from the parameters that `reader` has read. `motion_model` computes the states of the Gaussians
+    /// at each frame. A model that does not vary with time gets one frame at time 0.
     pub(super) fn new(
         reader: CheckpointReader,
         motion_model: L,
@@ -108,7 +110,7 @@ impl<L: ProxyRule> CheckpointModel<L> {
         Ok(CheckpointModel { tensors: reader.tensors, model, description })
     }
 
-    /// Returns the files of the model folder that are copied to the output.
+    /// Returns the paths of the files in the model folder that are copied to the output.
     fn copied_files(&self) -> Vec<PathBuf> {
         const NAMES: [&str; 2] = ["cfg_args", "cameras.json"];
         let Some(root) = &self.description.root else { return Vec::new() };
@@ -124,7 +126,7 @@ impl<L: ProxyRule> CheckpointModel<L> {
         self.description.file.strip_prefix(root).unwrap_or(&self.description.file).to_owned()
     }
 
-    /// Writes the compressed checkpoint and copies the files beside it.
+    /// Writes the compressed model to `path`: the checkpoint, and copies of the files beside it.
     fn write_model(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
@@ -176,13 +178,13 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.own.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
-            // The widest tensor, as stored and as f32.
+            // The widest tensor, both as stored and as f32.
             opening: 2 * whole,
-            // A copy of the parameters with the prepared values.
+            // A copy of the stored parameters and the values prepared from them.
             reader: whole + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            // Training stores two optimizer values per parameter.
+            // The training stores two optimizer values per parameter in addition.
             file: 3 * whole,
             fixed: 0,
             frame_block: 0,
@@ -273,7 +275,7 @@ fn is_small(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= MAX_COPIED_BYTES)
 }
 
-/// Returns the small YAML files in a folder, sorted by name.
+/// Returns the paths of the small YAML files in the folder `root`, sorted by name.
 pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     let is_small_yaml = |path: &Path| {
         path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)
@@ -284,7 +286,8 @@ pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns the files of a folder named `<prefix><number><suffix>`, sorted by number.
+/// Returns number and path of each file of a folder named `<prefix><number><suffix>`, in increasing order of the
+/// numbers.
 pub(super) fn numbered_files(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let number = |name: &str| name.strip_prefix(prefix)?.strip_suffix(suffix)?.parse::<u32>().ok();

@@ -1,7 +1,7 @@
-//! Gaussians as rows of the tensors of a checkpoint.
+//! Reads and writes Gaussians as rows of the tensors of a checkpoint.
 //!
-//! Input: an open checkpoint and the meaning of its tensors. Output: raw parameters, and the checkpoint with fewer
-//! rows. Memory: the raw parameters, and one tensor at a time.
+//! Input: an open checkpoint and the meaning of its tensors. Output: the stored parameters of all Gaussians, and the
+//! checkpoint with fewer rows. Memory: the stored parameters, and one tensor at a time.
 
 use std::path::Path;
 
@@ -12,29 +12,29 @@ use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
 use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams};
 use crate::models::trajectories::state_bytes;
 
-/// Meaning of one element of a tensor's row.
+/// Meaning of one value in a tensor's row (the values of one Gaussian).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
-    /// Plane of an attribute column.
+    /// Component of an attribute.
     Of(Attributes, usize),
-    /// Plane of [`StoredParams::own`].
+    /// Parameter with this index in [`StoredParams::own`], which only this model format has.
     Own(usize),
-    /// Value that frame states do not depend on.
+    /// Value that the states of Gaussians do not depend on.
     Unread,
 }
 
 impl RowElement {
-    /// Returns `count` consecutive planes of a column, after the first `skipped`.
+    /// Returns the meaning of `count` values that are components of an attribute, beginning with component `skipped`.
     pub(in crate::models) fn all_of(column: Attributes, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Returns `count` consecutive planes of [`StoredParams::own`], from `first` on.
+    /// Returns the meaning of `count` values that are parameters in [`StoredParams::own`], from index `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }
 
-    /// Returns the plane of `raw` that holds this element; `None` for values that are not read.
+    /// Returns the values that all Gaussians have for this element; `None` for [`RowElement::Unread`].
     fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
@@ -44,12 +44,12 @@ impl RowElement {
     }
 }
 
-/// Tensor whose rows are parameters of Gaussians.
+/// Tensor whose rows hold parameters of Gaussians.
 #[derive(Debug)]
 struct Param {
     name: String,
     tensor: TensorView,
-    /// Meaning of the elements of a row.
+    /// Meaning of each value of a row, in order.
     planes: Vec<RowElement>,
 }
 
@@ -60,21 +60,21 @@ pub(in crate::models) struct RowTensors {
     /// Number of Gaussians.
     count: usize,
     params: Vec<Param>,
-    /// Tensors that only training reads.
+    /// Tensors that only the training reads.
     training_only: Vec<TensorView>,
 }
 
-/// Checkpoint that is being read.
+/// Reader of the parameters of Gaussians from the tensors of a checkpoint.
 #[derive(Debug)]
 pub(in crate::models) struct CheckpointReader {
-    /// Tensors read so far.
+    /// Tensors that have been read so far.
     pub(in crate::models) tensors: RowTensors,
-    /// Parameters read so far.
+    /// Parameters of all Gaussians that have been read so far; the others are zero.
     pub(in crate::models) raw: StoredParams,
 }
 
 impl CheckpointReader {
-    /// Allocates `count` Gaussians with `own` format-specific planes, all values zero.
+    /// Creates a reader for `count` Gaussians with `own` format-specific parameters each; all values are still zero.
     ///
     /// # Errors
     /// Fails if this needs more memory than allowed.
@@ -94,8 +94,8 @@ impl CheckpointReader {
         })
     }
 
-    /// Reads the tensor at `id`. `name` is its name in messages, `row` the expected shape of a row, `planes` the
-    /// meaning of its elements.
+    /// Reads the tensor at the node `id` of the checkpoint. `name` is what error messages call it, `row` is the
+    /// expected shape of a row, and `planes` is the meaning of each value of a row.
     ///
     /// # Errors
     /// Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
@@ -126,7 +126,7 @@ impl CheckpointReader {
         Ok(())
     }
 
-    /// Adds the tensor at `id` to those that only training reads, if it has a row per Gaussian.
+    /// Records the tensor at the node `id` as one that only the training reads, if it has one row per Gaussian.
     pub(in crate::models) fn add_training_tensor(&mut self, id: NodeId) {
         let tensor =
             self.tensors.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.tensors.count));
@@ -134,7 +134,7 @@ impl CheckpointReader {
     }
 }
 
-/// Returns the number of rows of the tensor at `id`, called `name` in messages.
+/// Returns the number of rows of the tensor at the node `id`, which error messages call `name`.
 ///
 /// # Errors
 /// Fails if there is no tensor with rows.
@@ -145,9 +145,9 @@ pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &s
 }
 
 impl RowTensors {
-    /// Writes the checkpoint of the compressed model to `path`. Rows of parameters are copied byte for byte unless
-    /// `raw_left` (the compressed parameters) differs from `before`. Rows of merged Gaussians in tensors that only training
-    /// reads become zero.
+    /// Writes the checkpoint of the compressed model to `path`. `raw_left` holds the parameters of the compressed
+    /// model, `before` the original ones; values are copied byte for byte where both agree. In tensors that only the
+    /// training reads, the rows of merged Gaussians become zero.
     ///
     /// # Errors
     /// Fails if a tensor cannot be read or a write fails.

@@ -1,4 +1,4 @@
-//! Static Gaussians of a checkpoint.
+//! Motion model of static Gaussians in a checkpoint.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -11,7 +11,7 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 
-/// Motion model of static Gaussians: states are the stored values.
+/// Motion model of static Gaussians: their states are the stored values at every time.
 #[derive(Debug)]
 pub(in crate::models) struct Still;
 

@@ -1,8 +1,9 @@
-//! Frames that did not come from PLY files of the user, saved as PLY and then linked: a frame stream without ids
-//! (format/STREAM.md, version 2), or an input that identifies Gaussians and is linked anew at the user's request.
+//! Frames that did not come from PLY files of the user. They are saved as PLY files and then linked: their Gaussians
+//! are matched across frames. The source is a frame stream without ids (format/STREAM.md, version 2), or an input that
+//! identifies Gaussians across frames and is linked anew at the user's request.
 //!
-//! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and a tile of every
-//! column per thread. Disk, in a temporary folder: every frame as PLY.
+//! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and for each thread a
+//! tile (block of Gaussians × frames) of every column. Disk space, in a temporary folder: every frame as PLY.
 
 use std::io::Read;
 use std::ops::Range;
@@ -25,18 +26,19 @@ use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, gaussian_range};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
-/// PLY files of frames that are being received, and their times.
+/// Temporary PLY files of the frames received so far, and their times.
 struct ReceivedFrames {
     folder: ScratchFolder,
     times: Vec<f64>,
-    /// Bytes of memory of the reader that provides the frames.
+    /// Bytes of memory of the reader from which the frames come.
     reader_bytes: u64,
-    /// Bytes of the largest frame in memory.
+    /// Bytes of memory that the largest frame takes.
     largest_frame_bytes: u64,
 }
 
 impl ReceivedFrames {
-    /// Creates an empty folder in `scratch`. `reader_bytes` is the memory of the reader that provides the frames, bytes.
+    /// Creates an empty temporary folder in `scratch`. `reader_bytes` is the memory of the reader from which the frames
+    /// come.
     fn new(scratch: &Path, reader_bytes: u64) -> Result<ReceivedFrames> {
         Ok(ReceivedFrames {
             folder: ScratchFolder::new(scratch)?,
@@ -46,7 +48,7 @@ impl ReceivedFrames {
         })
     }
 
-    /// Writes the next frame as PLY.
+    /// Writes the next frame to a PLY file; `time` is its time stamp.
     fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);
@@ -55,7 +57,8 @@ impl ReceivedFrames {
         Ok(())
     }
 
-    /// Links the received frames. `kind` names the original input of `bytes` bytes; messages call it `name`.
+    /// Links the Gaussians of the received frames. `kind` is the name of the original input format, `bytes` the size of
+    /// the original input, `name` what messages call it, and `why` the reason for linking.
     fn link(
         self,
         kind: &'static str,
@@ -73,8 +76,8 @@ impl ReceivedFrames {
 }
 
 impl LinkedFrames {
-    /// Receives a whole stream, called `name` in messages, and links it. If `joins`, also joins tracks of the same
-    /// Gaussian.
+    /// Receives a whole stream, which messages call `name`, and links the Gaussians of its frames into tracks. If
+    /// `joins`, tracks that seem to be the same Gaussian are joined.
     ///
     /// # Errors
     /// Fails if the stream is damaged or has no frames, or if a write fails.
@@ -99,8 +102,9 @@ impl LinkedFrames {
         received.link("linked frame stream", name, stream.received(), why, joins, options)
     }
 
-    /// Links the frames of `input` again, ignoring which Gaussian is which. Each frame consists of the Gaussians that
-    /// may be visible in it. If `joins`, tracks of the same Gaussian are joined. `kind` names the input.
+    /// Links the Gaussians of the frames of `input` anew into tracks, ignoring which Gaussian is which in the input.
+    /// Each frame consists of the Gaussians that may be visible in it. If `joins`, tracks that seem to be the same
+    /// Gaussian are joined. `kind` is the name of the input format.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a write fails.
@@ -146,13 +150,14 @@ impl LinkedFrames {
     }
 }
 
-/// Returns the ranges of Gaussians of the blocks of `source`, for parallel reading.
+/// Returns the blocks of consecutive Gaussians of `source`, as ranges of indices, for reading in parallel.
 fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
     let count = source.info().count;
     (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| gaussian_range(count, block))
 }
 
-/// Returns the rows of `state` that may be visible: with an opacity of at least [`MIN_VISIBLE_OPACITY`].
+/// Returns the indices of the Gaussians of `state` that may be visible: those with an opacity of at least
+/// [`MIN_VISIBLE_OPACITY`].
 fn visible_rows(state: &Gaussians) -> Vec<u32> {
     let opacities = (0u32..).zip(state.opacity_logit.plane(0));
     opacities.filter(|&(_, &logit)| opacity(logit) >= MIN_VISIBLE_OPACITY).map(|(row, _)| row).collect()
@@ -177,7 +182,7 @@ fn count_visible_rows(source: &dyn FrameSource) -> Result<Vec<u64>> {
     blocks(source).map(count).try_reduce(|| vec![0; frames], add)
 }
 
-/// Returns, for each block of Gaussians, the visible ones ([`visible_rows`]) in each of `frames`.
+/// Returns, for each block of consecutive Gaussians, its visible Gaussians ([`visible_rows`]) in each of `frames`.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
     let wanted = ReadPlan::new(frames.clone());
     let unpack = |range: Range<usize>| {

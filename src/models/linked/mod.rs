@@ -1,16 +1,16 @@
-//! PLY frames that do not identify Gaussians across frames: linked into tracks, packed into a container, and read from
-//! it.
+//! PLY frames that do not tell which Gaussian is which in other frames. Their Gaussians are linked into tracks
+//! (Gaussians followed through frames), packed into a temporary container, and read from it.
 //!
-//! Every frame is read twice: once to link it, once to pack its tracks. Tracks that seem to be the same Gaussian are
-//! joined if renders with joined tracks stay within 40 dB PSNR of renders without. If joining all similar tracks costs
-//! more, only the close ones are joined. In frames where a track is absent, it keeps its previous state (or its first
-//! one before it begins) with an opacity of nearly zero, so that it is invisible and costs almost no bytes. Then
-//! colors, scales, rotations and opacities that hardly change along a track are replaced by their mean ([`steady`]), if
-//! renders again stay within 40 dB PSNR.
+//! Every frame is read twice: once to link its Gaussians, once to pack the tracks. Tracks that seem to be the same
+//! Gaussian are joined if renders with joined tracks reach at least 40 dB PSNR against renders without. If joining all
+//! similar tracks changes renders more, only the most similar ones are joined. In frames where a track is absent, it
+//! keeps its previous state (or its first one before it begins) with an opacity of nearly zero, so that it is invisible
+//! and costs almost no bytes. Then colors, scales, rotations and opacities that hardly change along a track are
+//! replaced by their mean ([`steady`]), if renders again reach at least 40 dB PSNR.
 //!
 //! Memory: [`Sizes`](memory::Sizes). Two frames while linking; one per thread and a few rendered ones while joining
-//! tracks and computing means; up to 128 MiB while packing. Disk, in unnamed files beside the container: 4 bytes per
-//! Gaussian and frame, and 4 per track and value that may be constant.
+//! tracks and computing means; up to 128 MiB while packing. Disk space, in unnamed files beside the container: 4 bytes
+//! per Gaussian and frame, and 4 bytes per track and value that may be constant.
 
 mod arrival;
 mod memory;
@@ -40,35 +40,36 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 use crate::tracking::Joiner;
 
-/// Open input of linked frames.
+/// Opened frames whose Gaussians have been linked into tracks (Gaussians followed through frames).
 pub struct LinkedFrames {
     tracks: LinkedTracks,
-    /// Container with every track at every frame.
+    /// Temporary container with the state of every track at every frame.
     container: Container,
-    /// Sequence info of the container, possibly with other times.
+    /// Sequence info of the container; its times may have been replaced.
     info: SequenceInfo,
     notes: Vec<String>,
-    /// Owner of the container's file, which is deleted when the input is dropped.
+    /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
-    /// Origin of the frames if they were not read from PLY files of the user.
+    /// Where the frames came from; `None` if from PLY files of the user.
     origin: Option<Origin>,
 }
 
-/// Origin of frames that did not come from PLY files of the user.
+/// Origin of frames that were not read from PLY files of the user.
 struct Origin {
-    /// Owner of their temporary PLY files, which are deleted when the input is dropped.
+    /// Owner of the temporary PLY files of the frames; deletes them when it is dropped.
     _folder: ScratchFolder,
-    /// Name of the input, shown to users.
+    /// Name of the original input format, shown to users.
     kind: &'static str,
-    /// Bytes of the original input.
+    /// Size of the original input in bytes.
     bytes: u64,
-    /// Peak bytes of memory while the frames were received or unpacked.
+    /// Peak bytes of memory that receiving or unpacking the frames took.
     memory: u64,
 }
 
 impl LinkedFrames {
-    /// Links `frames`. If `joins`, also joins tracks of the same Gaussian and makes nearly constant attributes
-    /// constant. The notes give the reason `why` frames were linked. Messages call the frames `name`.
+    /// Links the Gaussians of `frames` into tracks (Gaussians followed through frames). If `joins`, also joins tracks
+    /// that seem to be the same Gaussian and makes nearly constant attributes constant. `why` is the reason for
+    /// linking, for the notes to the user; `name` is what messages call the frames.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options` allow, or
@@ -129,7 +130,7 @@ impl InputModel for LinkedFrames {
     }
 
     fn digest(&self) -> Result<String> {
-        // A different linking of the same files is a different input.
+        // Linking the same files differently gives a different input, so the container's digest is included.
         let both = format!("{:032x} {}", self.tracks.frames().digest()?, self.container.digest());
         Ok(format!("{:032x}", xxh3_128(both.as_bytes())))
     }

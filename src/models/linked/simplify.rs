@@ -1,4 +1,5 @@
-//! Joining of tracks and choice of constant attributes, with their cost in PSNR of renders.
+//! Joins tracks (Gaussians followed through frames) and makes attributes constant along tracks, as far as the PSNR of
+//! renders allows.
 
 use std::ops::Range;
 use std::path::Path;
@@ -14,16 +15,16 @@ use crate::model::{Attributes, Gaussians};
 use crate::render::Renderer;
 use crate::tracking::{Joiner, Linker};
 
-/// Minimum PSNR of renders after a change (joined tracks, constant attributes) against renders before it, dB.
+/// Minimum PSNR in dB of renders after a change (tracks joined, attributes made constant) against renders before it.
 const MIN_PSNR_DB: f64 = 40.0;
-/// Number of views rendered of each sampled frame.
+/// Number of virtual cameras by which each sampled frame is rendered.
 const VIEWS: usize = 3;
-/// Bounds of the change of an attribute that becomes constant, tried in this order: the change that trainers leave
-/// between tracks of one Gaussian, and half of that.
+/// Maximum deviations of attributes that become constant, tried in this order. The first are the differences that
+/// trainers leave between tracks of one Gaussian, the second are half of them.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
-/// Joins tracks that `joiner` has seen, as loosely as the PSNR of renders allows. Returns a note for the user if any
-/// tracks could be joined.
+/// Joins the tracks that `joiner` recorded and that seem to be the same Gaussian. Tries the joiner's proposals in order
+/// and keeps the first whose renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any tracks could be joined.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -51,15 +52,15 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -
     Ok(note)
 }
 
-/// Replaces nearly constant attributes of `tracks` by their means, within the largest of [`STEADY_BOUNDS`] that the PSNR of
-/// renders allows. Returns a note for the user if any attribute became constant.
+/// Replaces nearly constant attributes of `tracks` by their means, with the first of [`STEADY_BOUNDS`] with which
+/// renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any attribute became constant.
 ///
 /// # Errors
-/// Fails if a frame cannot be read or a write to `scratch` fails.
+/// Fails if a frame cannot be read or a write to the folder `scratch` fails.
 pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<String>> {
     let first = tracks.first();
     for bound in STEADY_BOUNDS {
-        // Tracks are numbered in the order of their first frames.
+        // Tracks are numbered in the order of their first frames, so none of the range begins earlier.
         let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
         let steady = Steady::from_sums(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
         let parts = steady.parts();
@@ -89,7 +90,8 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
     Ok(None)
 }
 
-/// Sums the attributes along the tracks of `range`. None of them begins before the frame `born`.
+/// Returns sums of the attributes over all frames for each track of `range`. No track of `range` begins before the
+/// frame `born`.
 fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
     let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
@@ -102,8 +104,8 @@ fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<Track
     Ok(sums)
 }
 
-/// Returns the PSNR of renders with joined tracks against renders with separate ones; `None` if no frame has blended
-/// rows.
+/// Returns the PSNR in dB of renders with joined tracks against renders with separate ones; `None` if no frame has a
+/// track with several Gaussians, which would be blended into one.
 fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {
@@ -120,14 +122,14 @@ fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     Ok(Some(mean_psnr(&apart, &joined)))
 }
 
-/// Returns up to [`SAMPLED_FRAMES`] of `frames`, evenly spread.
+/// Returns up to [`SAMPLED_FRAMES`] of the frame numbers `frames`, evenly spread.
 fn sampled_frames(frames: &[u32]) -> impl Iterator<Item = usize> {
     let count = frames.len().min(SAMPLED_FRAMES);
     (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
 }
 
-/// Returns the PSNR of renders of `b` against renders of `a`: the mean over all frames and some views around the scene,
-/// dB.
+/// Returns the PSNR in dB of renders of the frames `b` against renders of the frames `a`: the mean over all frames and
+/// some views around the scene.
 fn mean_psnr(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     let mut renderer = Renderer::on_all_threads();
     let mut found = Vec::new();
@@ -143,7 +145,7 @@ fn mean_psnr(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     found.iter().sum::<f64>() / found.len() as f64
 }
 
-/// Formats a PSNR for notes.
+/// Formats a PSNR in dB for notes to the user.
 fn psnr_note(psnr: f64) -> String {
     if psnr.is_finite() { format!("renders stay within {psnr:.1} dB PSNR") } else { "renders are unchanged".to_owned() }
 }

@@ -1,8 +1,10 @@
-//! Attributes that hardly change along a track. Colors, scales, rotations and opacities that differ little from frame
-//! to frame, as in joined tracks of slightly different colors, are replaced by their mean in every frame.
+//! Attributes that hardly change along a track (Gaussian followed through frames). Colors, scales, rotations and
+//! opacities that differ little from frame to frame, as in joined tracks of slightly different colors, are replaced by
+//! their mean in every frame.
 //!
-//! For a track whose row at frame t has opacity αₜ and values vₜ, the mean is v̄ = Σ αₜ·vₜ / Σ αₜ. A column is steady
-//! if its root mean square deviation, weighted by αₜ, is at most a [bound](Bound). Deviations are:
+//! For a track that at frame t has the opacity αₜ and the values vₜ of an attribute, the mean is v̄ = Σ αₜ·vₜ / Σ αₜ.
+//! An attribute is steady if its root mean square deviation, weighted by αₜ, is at most a [bound](Bound). Deviations
+//! are:
 //!
 //! - color over all directions: √(Σₖ (vₜₖ − v̄ₖ)² / 4π) for SH coefficients k, in the channel with the largest
 //!   deviation;
@@ -20,41 +22,41 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 
-/// Columns that may become constant. Positions always move.
+/// Attributes that may become constant along a track. Positions always move.
 const STEADY_COLUMNS: Attributes = Attributes::all().difference(Attributes::POSITION);
-/// Number of tracks per batch in which a thread computes means.
+/// Maximum number of tracks whose means a thread computes together.
 pub(super) const BATCH: usize = 1 << 16;
 
-/// Maximum root mean square deviation of a steady column.
+/// Maximum root mean square deviation from the mean, along a track, of an attribute that becomes constant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bound {
-    /// Bound of colors in the range 0 to 1.
+    /// Maximum deviation of colors, whose values range from 0 to 1.
     pub(super) color: f64,
-    /// Bound of natural logarithms of scales, of rotations in radians, and of opacities.
+    /// Maximum deviation of natural logarithms of scales, of rotations in radians, and of opacities.
     pub(super) other: f64,
 }
 
-/// Columns of each track that are constant, and their values.
+/// For each track (Gaussian followed through frames) the attributes that are constant, and their values.
 pub(super) struct Steady {
-    /// Constant columns of every track.
+    /// Constant attributes of every track, by index of the track.
     columns: Vec<Attributes>,
-    /// Means of the columns [`STEADY_COLUMNS`] of every track, track by track, plane by plane.
+    /// Means of the attributes [`STEADY_COLUMNS`] over all frames, track by track, component by component.
     means: Spill,
     sh_degree: usize,
 }
 
-/// Constant columns of some tracks, and their values.
+/// Constant attributes of some tracks, and their values.
 pub(super) struct HeldMeans {
     columns: Vec<Attributes>,
     values: Gaussians,
 }
 
 impl Steady {
-    /// Finds the columns that change by at most `bound` along each of `count` tracks. `sums` returns the sums of a
-    /// range of tracks.
+    /// Finds the attributes that deviate by at most `bound` along each of `count` tracks. `sums` returns sums over all
+    /// frames for a range of tracks.
     ///
     /// # Errors
-    /// Fails if `sums` fails or a write to `scratch` fails.
+    /// Fails if `sums` fails or a write to the folder `scratch` fails.
     pub(super) fn from_sums(
         count: usize,
         sh_degree: usize,
@@ -75,7 +77,7 @@ impl Steady {
         Ok(Steady { columns, means: means.finish()?, sh_degree })
     }
 
-    /// Returns the fractions of tracks whose colors, scales, rotations and opacities are constant, in this order.
+    /// Returns the fraction of tracks whose colors are constant, and the same for scales, rotations and opacities.
     pub(super) fn parts(&self) -> [f64; 4] {
         [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
@@ -83,15 +85,16 @@ impl Steady {
         })
     }
 
-    /// Returns whether any column of `track` is constant.
+    /// Returns whether any attribute of `track` is constant.
     pub(super) fn has_steady(&self, track: u32) -> bool {
         !self.columns[track as usize].is_empty()
     }
 
-    /// Returns the constant columns of `tracks`, in their order. Cheap if `tracks` are in increasing order.
+    /// Returns the constant attributes of `tracks` and their values, in the same order. Fast if `tracks` are in
+    /// increasing order.
     ///
     /// # Errors
-    /// Fails if a read fails.
+    /// Fails if a read of the means fails.
     pub(super) fn means(&self, tracks: &[u32]) -> Result<HeldMeans> {
         let width = STEADY_COLUMNS.width(self.sh_degree);
         let mut values = Gaussians::zeros(tracks.len(), self.sh_degree);
@@ -112,8 +115,8 @@ impl Steady {
 }
 
 impl HeldMeans {
-    /// Writes constant columns to `state`. Each pair of `places` is the index of a track in this object and a row of
-    /// `state`.
+    /// Writes the values of constant attributes to `state`. Each pair of `places` is the index of a track in this
+    /// object and the row of that track in `state`.
     pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {
@@ -127,25 +130,28 @@ impl HeldMeans {
     }
 }
 
-/// Sums over frames for some tracks, track by track.
+/// Sums over frames for some tracks (Gaussians followed through frames), by index of the track. α is the opacity at a
+/// frame.
 pub(super) struct TrackSums {
     sh_width: usize,
-    /// Σ 1, Σ α, Σ α² of each track.
+    /// For each track its number of frames, the sum over these frames of the opacity α, and the sum of α².
     opacity: Vec<[f64; 3]>,
-    /// Σ α·v of the columns [`STEADY_COLUMNS`].
+    /// For each track the sum over frames of α·v, where α is the opacity, for each component v of the attributes
+    /// [`STEADY_COLUMNS`].
     values: Vec<f64>,
-    /// Σ α·q/|q| of the quaternions.
+    /// For each track the sum over frames of α·q/|q|, where α is the opacity and q the quaternion.
     rotations: Vec<[f64; 4]>,
-    /// Σ α·v² of the log scales.
+    /// For each track the sum over frames of α·v² for the three log scales v, where α is the opacity.
     scales: Vec<[f64; 3]>,
-    /// Σ α·Σₖ vₖ² of each color channel.
+    /// For each track and color channel the sum over frames of α·Σₖ vₖ², where α is the opacity and vₖ are the SH
+    /// coefficients.
     colors: Vec<[f64; 3]>,
-    /// First quaternion of each track; later ones get the sign nearest to it.
+    /// First quaternion of each track; later quaternions get the sign nearest to it.
     first: Vec<[f32; 4]>,
 }
 
 impl TrackSums {
-    /// Creates the sums of `len` tracks without frames.
+    /// Creates sums for `len` tracks, without any frame yet.
     pub(super) fn new(len: usize, sh_degree: usize) -> TrackSums {
         TrackSums {
             sh_width: Attributes::SH.width(sh_degree),
@@ -158,7 +164,7 @@ impl TrackSums {
         }
     }
 
-    /// Returns the bytes per track.
+    /// Returns the bytes of memory that the sums of one track take.
     pub(super) fn bytes(sh_degree: usize) -> u64 {
         (8 * (3 + STEADY_COLUMNS.width(sh_degree) + 4 + 3 + 3) + 16) as u64
     }
@@ -167,7 +173,7 @@ impl TrackSums {
         self.opacity.len()
     }
 
-    /// Adds row `at` of `state` as the state of `track` in one frame.
+    /// Adds the Gaussian in row `at` of `state` as the state of `track` in one frame.
     pub(super) fn add(&mut self, track: usize, state: &Gaussians, at: usize) {
         let [logit] = state.opacity_logit.row(at);
         let alpha = 1.0 / (1.0 + (-f64::from(logit)).exp());
@@ -204,14 +210,15 @@ impl TrackSums {
         }
     }
 
-    /// Returns the means of the columns [`STEADY_COLUMNS`] of `track`.
+    /// Returns the means of the attributes [`STEADY_COLUMNS`] of `track` over its frames.
     fn means(&self, track: usize) -> Vec<f32> {
         let width = self.values.len() / self.opacity.len();
         let [_, weight, _] = self.opacity[track];
         self.values[track * width..][..width].iter().map(|sum| (sum / weight) as f32).collect()
     }
 
-    /// Returns the columns of `track` that change by at most `bound`. A column with NaN is not steady.
+    /// Returns the attributes of `track` that deviate by at most `bound` from their mean. An attribute with NaN is not
+    /// steady.
     fn steady(&self, track: usize, bound: Bound) -> Attributes {
         let [frames, weight, squares] = self.opacity[track];
         let width = self.values.len() / self.opacity.len();

@@ -1,4 +1,5 @@
-//! Assignment of the rows of all PLY files to tracks, and the state of every track at every frame.
+//! Assigns the Gaussians of all PLY files to tracks (Gaussians followed through frames), and computes the state of
+//! every track at every frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,69 +19,70 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend};
 
-/// Opacity logit of a track in frames where it is absent: an opacity of 4·10⁻¹⁸.
+/// Opacity logit of a track in frames where it is absent; the opacity is then 4·10⁻¹⁸.
 const ABSENT_LOGIT: f32 = -40.0;
 
-/// Row of the file of a frame, and its track.
+/// Row of a Gaussian in the file of a frame, and the track to which it belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct TrackedRow {
     pub(super) track: u32,
     pub(super) row: u32,
 }
 
-/// Frame and row where a track is present.
+/// Frame, and row in the file of that frame, where a track is present.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TrackPosition {
     pub(super) frame: u32,
     row: u32,
 }
 
-/// Frames, and the track of each of their rows. If tracks are joined, several rows of a frame may belong to one track.
+/// Frames, and the track to which each Gaussian of each frame belongs. If tracks are joined, several Gaussians of a
+/// frame may belong to one track.
 pub(super) struct LinkedTracks {
     frames: PlyFrames,
     count: usize,
-    /// Peak number of linked tracks that may continue in the next frame.
+    /// Maximum, over all frames, of the number of linked tracks that may continue in the next frame.
     live_tracks: usize,
-    /// Joined track of every linked track, if tracks are joined.
+    /// For each linked track the index of the joined track to which it belongs, if tracks are joined.
     joined: Option<Vec<u32>>,
-    /// Attributes that are constant along tracks, if any.
+    /// Attributes that are constant along tracks, with their values; `None` if there are none.
     steady: Option<Steady>,
-    /// First position of each linked track.
+    /// First frame and row of each linked track.
     births: Vec<TrackPosition>,
-    /// Linked track of every row of all frames, frame by frame.
+    /// Index of the linked track of every Gaussian, frame by frame.
     track_of_rows: Spill,
-    /// Index in `track_of_rows` where each frame begins, and the total number of rows.
+    /// Index in `track_of_rows` where each frame begins, followed by the total number of entries.
     starts: Vec<u64>,
 }
 
-/// Number of frames in which tracks are present.
+/// Number of frames in which each track is present.
 pub(super) struct TrackLengths {
-    /// Number of frames of each track.
+    /// Number of frames of each track, by index of the track.
     frames_per_track: Vec<u32>,
-    /// Frames in which several rows belong to one track.
+    /// Frames in which some track has several Gaussians, which are blended into one.
     pub(super) blended: Vec<u32>,
 }
 
 impl TrackLengths {
-    /// Returns the median number of frames per track.
+    /// Returns the median over all tracks of the number of frames.
     pub(super) fn median(mut self) -> u32 {
         let middle = self.frames_per_track.len() / 2;
         if self.frames_per_track.is_empty() { 0 } else { *self.frames_per_track.select_nth_unstable(middle).1 }
     }
 }
 
-/// Counts that linking found, reported in notes.
+/// Counts from linking Gaussians into tracks, which are reported in notes.
 pub(super) struct LinkingResult {
-    /// Number of rows of all frames.
+    /// Number of Gaussians in all frames together.
     states: u64,
-    /// Frames that begin a new scene: no track continues into them.
+    /// Numbers of the frames that begin a new scene: no track continues into them.
     cuts: Vec<usize>,
-    /// Number of ambiguous links that were not made.
+    /// Number of links between Gaussians that were ambiguous and therefore not made.
     doubtful: usize,
 }
 
 impl LinkingResult {
-    /// Returns notes for the user about the linking and the resulting `tracks`.
+    /// Returns notes for the user about the linking and about the resulting `tracks`.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -110,7 +112,8 @@ impl LinkingResult {
 }
 
 impl LinkedTracks {
-    /// Links `frames`, called `name` in messages, and shows each frame to `joiner`.
+    /// Links the Gaussians of `frames`, which messages call `name`, into tracks. Shows each frame to `joiner`, which
+    /// looks for tracks of the same Gaussian. Returns the tracks, counts for notes, and the linker.
     ///
     /// # Errors
     /// Fails if a frame cannot be read, if linking needs more memory than `options` allow, or if a write fails.
@@ -128,7 +131,7 @@ impl LinkedTracks {
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = options.events.task("link", "frames", frames.paths().len() as u64);
         for frame in 0..frames.paths().len() {
-            // Before a frame is read, assume at least as many tracks as its own Gaussians.
+            // Before a frame is read, assume at least as many tracks as the frame has Gaussians.
             let linked = births.len().max(of_frame as usize) as u64;
             let sizes = Sizes {
                 frame_gaussians: of_frame.into(),
@@ -149,7 +152,7 @@ impl LinkedTracks {
             }
             doubtful += linked.doubtful;
             for (row, &track) in linked.tracks.iter().enumerate() {
-                // New tracks are numbered in the order of their rows.
+                // New tracks are numbered in the order of their rows in the frame.
                 if track as usize == births.len() {
                     births.push(TrackPosition { frame: frame as u32, row: row as u32 });
                 }
@@ -172,22 +175,23 @@ impl LinkedTracks {
         Ok((tracks, LinkingResult { states: end, cuts, doubtful }, linker))
     }
 
-    /// Joins the linked tracks to `count` tracks. `of_tracks` holds the joined track of each linked one.
+    /// Joins the linked tracks to `count` tracks. `joined_tracks` holds the index of the joined track of each linked
+    /// one.
     pub(super) fn join(&mut self, joined_tracks: Vec<u32>, count: usize) {
         (self.joined, self.count) = (Some(joined_tracks), count);
     }
 
-    /// Sets the attributes that are constant along tracks; `None` makes none constant.
+    /// Sets the attributes that are constant along tracks; `None` makes all attributes vary.
     pub(super) fn set_steady(&mut self, steady: Option<Steady>) {
         self.steady = steady;
     }
 
-    /// Returns the attributes that are constant along tracks, if any.
+    /// Returns the attributes that are constant along tracks, with their values; `None` if there are none.
     pub(super) fn steady(&self) -> Option<&Steady> {
         self.steady.as_ref()
     }
 
-    /// Undoes [`LinkedTracks::join`].
+    /// Separates the tracks that [`LinkedTracks::join`] joined.
     pub(super) fn undo_join(&mut self) {
         (self.joined, self.count) = (None, self.births.len());
     }
@@ -213,7 +217,7 @@ impl LinkedTracks {
         Ok(lengths)
     }
 
-    /// Returns the track of each row of a frame.
+    /// Returns the index of the track of each Gaussian of a frame.
     fn tracks_in_frame(&self, frame: usize) -> Result<Vec<u32>> {
         let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
         self.track_of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
@@ -240,7 +244,7 @@ impl LinkedTracks {
         }
     }
 
-    /// Returns the counts from which memory is estimated.
+    /// Returns the counts of Gaussians and tracks from which memory is estimated.
     pub(super) fn sizes(&self) -> Sizes {
         Sizes {
             frame_gaussians: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
@@ -255,12 +259,12 @@ impl LinkedTracks {
         &self.frames
     }
 
-    /// Returns the number of tracks.
+    /// Returns the number of tracks (joined ones if tracks are joined).
     pub(super) fn count(&self) -> usize {
         self.count
     }
 
-    /// Returns the rows of a frame that belong to `tracks`, sorted by track.
+    /// Returns the rows of frame `frame` whose Gaussians belong to `tracks`, sorted by track.
     pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<TrackedRow>> {
         let rows = self.tracks_in_frame(frame)?.into_iter().enumerate();
         let rows = rows.map(|(row, track)| TrackedRow { track, row: row as u32 });
@@ -269,8 +273,8 @@ impl LinkedTracks {
         Ok(rows)
     }
 
-    /// Reads `rows`, sorted by track, of a frame's `file` into `state`. Rows of one track are blended into the first of
-    /// them. Returns the index of the first row of each track.
+    /// Reads the Gaussians in `rows`, which are sorted by track, from the `file` of a frame into `state`. Gaussians of
+    /// one track are blended into the first of them. Returns for each track the index in `rows` of its first row.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -289,8 +293,8 @@ impl LinkedTracks {
         Ok(firsts)
     }
 
-    /// Returns the state of each track of `rows`, sorted by track, in the frame of `file`: rows of one track blended,
-    /// steady columns set to their means.
+    /// Returns the state of each track of `rows`, which are sorted by track, in the frame stored in `file`. Gaussians
+    /// of one track are blended, and constant attributes are set to their means.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -305,8 +309,8 @@ impl LinkedTracks {
         Ok(states)
     }
 
-    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbors, so that no
-    /// bytes are written for a block of tracks that has not begun yet or has ended.
+    /// Writes the states of all tracks at all frames to the container `path`. Tracks that begin together are neighbors,
+    /// so that no bytes are written for a block of tracks that has not begun yet or has ended.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
@@ -347,16 +351,16 @@ impl LinkedTracks {
     }
 }
 
-/// Source for the container writer: every track at the frames of one block.
+/// Source from which the container is written: the states of all tracks at the frames of one block.
 struct FrameBlock<'a> {
     info: SequenceInfo,
     tracks: &'a LinkedTracks,
-    /// Number of the first frame.
+    /// Number of the first frame of the block.
     start: usize,
     files: &'a [Ply],
-    /// Rows of each frame, sorted by track.
+    /// For each frame of the block the rows of its Gaussians, sorted by track.
     rows: &'a [Vec<TrackedRow>],
-    /// Last position of each track before these frames, or its first one.
+    /// For each track its last frame and row before this block, or its first ones if it begins later.
     held: &'a [TrackPosition],
 }
 
@@ -378,7 +382,7 @@ impl FrameSource for FrameBlock<'_> {
 }
 
 impl FrameBlock<'_> {
-    /// Writes the states of the tracks of `range` before the first of the frames.
+    /// Writes to `state` the states that the tracks of `range` have just before the first frame of the block.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -402,20 +406,20 @@ impl FrameBlock<'_> {
     }
 }
 
-/// Reader of consecutive tracks, frame by frame.
+/// Reader of the states of consecutive tracks, frame by frame.
 struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
-    /// Next frame to apply to `state`.
+    /// Next frame of the block that is to be applied to `state`.
     next: usize,
-    /// Constant columns of `range`.
+    /// Constant attributes of the tracks of `range`, with their values.
     means: Option<HeldMeans>,
     state: Gaussians,
     part: Gaussians,
 }
 
 impl TrackReader<'_> {
-    /// Resets to the state before the first of the frames.
+    /// Resets `state` to the states just before the first frame of the block.
     fn begin(&mut self) -> Result<()> {
         self.block.hold(self.range.clone(), &mut self.state)?;
         if let Some(means) = &self.means {
@@ -452,7 +456,7 @@ impl BlockReader for TrackReader<'_> {
     }
 }
 
-/// Copies rows of `part` to `state`. Each pair of `places` is a source row and a target row.
+/// Copies rows of `part` to `state`. Each pair of `places` is a row of `part` and a row of `state`.
 fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
     for column in Attributes::all().iter() {
         let (from, to) = (part.column(column), state.column_mut(column));

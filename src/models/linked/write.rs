@@ -1,5 +1,6 @@
-//! Compressed linked frames, written as PLY files like those of the input. Each file holds the Gaussians that are
-//! present in the frame, with its original properties, comments and name.
+//! Writes a compressed sequence of linked frames (whose Gaussians were matched across frames) as PLY files like those
+//! of the input. The file of a frame holds the Gaussians that are present in this frame, and keeps the properties,
+//! comments and name of its input file.
 
 use std::path::Path;
 
@@ -15,12 +16,13 @@ use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
-/// Marks a track without a row in a frame.
+/// Row number of a track that is absent from a frame.
 const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {
-    /// Writes the file of every frame into `folder`. A proxy is present if one of its members is, in the row of the
-    /// first of them. Several rows of a track become one, in the place of the first. Steady columns have their means.
+    /// Writes one file per frame into `folder`. A proxy (Gaussian that replaces merged tracks) is present in a frame if
+    /// one of its members is, and takes the row of the first of them. Several Gaussians of a track become one, in the
+    /// row of the first. Attributes that are constant along a track have their means.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
@@ -31,7 +33,7 @@ impl LinkedFrames {
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
             let mut row_of = vec![NO_ROW; self.tracks.count()];
-            // If a track has several rows, use the first.
+            // If a track has several rows in this frame, use the first.
             of_frame.iter().rev().for_each(|row| row_of[row.track as usize] = row.row);
             let several = of_frame.chunk_by(|a, b| a.track == b.track).filter(|of_track| of_track.len() > 1);
             let blended: HashSet<u32> = several.map(|of_track| of_track[0].track).collect();
@@ -71,7 +73,7 @@ impl LinkedFrames {
             progress.advance(1);
             Ok(())
         };
-        // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
+        // Frames are written in batches: while a thread waits for proxies, it would otherwise begin another frame.
         let numbers: Vec<usize> = (0..frames.paths().len()).collect();
         numbers.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
     }

@@ -1,9 +1,9 @@
-//! Models whose frames are computed from raw parameters by a motion model: polynomials of time, networks, conditional
-//! covariances.
+//! Models whose frames are computed from stored parameters by a motion model: polynomials of time, networks, or
+//! conditional covariances.
 //!
-//! A model format provides its [`MotionModel`]. Reading in blocks, adding deltas and compressing are shared by all of
-//! them. Memory: the raw parameters, and per open reader a copy of the raw parameters of its Gaussians with the values
-//! prepared from them.
+//! Each model format provides its [`MotionModel`]. Reading in blocks, adding deltas and compressing are shared by all
+//! of these formats. Memory: the stored parameters, and for each open reader a copy of the stored parameters of its
+//! Gaussians with the values prepared from them.
 
 mod proxies;
 pub(super) mod window;
@@ -21,25 +21,27 @@ use crate::source::{BlockReader, Count, Deformation, FeatureDecoder, FrameSource
 
 pub(super) use proxies::solve;
 
-/// Computation of frame states from raw parameters. States are in stored encoding (see [`Gaussians`]).
+/// Computes the states of Gaussians at any time from their stored parameters. States are in stored encoding (see
+/// [`Gaussians`]).
 pub(super) trait MotionModel: Debug + Send + Sync {
-    /// Values of some Gaussians that do not depend on time, computed once.
+    /// Values of some Gaussians that do not depend on time and are computed once.
     type Prepared: Send + Sync;
 
-    /// Computes the time-independent values of `raw`.
+    /// Computes the values that do not depend on time from the stored parameters `raw`.
     fn prepare(&self, raw: &StoredParams) -> Self::Prepared;
 
-    /// Returns the columns that change with time.
+    /// Returns the attributes that change with time.
     fn varying(&self) -> Attributes;
 
-    /// Returns the columns of [`StoredParams::gaussians`] that [`MotionModel::jacobian`] covers, so that they can be optimized.
+    /// Returns the attributes in [`StoredParams::gaussians`] that the optimizer can change, because
+    /// [`MotionModel::jacobian`] covers them.
     fn movable(&self) -> Attributes;
 
-    /// Writes the columns `want` of the states at `time` into `out`, whose columns already have the right length.
-    /// Called with at most [`BLOCK`] Gaussians at once, from many threads.
+    /// Computes the attributes `want` of the states at `time` and writes them to `out`, whose attributes already have
+    /// the right length. Called with at most [`BLOCK`] Gaussians at once, from many threads.
     ///
-    /// Implementations are always inlined, so that loops over planes are compiled for wider registers. No operation is
-    /// fused, so the bits are the same on every machine.
+    /// Implementations are always inlined, so that loops over Gaussians are compiled for wider registers. No operation
+    /// is fused, so the bits are the same on every machine.
     ///
     /// # Errors
     /// Fails if the model cannot be evaluated.
@@ -52,8 +54,8 @@ pub(super) trait MotionModel: Debug + Send + Sync {
         out: &mut Gaussians,
     ) -> Result<()>;
 
-    /// Returns the derivative of the columns `want` of these states with respect to [`StoredParams::gaussians`]. The default is
-    /// the identity: states change by as much as stored values.
+    /// Returns the derivative of the attributes `want` of the states at `time` with respect to
+    /// [`StoredParams::gaussians`]. The default is the identity: states change by as much as stored values do.
     ///
     /// # Errors
     /// Fails if the model cannot be evaluated.
@@ -62,15 +64,15 @@ pub(super) trait MotionModel: Debug + Send + Sync {
         Ok(Jacobian::default())
     }
 
-    /// Returns the decoder of pixel colors for models that render features instead of colors.
+    /// Returns the decoder of pixel colors if the model renders features instead of colors; else `None`.
     fn shading(&self) -> Option<&dyn Shading> {
         None
     }
 }
 
-/// Decoder of rendered features to colors.
+/// Computes colors of pixels from rendered features.
 pub(super) trait Shading: Sync {
-    /// Returns the features of `raw` at `time`, one plane per feature.
+    /// Returns the features of the Gaussians `raw` at `time`, feature by feature.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues;
 
     /// Returns the color of a pixel from its blended `features`, seen from the camera center `center` along the unit
@@ -78,7 +80,7 @@ pub(super) trait Shading: Sync {
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// Raw parameters with their motion model, readable as frames.
+/// Frames that a motion model computes from stored parameters.
 #[derive(Debug)]
 pub(super) struct MotionModelFrames<L> {
     motion_model: Arc<L>,
@@ -95,18 +97,18 @@ impl<L> Clone for MotionModelFrames<L> {
 }
 
 impl<L: MotionModel> MotionModelFrames<L> {
-    /// Creates a model without frames, whose states have the SH degree `sh_degree`.
+    /// Creates a model that has no frames yet. `sh_degree` is the SH degree of its states.
     pub(super) fn new(motion_model: L, raw: StoredParams, sh_degree: usize) -> MotionModelFrames<L> {
         let info = SequenceInfo { count: raw.len(), times: Vec::new(), sh_degree, varying: motion_model.varying() };
         MotionModelFrames { motion_model: Arc::new(motion_model), raw: Arc::new(raw), info, states: Count::default() }
     }
 
-    /// Returns the motion model.
+    /// Returns the motion model, which computes states from stored parameters.
     pub(super) fn motion_model(&self) -> &L {
         &self.motion_model
     }
 
-    /// Returns the raw parameters.
+    /// Returns the stored parameters of all Gaussians.
     pub(super) fn raw(&self) -> &StoredParams {
         &self.raw
     }
@@ -120,7 +122,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
         Ok(self)
     }
 
-    /// Returns the same motion model and frames with other Gaussians.
+    /// Returns a model with the same motion model and frames, but with the Gaussians `raw`.
     pub(super) fn with_raw(&self, raw: StoredParams) -> MotionModelFrames<L> {
         let sh_degree = self.info.sh_degree.min(raw.gaussians.sh_degree());
         let info = SequenceInfo { count: raw.len(), sh_degree, ..self.info.clone() };
@@ -132,12 +134,12 @@ impl<L: MotionModel> MotionModelFrames<L> {
         }
     }
 
-    /// Returns the frames of the compressed model `reduction`.
+    /// Returns the frames of the compressed model that `reduction` describes.
     pub(super) fn reduced(&self, reduction: &CompressedModel) -> MotionModelFrames<L> {
         self.with_raw(compressed_raw(&self.raw, reduction))
     }
 
-    /// Returns the time of a frame; fails if the frame does not exist.
+    /// Returns the time of frame `frame`; fails if the frame does not exist.
     fn frame_time(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
         let missing = || Error::internal(format!("frame {frame} was requested; the sequence has {}", times.len()));
@@ -145,8 +147,9 @@ impl<L: MotionModel> MotionModelFrames<L> {
     }
 }
 
-/// Returns the raw parameters of the compressed model `reduction` of `raw`: the survivors, proxies in place of their
-/// leaders, parameter deltas added, and the SH degree lowered.
+/// Returns the stored parameters of the compressed model `reduction` of `raw`: Gaussians are removed, proxies
+/// (Gaussians that replace merged ones) put in place of their leaders, parameter deltas added, and the SH degree
+/// lowered.
 pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) -> StoredParams {
     let mut raw_left = raw.pick(&reduction.kept);
     if let Some(proxies) = &reduction.proxies.raw {
@@ -159,7 +162,7 @@ pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) ->
     raw_left
 }
 
-/// Copies the columns `want` of `raw` to `out`.
+/// Copies the stored attributes `want` of all Gaussians of `raw` to `out`.
 pub(super) fn copy_stored(raw: &StoredParams, want: Attributes, out: &mut Gaussians) {
     for column in want.iter() {
         let (from, to) = (raw.gaussians.column(column), out.column_mut(column));
@@ -183,7 +186,7 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
-    /// No frames are decoded together, so blocks are read one by one.
+    /// Returns `None`: no frames are decoded together, so blocks of Gaussians are read one by one.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
@@ -214,7 +217,7 @@ impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
     }
 }
 
-/// Up to [`BLOCK`] Gaussians with their time-independent values.
+/// Up to [`BLOCK`] Gaussians, with the values that do not depend on time.
 struct PreparedBlock<L: MotionModel> {
     raw: StoredParams,
     prepared: L::Prepared,
@@ -225,7 +228,8 @@ impl<L: MotionModel> PreparedBlock<L> {
         PreparedBlock { prepared: motion_model.prepare(&raw), raw }
     }
 
-    /// Computes the columns `want` of the states at `time`, with AVX2 where the processor has it.
+    /// Computes the attributes `want` of the states at `time` into `out`, using AVX2 instructions if the processor has
+    /// them.
     fn state(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
         out.columns_mut(want).for_each(|column| column.resize(self.raw.len()));
         #[cfg(target_arch = "x86_64")]
@@ -236,7 +240,7 @@ impl<L: MotionModel> PreparedBlock<L> {
         motion_model.state(time, &self.raw, &self.prepared, want, out)
     }
 
-    /// Calls [`MotionModel::state`] compiled for AVX2.
+    /// Computes the same as [`MotionModel::state`], compiled for AVX2 instructions.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn state_avx2(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
@@ -244,7 +248,7 @@ impl<L: MotionModel> PreparedBlock<L> {
     }
 }
 
-/// Reader of some Gaussians of a model, in blocks.
+/// Reader of some Gaussians of a model, frame by frame; it works in blocks of Gaussians.
 struct MotionModelReader<'a, L: MotionModel> {
     model: &'a MotionModelFrames<L>,
     blocks: Vec<PreparedBlock<L>>,
@@ -270,7 +274,7 @@ impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
     }
 }
 
-/// Evaluates blocks of Gaussians in parallel.
+/// Evaluation of blocks of Gaussians in parallel.
 impl<L: MotionModel> Deformation for MotionModelFrames<L> {
     fn stored(&self) -> &StoredParams {
         &self.raw

@@ -1,4 +1,5 @@
-//! Proxies with raw parameters of a model format, checked against the moment match of their members.
+//! Computes proxies (Gaussians that replace merged ones) that have stored parameters of a model format, and compares
+//! them with the moment match of their members.
 
 use super::{MotionModel, MotionModelFrames};
 use crate::compressed_model::{Cluster, Proxies, Reference};
@@ -10,12 +11,12 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum difference in opacity between a proxy and the moment match of its members, at any frame.
+/// Maximum difference in opacity, at any frame, between a proxy and the moment match of its members (merged Gaussians).
 const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 
-/// Returns the proxies that `propose` computes for `clusters`, one row each. Refuses a proxy if at any frame its state
-/// differs from the moment match of its members by more than `max_drift` in position or 0.1 in opacity. Frames in which
-/// neither is visible are not compared.
+/// Returns the proxies that `propose` computes for `clusters`, one row each. A proxy is refused if at any frame its
+/// state differs from the moment match of its members by more than `max_drift` in position or 0.1 in opacity. Frames in
+/// which both are invisible are not compared.
 ///
 /// # Errors
 /// Fails if `propose` fails or frames cannot be evaluated.

@@ -1,20 +1,21 @@
 //! Opacities that fade with the distance in time.
 //!
-//! α = σ(o)·m with m = exp(e), e ≤ 0. As a logit: ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), computed in f64 without
-//! loss of precision for α near 0 or 1.
+//! The opacity is α = σ(o)·m, with the stored logit o, the logistic function σ, and the window m = exp(e), e ≤ 0. Its
+//! logit ln α − ln(1 − α) equals e − ln(exp(−o) + 1 − m), which is computed in f64 without loss of precision for α near
+//! 0 or 1.
 
 use crate::model::functions::{exp_m1, ln};
 
-/// Maximum absolute value of a logit. Larger ones do not change the opacity noticeably.
+/// Maximum absolute value of an opacity logit. Larger ones do not change the opacity noticeably.
 pub(in crate::models) const MAX_LOGIT: f64 = 40.0;
 
-/// Returns exp(−o) of a stored logit o.
+/// Returns exp(−o) for a stored opacity logit o.
 pub(in crate::models) fn inverse_odds(logit: f32) -> f64 {
     (-f64::from(logit)).exp()
 }
 
-/// Returns the logit of σ(o)·exp(`exponent`), clamped to ±[`MAX_LOGIT`]. `inverse_odds` is exp(−o). Written without branches, so
-/// that loops are vectorized.
+/// Returns the logit of the faded opacity σ(o)·exp(`exponent`), clamped to ±[`MAX_LOGIT`]. `inverse_odds` is exp(−o)
+/// for the stored opacity logit o. Has no branches, so that loops are vectorized.
 #[inline(always)]
 pub(in crate::models) fn faded_logit(inverse_odds: f64, exponent: f64) -> f64 {
     // The resulting opacity is at most m = exp(exponent).
@@ -24,7 +25,7 @@ pub(in crate::models) fn faded_logit(inverse_odds: f64, exponent: f64) -> f64 {
     if logit < -MAX_LOGIT { -MAX_LOGIT } else { logit }
 }
 
-/// Returns ∂ [`faded_logit`] / ∂ o; 0 where the logit is clamped.
+/// Returns the derivative of [`faded_logit`] with respect to the stored logit o; 0 where the result is clamped.
 pub(in crate::models) fn slope(inverse_odds: f64, exponent: f64) -> f64 {
     let logit = faded_logit(inverse_odds, exponent);
     if logit.abs() < MAX_LOGIT { inverse_odds / (inverse_odds - exponent.exp_m1()) } else { 0.0 }
@@ -49,7 +50,7 @@ mod tests {
                 assert!((slope - expected).abs() < 1e-6, "{logit} {exponent}: {slope} {expected}");
             }
         }
-        // Clamped values.
+        // Values that are clamped.
         assert_eq!(
             [faded_logit(inverse_odds(800.0), 0.0), faded_logit(inverse_odds(-800.0), 0.0), faded_logit(1.0, -1e300)],
             [MAX_LOGIT, -MAX_LOGIT, -MAX_LOGIT]

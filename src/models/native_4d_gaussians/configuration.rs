@@ -1,5 +1,5 @@
-//! Files beside a checkpoint that record how it was trained: `cfg_args`, and the YAML configuration of the training.
-//! The YAML is not saved with the model, so it is there only if somebody copied it.
+//! Reads the files beside a checkpoint that record how the model was trained: `cfg_args`, and the YAML configuration of
+//! the training. The trainer does not save the YAML with the model, so it exists only if somebody copied it.
 
 use std::path::Path;
 
@@ -9,20 +9,20 @@ use crate::files::text::read_text;
 use crate::models::four_d_gaussians::cfg_args;
 use crate::models::in_checkpoint::yaml_files_in;
 
-/// Values of the training configuration that are used.
+/// Values of the training configuration that affect how the model is read or rendered.
 #[derive(Debug, Default)]
 pub(super) struct TrainingConfig {
     pub(super) source_path: Option<String>,
-    /// Background color: white if true, else black.
+    /// Whether the background of the training images is white; else it is black.
     pub(super) white_background: bool,
-    /// Variance added to Σ_tt (`prefilter_var`).
+    /// Variance in time that the training added to that of each Gaussian, Σ_tt (`prefilter_var`).
     pub(super) prefilter: f64,
-    /// Period L of colors, and the name of the file that gives it.
+    /// Period L after which colors repeat, in the model's time unit, and the name of the file that gives it.
     pub(super) time_duration: Option<(f64, String)>,
 }
 
 impl TrainingConfig {
-    /// Reads the configuration of the model in the folder `root`.
+    /// Reads the training configuration of the model in the folder `root`.
     ///
     /// # Errors
     /// Fails if a file cannot be read or parsed, or if two files contradict each other.
@@ -46,11 +46,11 @@ impl TrainingConfig {
     }
 }
 
-/// Returns the period L from the YAML files in `root`, and the name of the file.
+/// Returns the period L of colors from the YAML files in `root`, and the name of the file that gives it.
 fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
     for path in yaml_files_in(root) {
-        // Unrelated text files may be unreadable.
+        // Text files that have nothing to do with the model may be unreadable, so skip such files.
         let Ok(text) = read_text(&path, 1 << 20) else { continue };
         let Some(span) = time_duration_entries(&text) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -72,7 +72,8 @@ fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     Ok(found)
 }
 
-/// Returns the entries of the list `time_duration` of a YAML, written in one line or one per line.
+/// Returns the entries of the list `time_duration` in a YAML text. The list may be written in one line or one entry per
+/// line.
 fn time_duration_entries(text: &str) -> Option<Vec<&str>> {
     let mut lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim_end());
     let after = lines.find_map(|line| line.strip_prefix("time_duration:"))?.trim();

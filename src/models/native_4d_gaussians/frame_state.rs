@@ -1,9 +1,13 @@
-//! Motion model of four-dimensional Gaussians: each time is a slice of them.
+//! Motion model of four-dimensional Gaussians: the state at a time is a slice of the Gaussian at that time.
 //!
-//! - Σ₄ = R₄ diag(s)² R₄ᵀ; v = Σ₁₂/Σ_tt; x(t) = x + v·(t − μ); Σ = Σ₁₁ − Σ₁₂Σ₂₁/Σ_tt, constant in time.
-//! - m = exp(−½(t − μ)²/Σ_tt); opacity = σ(o)·m, and 0 if m ≤ 0.05.
+//! A Gaussian has the center x, μ in space and time, and a covariance Σ₄ with the blocks Σ₁₁ (space), Σ_tt (time) and
+//! Σ₁₂ (both).
+//!
+//! - Σ₄ = R₄ diag(s)² R₄ᵀ; velocity v = Σ₁₂/Σ_tt; x(t) = x + v·(t − μ); the spatial covariance Σ = Σ₁₁ − Σ₁₂Σ₂₁/Σ_tt is
+//!   constant in time.
+//! - Temporal marginal m = exp(−½(t − μ)²/Σ_tt); opacity = σ(o)·m, and 0 if m ≤ 0.05.
 //! - Without a 4D rotation, v = 0, Σ follows from `scaling` and `rotation`, and Σ_tt = exp(scaling_t), not its square.
-//! - SH coefficients: c_k + cos(2π(μ − t)/L)·c₁₆₊ₖ + cos(4π(μ − t)/L)·c₃₂₊ₖ.
+//! - SH coefficients: c_k + cos(2π(μ − t)/L)·c₁₆₊ₖ + cos(4π(μ − t)/L)·c₃₂₊ₖ, with the period L.
 //!
 //! All computations are in f64: in f32 a fast, small Gaussian with a long life span would lose Σ. Source:
 //! `computeCov3D_conditional`, `get_marginal_t`, `eval_shfs_4d` of the repository (fudan-zvg). Its rasterizer evaluates
@@ -17,63 +21,63 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::motion_model::window::{MAX_LOGIT, faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Plane of [`StoredParams::own`] with the center μ in time.
+/// Index in [`StoredParams::own`] of the center μ in time.
 pub(super) const TIME: usize = 0;
-/// Plane of [`StoredParams::own`] with the logarithm of the scale along time.
+/// Index in [`StoredParams::own`] of the logarithm of the scale along time.
 pub(super) const SCALING_T: usize = 1;
-/// First of four planes of [`StoredParams::own`] with the right quaternion.
+/// First of four indices in [`StoredParams::own`] of the right quaternion of the 4D rotation.
 pub(super) const ROTATION_R: usize = 2;
-/// First plane of [`StoredParams::own`] with the time-dependent SH coefficients, term by term.
+/// First index in [`StoredParams::own`] of the time-dependent SH coefficients, term by term.
 pub(super) const TERMS: usize = 6;
-/// Number of planes of one term of SH coefficients of degree 3.
+/// Number of SH coefficients (three channels, degree 3) of one time-dependent term.
 pub(super) const TERM_WIDTH: usize = 48;
 
-/// Temporal marginal m up to which a Gaussian is not drawn.
+/// Temporal marginal m (factor of the opacity) up to which a Gaussian is not drawn.
 const MIN_MARGINAL: f64 = 0.05;
 
-/// Motion model of four-dimensional Gaussians.
+/// Motion model of four-dimensional Gaussians and the settings of their training.
 #[derive(Debug, Clone)]
 pub(super) struct Native {
     /// Whether Gaussians have a 4D rotation; if not, space and time are independent.
     pub(super) has_4d_rotation: bool,
-    /// Whether the order of rows and columns of the rotation matrix is reversed, as since 15 September 2024.
+    /// Whether the order of rows and columns of the 4D rotation matrix is reversed, as since 15 September 2024.
     pub(super) flipped: bool,
-    /// Variance added to Σ_tt in the temporal marginal.
+    /// Variance that is added to the variance in time Σ_tt in the temporal marginal.
     pub(super) prefilter: f64,
-    /// Number of time-dependent SH terms.
+    /// Number of time-dependent SH terms in use, from 0 to 2.
     pub(super) terms: usize,
-    /// Period L given by the user or the training configuration.
+    /// Period L of colors as given by the user or the training configuration, in the model's time unit.
     pub(super) given_period: Option<f64>,
-    /// Period L in use.
+    /// Period L of colors in use, in the model's time unit.
     pub(super) period: f64,
 }
 
-/// Time-independent values of some Gaussians.
+/// Values of some Gaussians that do not depend on time.
 #[derive(Debug)]
 pub(super) struct Slices {
-    /// Velocity, one plane per axis.
+    /// Velocity of each Gaussian, axis by axis, in scene units per unit of time.
     velocity: [Vec<f64>; 3],
-    /// −1/(2 Σ_tt), including the prefilter.
+    /// For each Gaussian −1/(2 Σ_tt), where the variance in time Σ_tt includes `prefilter`.
     rates: Vec<f64>,
-    /// exp(−o) of each opacity logit o.
+    /// For each Gaussian exp(−o), where o is the stored opacity logit.
     inverse_odds: Vec<f64>,
-    /// Rotation of Σ; empty without a 4D rotation.
+    /// Rotation of the spatial covariance Σ of each Gaussian; empty without a 4D rotation.
     rotation: AttributeValues,
-    /// Log scales of Σ; empty without a 4D rotation.
+    /// Log scales of the spatial covariance Σ of each Gaussian; empty without a 4D rotation.
     log_scale: AttributeValues,
 }
 
-/// Time-independent values of one Gaussian.
+/// Velocity, variance in time and spatial covariance of one four-dimensional Gaussian.
 pub(super) struct Slice {
     pub(super) velocity: [f64; 3],
-    /// Variance in time, Σ_tt.
+    /// Variance in time, Σ_tt, without `prefilter`.
     pub(super) variance: f64,
-    /// Spatial covariance Σ: xx xy xz yy yz zz; `None` if it follows from the raw scales and rotation.
+    /// Spatial covariance Σ: xx xy xz yy yz zz; `None` if it follows from the stored scales and rotation.
     pub(super) covariance: Option<[f64; 6]>,
 }
 
 impl Native {
-    /// Computes the velocity and covariance of Gaussian `i`.
+    /// Computes velocity, variance in time and spatial covariance of Gaussian `i` from its stored parameters.
     pub(super) fn slice(&self, raw: &StoredParams, i: usize) -> Slice {
         let log_scale_t = f64::from(raw.own.plane(SCALING_T)[i]);
         if !self.has_4d_rotation {
@@ -93,18 +97,19 @@ impl Native {
         Slice { velocity, variance, covariance: Some(covariance) }
     }
 
-    /// Returns −1/(2 Σ_tt), including the prefilter.
+    /// Returns −1/(2 Σ_tt) for the variance in time `variance`, to which `prefilter` is added.
     fn rate(&self, variance: f64) -> f64 {
         -0.5 / (variance + self.prefilter.max(0.0))
     }
 
-    /// Returns the temporal marginal m at `time` of a Gaussian with this center and variance Σ_tt; 0 below the cutoff.
+    /// Returns the temporal marginal m at `time` (factor of the opacity) of a Gaussian with this center and variance in
+    /// time; 0 at or below [`MIN_MARGINAL`].
     pub(super) fn marginal(&self, time: f64, center: f64, variance: f64) -> f64 {
         let m = (self.rate(variance) * (time - center).powi(2)).exp();
         if m > MIN_MARGINAL { m } else { 0.0 }
     }
 
-    /// Returns cos(2π(μ − t)/L) and cos(4π(μ − t)/L).
+    /// Returns the waves cos(2π(μ − t)/L) and cos(4π(μ − t)/L) of the colors, for time t, center μ and period L.
     pub(super) fn waves(&self, time: f64, center: f64) -> [f64; 2] {
         let wave = (TAU * (center - time) / self.period).cos();
         [wave, 2.0 * wave * wave - 1.0]
@@ -141,8 +146,8 @@ impl MotionModel for Native {
         Attributes::POSITION | Attributes::OPACITY | colors
     }
 
-    /// Excludes scales and rotations of Gaussians with a 4D rotation: they follow from the 4D scales and rotation
-    /// together.
+    /// Returns the attributes that the optimizer can change. Excludes scales and rotations of Gaussians with a 4D
+    /// rotation: they follow from the 4D scales and rotation together.
     fn movable(&self) -> Attributes {
         let mixed =
             if self.has_4d_rotation { Attributes::ROTATION | Attributes::LOG_SCALE } else { Attributes::empty() };

@@ -1,9 +1,10 @@
-//! 4D Gaussian Splatting in its native form (fudan-zvg): four-dimensional Gaussians in a training checkpoint.
+//! 4D Gaussian Splatting in its native form (fudan-zvg) as a model format: four-dimensional Gaussians in a training
+//! checkpoint.
 //!
-//! Input: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, where the capture
-//! is a tuple of 19 (4D) or 12 (static model). Output: the same checkpoint with fewer rows, including optimizer state,
-//! `cfg_args` and the training configuration if it is there. Settings of the training that the files do not record can
-//! be given as [`Conventions`].
+//! Input: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file. It holds `(capture, iteration)`, where
+//! the capture is a tuple of 19 values (4D model) or 12 values (static model). Output: the same checkpoint with fewer
+//! Gaussians, including optimizer state, `cfg_args`, and the training configuration if it exists. Settings of the
+//! training that the files do not record can be given as [`Conventions`].
 
 mod configuration;
 mod frame_state;
@@ -29,15 +30,15 @@ use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
 use frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 
-/// Length of the capture tuple of a 4D model.
+/// Number of values in the capture tuple of a 4D model.
 const CAPTURE_LENGTH_4D: usize = 19;
-/// Length of the capture tuple of a static model.
+/// Number of values in the capture tuple of a static model.
 const CAPTURE_LENGTH_STATIC: usize = 12;
 
-/// Checkpoint, or the folder of a model.
+/// Training checkpoint, or the model folder that contains it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
-        // Other formats save checkpoints of their own beside a folder `point_cloud`.
+        // Other formats also save checkpoints beside a folder `point_cloud`, so the capture must be that of a 4D model.
         true if found.path.join("point_cloud").is_dir() => {
             checkpoints(found.path).iter().any(|path| has_capture(path, &[CAPTURE_LENGTH_4D], found.memory))
         }
@@ -61,14 +62,16 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns the best checkpoint, then those of iterations, last one first.
+/// Returns the paths of the checkpoints in `folder`: the best one if it exists, then those of iterations, last one
+/// first.
 fn checkpoints(folder: &Path) -> Vec<PathBuf> {
     let best = folder.join("chkpnt_best.pth");
     let by_number = numbered_files(folder, "chkpnt", ".pth").into_iter().rev().map(|(_, path)| path);
     best.is_file().then_some(best).into_iter().chain(by_number).collect()
 }
 
-/// Returns whether the checkpoint at `path` is a pair of a tuple with one of `lengths` and an iteration number.
+/// Returns whether the checkpoint at `path` is a pair of a capture tuple, whose number of values is one of `lengths`,
+/// and an iteration number.
 fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
@@ -81,8 +84,8 @@ fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     }
 }
 
-/// Returns the checkpoint of the requested iteration; without a request the best one, or the last. Adds a note if there
-/// are several.
+/// Returns the path of the checkpoint of the requested iteration. Without a request, returns the best one, or the last
+/// if there is no best one; a note is added if there are several.
 fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(folder);
     let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -103,8 +106,8 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-/// Returns the SH degree and the number of stored time-dependent SH terms for a number of SH coefficients; `None` if no model
-/// has this number.
+/// Returns the SH degree and the number of stored time-dependent SH terms for a number of SH coefficients per channel;
+/// `None` if no model has this number.
 fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     match (coefficients, is_4d) {
         (1 | 4 | 9 | 16, _) => Some((coefficients.isqrt() - 1, 0)),
@@ -115,7 +118,8 @@ fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     }
 }
 
-/// Returns the motion model of a 4D capture with the given `parts`. At most `stored_terms` time-dependent SH terms are active.
+/// Returns the motion model of a 4D capture with the values `parts`. At most `stored_terms` time-dependent SH terms are
+/// in use.
 fn motion_model(
     checkpoint: &Checkpoint,
     parts: &[NodeId],
@@ -143,7 +147,7 @@ fn motion_model(
     })
 }
 
-/// Returns the nodes of a capture that only training reads: its statistics and the tensors of the optimizer.
+/// Returns the values of a capture that only the training reads: statistics, and the tensors of the optimizer.
 fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId> {
     let (optimizer, statistics) = if is_4d { (11, 7..11) } else { (10, 7..10) };
     let mut nodes: Vec<NodeId> = parts[statistics].to_vec();
@@ -154,7 +158,7 @@ fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId>
     nodes
 }
 
-/// Returns the name of part `i` of a capture for messages.
+/// Returns the place of value `i` of a capture, called `name`, for error messages.
 fn place(i: usize, name: &str) -> String {
     format!("capture[{i}] ({name})")
 }
@@ -249,8 +253,8 @@ impl ProxyRule for Native {
         hash.update(&self.given_period.unwrap_or(0.0).to_le_bytes());
     }
 
-    /// Chooses the period L of colors: the given one, else 10 (the length of the N3V videos) if frames lie beyond time
-    /// 1, else 1.
+    /// Returns the motion model with the period L of colors for frames at `times`: the given period, else 10 (the
+    /// length of the N3V videos) if frames lie beyond time 1, else 1.
     fn for_times(&self, times: &[f64]) -> Option<Native> {
         let beyond = times.iter().any(|&time| time > 1.0);
         let guessed = if beyond { 10.0 } else { 1.0 };

@@ -1,9 +1,10 @@
-//! Proxies of four-dimensional Gaussians: combines the matched slice and temporal window into one 4D Gaussian.
+//! Computes proxies (Gaussians that replace merged ones) of four-dimensional Gaussians. The matched slice (state at one
+//! time) and temporal window are combined into one 4D Gaussian.
 //!
-//! With the match of the slices (a line with velocity v, Σ, a window of standard deviation s): Σ₄ = [[Σ + vvᵀs², vs²],
-//! [vᵀs², s²]], whose axes give two quaternions. SH coefficients refer to the proxy's own center: the values of the
-//! moment match at the sampled frames are fitted by 1, cos and cos of the double angle (least squares, with a ridge
-//! term on the waves).
+//! The match of the slices is a line with velocity v, a spatial covariance Σ, and a window of standard deviation s in
+//! time. Then Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes give two quaternions. SH coefficients refer to the
+//! proxy's own center in time: the values of the moment match at the sampled frames are fitted by 1, a cosine wave and
+//! the wave of twice its frequency (least squares, with a ridge term on the waves).
 
 use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
@@ -14,11 +15,11 @@ use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Ridge as a fraction of the total frame weight. Keeps waves near 0 if the frames do not distinguish them from the
-/// constant.
+/// Ridge term of the fit, as a fraction of the total weight of the frames. It keeps the coefficients of waves near 0 if
+/// the frames do not distinguish the waves from the constant.
 const RIDGE: f64 = 1e-3;
 
-/// Returns the raw parameters of the proxies of `clusters`.
+/// Returns the stored parameters of the proxies of `clusters`, one row each.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -83,17 +84,17 @@ pub(super) fn propose(
     Ok(proxies)
 }
 
-/// Sums of a least-squares fit of many values by the same three functions.
+/// Least-squares fit of many values by the same three functions of time: the constant 1 and two waves.
 #[derive(Debug, Clone, Default)]
 struct ThreeFunctionFit {
-    /// Weighted products of the functions, summed over samples.
+    /// Matrix of the normal equations: for each pair of functions the weighted sum of their products over the samples.
     normal: [[f64; 3]; 3],
-    /// Weighted products of the functions with each value.
+    /// For each value and function the weighted sum of their products over the samples.
     by_value: Vec<[f64; 3]>,
 }
 
 impl ThreeFunctionFit {
-    /// Adds a sample: the functions `basis` and all values at one time.
+    /// Adds a sample: the three functions `basis` and all values at one time, with a weight.
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {
@@ -104,7 +105,8 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Returns the coefficients of each value: of the constant and of the first `terms` waves; the others are 0.
+    /// Returns for each value the coefficients of the constant and of the first `terms` waves; the other coefficients
+    /// are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];
@@ -147,7 +149,7 @@ mod tests {
         short.add(0.5, wave(6, 0.3), [0.7].into_iter());
         let [[constant, first, second]] = short.solve(2).collect::<Vec<_>>()[..] else { panic!("one value") };
         assert!((constant + first + second - 0.7).abs() < 1e-9 && first.abs() < 1e-2 && second.abs() < 1e-2);
-        // Terms beyond those of the model stay 0.
+        // Coefficients of terms that the model does not have stay 0.
         let [got, _] = whole.solve(0).collect::<Vec<_>>()[..] else { panic!("two values") };
         assert_eq!(got[1..], [0.0, 0.0]);
     }

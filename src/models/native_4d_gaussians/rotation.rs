@@ -1,46 +1,46 @@
-//! Four-dimensional rotations as pairs of quaternions.
+//! Four-dimensional rotations, given as pairs of quaternions.
 //!
-//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, and R̄ from the right by the conjugate of r, on
-//! (w, x, y, z). After reversing both axes, rows and columns are x, y, z, t. Source: `build_rotation_4d` of the
-//! repository.
+//! The rotation matrix is R = L(l)·R̄(r), for vectors (w, x, y, z). L multiplies from the left by the unit quaternion
+//! l, and R̄ from the right by the conjugate of the unit quaternion r. After the order of rows and columns is reversed,
+//! they stand for x, y, z, t. Source: `build_rotation_4d` of the repository.
 
 /// 4×4 matrix, row by row.
 pub(super) type Matrix = [[f64; 4]; 4];
 
-/// Returns the matrix of multiplication from the left by a quaternion.
+/// Returns the matrix that multiplies a quaternion from the left by the quaternion (a, b, c, d).
 fn left([a, b, c, d]: [f64; 4]) -> Matrix {
     [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
 }
 
-/// Returns the matrix of multiplication from the right by the conjugate of a quaternion.
+/// Returns the matrix that multiplies a quaternion from the right by the conjugate of the quaternion (p, q, r, s).
 fn right([p, q, r, s]: [f64; 4]) -> Matrix {
     [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
 }
 
-/// Returns the matrix product.
+/// Returns the product of two matrices.
 fn product(a: &Matrix, b: &Matrix) -> Matrix {
     [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
-/// Reverses the order of rows and columns. Applied twice, it returns the original matrix.
+/// Returns the matrix with rows and columns in reversed order. Applied twice, it returns the original matrix.
 fn reversed(a: &Matrix) -> Matrix {
     [3, 2, 1, 0].map(|i| [3, 2, 1, 0].map(|j| a[i][j]))
 }
 
-/// Returns the normalized quaternion; 1 for a quaternion of length 0.
+/// Returns the quaternion scaled to length 1; the quaternion 1 for a quaternion of length 0.
 fn unit(q: [f64; 4]) -> [f64; 4] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 
-/// Returns the rotation matrix of two quaternions of any length; length 0 counts as the quaternion 1. `flipped`
-/// reverses both axes; checkpoints from before 15 September 2024 have no reversal.
+/// Returns the rotation matrix of the left and the right quaternion, which may have any length; length 0 counts as the
+/// quaternion 1. If `flipped`, the order of rows and columns is reversed, as in checkpoints since 15 September 2024.
 pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
     let whole = product(&left(unit(l)), &right(unit(r)));
     if flipped { reversed(&whole) } else { whole }
 }
 
-/// Returns unit quaternions whose rotation is `matrix`, which must have determinant 1.
+/// Returns the left and the right unit quaternion of the rotation `matrix`, which must have determinant 1.
 pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     let matrix = if flipped { reversed(matrix) } else { *matrix };
     let axis = |i: usize| {
@@ -48,8 +48,8 @@ pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
         axis[i] = 1.0;
         axis
     };
-    // Products of the basis matrices are orthogonal, each with squared norm 4. The result is the matrix of coefficients
-    // l_i·r_j, of rank 1.
+    // Products of the basis matrices are orthogonal, each with squared norm 4. This gives the matrix of coefficients
+    // l_i·r_j, which has rank 1.
     let coefficient = |i: usize, j: usize| -> f64 {
         let basis = product(&left(axis(i)), &right(axis(j)));
         basis.iter().flatten().zip(matrix.iter().flatten()).map(|(a, b)| a * b).sum::<f64>() / 4.0
@@ -62,19 +62,19 @@ pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     [unit(l), r]
 }
 
-/// Returns R diag(s)² Rᵀ.
+/// Returns the covariance R diag(s)² Rᵀ of a rotation R and scales s.
 pub(super) fn covariance(rotation: &Matrix, scales: [f64; 4]) -> Matrix {
     [0, 1, 2, 3]
         .map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| rotation[i][k] * scales[k].powi(2) * rotation[j][k]).sum()))
 }
 
-/// Returns scales and rotation (determinant 1) of a covariance by Jacobi's method. The axis with the largest time
+/// Returns scales and rotation (determinant 1) of a covariance, by Jacobi's method. The axis with the largest time
 /// component comes last. Squares of scales are at least 1e-14.
 pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     const SWEEPS: usize = 16;
     const MIN_SQUARE: f64 = 1e-14;
     let mut a = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| 0.5 * (covariance[i][j] + covariance[j][i])));
-    // Row i is axis i.
+    // Row i of this matrix is axis i.
     let mut axes = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| f64::from(u8::from(i == j))));
     let largest = a.iter().flatten().fold(0.0f64, |largest, x| largest.max(x.abs()));
     for _ in 0..SWEEPS {
@@ -114,7 +114,7 @@ pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     (scales, rotation)
 }
 
-/// Returns the determinant by expansion along the first row.
+/// Returns the determinant of a matrix, by expansion along the first row.
 fn determinant(a: &Matrix) -> f64 {
     let minor = |row: [usize; 3], column: [usize; 3]| {
         let entry = |i: usize, j: usize| a[row[i]][column[j]];
@@ -165,7 +165,7 @@ mod tests {
             let apply = |matrix: &Matrix, at: [f64; 4]| matrix.map(|row| (0..4).map(|k| row[k] * at[k]).sum::<f64>());
             let got = apply(&rotation([l, r], false), at);
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
-            // Reversed axes map (z, y, x, w) to (z, y, x, w).
+            // With reversed axes, the quaternion components w, x, y, z come in the order z, y, x, w.
             let back = |[a, b, c, d]: [f64; 4]| [d, c, b, a];
             let got = back(apply(&rotation([l, r], true), back(at)));
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");

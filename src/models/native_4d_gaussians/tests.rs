@@ -21,12 +21,13 @@ use crate::recipe::Recipe;
 const COUNT: usize = 6;
 const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];
 
-/// Returns pseudo-random values from -½ to ½.
+/// Returns `n` pseudo-random values from -½ to ½.
 fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// Returns the parameters of a test model, with their indices in the capture.
+/// Returns the parameters of a test model, each with its index in the capture tuple. `turns` states whether Gaussians
+/// have a 4D rotation.
 fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
     let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
     let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
@@ -45,7 +46,7 @@ fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
     tensors.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
 }
 
-/// Returns the parts of the capture tuple of a test model.
+/// Returns the values of the capture tuple of a test model. `turns` states whether Gaussians have a 4D rotation.
 fn capture(turns: bool) -> Vec<Made> {
     let mut parts = vec![Made::None; CAPTURE_LENGTH_4D];
     let mut state = Vec::new();
@@ -84,7 +85,7 @@ impl CheckpointFolder {
         self.0.path().join(name)
     }
 
-    /// Writes a model folder with these parts as its checkpoint.
+    /// Writes a model folder whose checkpoint has the capture tuple `parts`.
     fn put(&self, parts: Vec<Made>) -> PathBuf {
         let root = self.path("model");
         fs::create_dir_all(&root).unwrap();
@@ -126,8 +127,9 @@ fn rule() -> crate::recipe::MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
-/// Checks a row against an independent computation. The covariance of a slice is the inverse of the spatial block of
-/// the inverse of Σ₄. The rotation is computed by applying the quaternions to each axis.
+/// Checks row `row` of `state`, the state at `time`, against an independent computation from `parameters`. The spatial
+/// covariance at a time is the inverse of the spatial block of the inverse of Σ₄. The rotation is computed by applying
+/// the quaternions to each axis.
 fn check(parameters: &[(usize, PickledTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
     let values = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
@@ -189,7 +191,7 @@ fn states_are_4d_slices_in_both_conventions() {
             (0..COUNT).for_each(|row| check(&parameters(true), !unflipped, row, time, state));
         }
     }
-    // Some states are below the cutoff and some are not.
+    // Some states have a temporal marginal below the cutoff and some do not.
     let cut = |x: &&f32| **x == -40.0;
     let all_states = states(&*open(&root));
     let cuts: usize = all_states.iter().map(|state| state.opacity_logit.planes().iter().filter(cut).count()).sum();
@@ -225,7 +227,7 @@ fn kept_rows_keep_their_bytes_in_every_tensor() {
     let checkpoints = [folder.path("model"), result]
         .map(|root| Checkpoint::open(&root.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap());
     let [before, after] = checkpoints.each_ref().map(|checkpoint| checkpoint.tensors().collect::<Vec<_>>());
-    // Nine parameters with two optimizer values each, and four training statistics.
+    // There are nine parameters with two optimizer values each, and four training statistics.
     assert_eq!((before.len(), after.len()), (31, 31));
     for (b, a) in before.iter().zip(&after) {
         assert_eq!(a.shape, [&[3], &b.shape[1..]].concat());
@@ -268,7 +270,7 @@ fn written_proxies_and_deltas_read_back() {
         let moved = state.position.row::<1>(2)[0] - whole[frame].position.row::<1>(4)[0];
         assert!((moved - 0.5).abs() < 1e-6, "{moved}");
     }
-    // Optimizer state of merged Gaussians is reset.
+    // The optimizer state of merged Gaussians becomes zero.
     let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap();
     let average = checkpoint.tensors().find(|tensor| tensor.storage == "20").unwrap();
     let values = checkpoint.floats(&average, "").unwrap();
@@ -305,7 +307,7 @@ fn best_or_requested_checkpoint_is_read() {
     assert!(open_iteration(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
     let error = open_iteration(7).err().unwrap().to_string();
     assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
-    // The guessed period depends on the times.
+    // The guessed period of colors depends on the frame times.
     let at = |times: Vec<f64>| models::open(&root, &OpenOptions::default()).unwrap().with_times(times).unwrap().notes();
     assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
     assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));

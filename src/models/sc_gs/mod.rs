@@ -1,13 +1,13 @@
 //! SC-GS as a model format: canonical Gaussians that follow a few control nodes, which a network of position and time
 //! moves.
 //!
-//! State at time t: the network's outputs for the nodes nearest to a Gaussian are summed with its node weights
-//! ([`Nodes`]) and multiplied by its motion mask, σ of its last feature (1 without a mask). x = xyz + warp; scale =
-//! exp(scale) + d_scaling, of which only the square matters; rotation = rot + d_rotation of the raw rot, normalized
-//! afterwards. If the network predicts them, opacity = σ(opacity) + d_opacity, and a color is added to the SH
-//! coefficients of degree 0. With `deform_type='mlp'` there are neither nodes nor mask, and the network is evaluated at
-//! each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes",
-//! 2024, and its public code.
+//! At time t, the network's outputs for the nodes nearest to a Gaussian are summed with its node weights ([`Nodes`])
+//! and multiplied by its motion mask, the logistic function σ of its last feature (1 without a mask). Then the position
+//! is xyz + warp; the scale is exp(scale) + d_scaling, of which only the square matters; the rotation is rot +
+//! d_rotation with the stored rot, normalized afterwards. If the network predicts them, the opacity is σ(opacity) +
+//! d_opacity, and a color is added to the SH coefficients of degree 0. With `deform_type='mlp'` there are neither nodes
+//! nor mask, and the network is evaluated at each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian
+//! Splatting for Editable Dynamic Scenes", 2024, and its public code.
 
 mod nodes;
 
@@ -25,7 +25,7 @@ use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
 
-/// SC-GS model folder, distinguished from Deformable-3D-Gaussians by a key of its configuration or by its nodes.
+/// Model folder of SC-GS. A key of its configuration, or its nodes, distinguish it from Deformable-3D-Gaussians.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let typed = || {
@@ -39,14 +39,14 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| DeformFolder::open(path, options, NodeMotion::new),
 };
 
-/// Maximum bytes of cached network outputs, each of all nodes at one time.
+/// Maximum bytes of cached network outputs; each output is for all nodes at one time.
 const MAX_CACHE_BYTES: usize = 16 << 20;
-/// Maximum absolute value of a log scale; Gaussians beyond it are too small or large to be drawn.
+/// Maximum absolute value of a log scale; Gaussians beyond it are too small or too large to be drawn.
 const MAX_LOG_SCALE: f64 = 600.0;
-/// Maximum absolute logit of an opacity that the network changes.
+/// Maximum absolute value of the logit of an opacity that the network changes.
 const MAX_LOGIT: f64 = 40.0;
 
-/// Motion model of SC-GS.
+/// Motion model of SC-GS: a network that moves control nodes, or Gaussians directly.
 #[derive(Debug)]
 struct NodeMotion {
     network: Network,
@@ -54,28 +54,29 @@ struct NodeMotion {
     nodes: Option<CachedNodes>,
 }
 
-/// Control nodes with cached network outputs.
+/// Control nodes of a model, and network outputs for them that were computed before.
 #[derive(Debug)]
 struct CachedNodes {
     nodes: Nodes,
-    /// Canonical positions of the nodes, encoded for the network.
+    /// Canonical positions of the nodes, encoded as input of the network.
     encoded: Encoded,
-    /// Whether the last feature of a Gaussian is a motion mask.
+    /// Whether the last feature of a Gaussian is its motion mask.
     has_mask: bool,
-    /// Network outputs at the last requested times (keyed by f32 bits), oldest first.
+    /// Network outputs for all nodes at the last requested times, oldest first. The key is the f32 bits of the time.
     cache: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
 }
 
-/// Time-independent values of a block of Gaussians.
+/// Values of a block of Gaussians that do not depend on time.
 enum PreparedNodes {
-    /// Node weights, K per Gaussian, multiplied by the mask.
+    /// For each Gaussian the K nodes that move it: index of the node, and its weight multiplied by the motion mask.
     Shares(Vec<(u32, f64)>),
-    /// Encoded positions, for a network without nodes.
+    /// Positions encoded as input of the network, for a model without nodes.
     Encoded(Encoded),
 }
 
 impl NodeMotion {
-    /// Reads the network and its nodes. Refuses options of training whose models are not supported.
+    /// Creates the motion model from the network and its nodes, and returns notes for the user. Fails for training
+    /// options whose models are not supported.
     fn new(parts: &ModelParts<'_>) -> Result<(NodeMotion, Vec<String>)> {
         let arguments = parts.arguments;
         let refuse = |key: &'static str, found: &str| {
@@ -117,7 +118,7 @@ impl NodeMotion {
             }
         }
         let prefix = if has_nodes { "network." } else { "" };
-        // Other color heads have inner layers, and nodes with local frames have a rotation head.
+        // Other color heads have inner layers, and nodes with local frames have a rotation head; neither is supported.
         for inner in ["gaussian_color.0.weight", "gaussian_color.layers.0.weight", "local_rotation.weight"] {
             let name = format!("{prefix}{inner}");
             if parts.tensors.contains_key(&name) {
@@ -164,13 +165,14 @@ impl NodeMotion {
 }
 
 impl CachedNodes {
-    /// Returns the motion mask of a Gaussian, σ of its last feature; 1 without a mask.
+    /// Returns the motion mask of the Gaussian in row `row`: σ (logistic function) of its last feature; 1 without a
+    /// mask.
     fn mask(&self, raw: &StoredParams, row: usize) -> f64 {
         if self.has_mask { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
-    /// Returns the network's output for all nodes at `time`. The output is the same for all blocks, so it is cached.
-    /// Two threads that compute the same time get equal values.
+    /// Returns the network's output for all nodes at `time`. The output is the same for all blocks of Gaussians, so it
+    /// is cached. Two threads that compute the same time get equal values.
     fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
         let cache = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
@@ -190,14 +192,14 @@ impl CachedNodes {
         Ok(motion)
     }
 
-    /// Returns the maximum number of times whose outputs are cached.
+    /// Returns the maximum number of times for which network outputs are cached.
     fn max_cached(&self) -> usize {
         (MAX_CACHE_BYTES / (4 * 14 * self.nodes.len())).max(2)
     }
 }
 
-/// Returns the sum of the rows of `output`, weighted by the node weights of each Gaussian. `each` is the number of nodes
-/// per Gaussian.
+/// Returns for each Gaussian the network's output for its nodes (rows of `output`), summed with the node weights
+/// `shares`. `each` is the number of nodes per Gaussian.
 fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> AttributeValues {
     let mut out = AttributeValues::zeros(output.width(), shares.len() / each.max(1));
     for c in 0..output.width() {
@@ -210,7 +212,7 @@ fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> Attrib
 }
 
 impl NodeMotion {
-    /// Returns the network's output for the columns `want` of a block.
+    /// Returns the network's output at `time` for a block of Gaussians, as far as the attributes `want` need it.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Attributes) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
         match (prepared, &self.nodes) {
@@ -306,7 +308,7 @@ impl MotionModel for NodeMotion {
             };
         }
         if want.contains(Attributes::LOG_SCALE) {
-            // Each scale depends on its own stored value only.
+            // Each scale depends only on its own stored value.
             let mut out = AttributeValues::zeros(9, raw.len());
             for c in 0..3 {
                 let pairs = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
@@ -330,12 +332,13 @@ impl MotionModel for NodeMotion {
     }
 }
 
-/// Adds `by` to the first planes of `to`. Does nothing if `by` is empty.
+/// Adds each component (plane) of `by` to the same component of `to`. Does nothing if `by` is empty.
 fn add(by: &AttributeValues, to: &mut AttributeValues) {
     each(by, to, |value, by| value + by);
 }
 
-/// Replaces each value of the planes that `by` has by `f` of it and the value of `by`.
+/// Replaces each value of `to` by `f` of this value and the value of `by` at the same place. Components that `by` lacks
+/// stay unchanged.
 #[inline(always)]
 fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
@@ -343,13 +346,14 @@ fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> 
     }
 }
 
-/// Returns the logit of a stored opacity after adding `by` to the opacity.
+/// Returns the logit of an opacity after adding `by` to the opacity; `stored` is its logit before.
 fn add_to_opacity(stored: f32, by: f32) -> f64 {
     let alpha = opacity(stored) + f64::from(by);
     logit(alpha.clamp(0.0, 1.0)).clamp(-MAX_LOGIT, MAX_LOGIT)
 }
 
-/// Returns the derivatives of positions that follow nodes, whose node weights depend on the position.
+/// Returns the derivatives of the positions at `time` with respect to the stored positions, for Gaussians that follow
+/// nodes. They include that the node weights depend on the position.
 fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &StoredParams, time: f64) -> Result<AttributeValues> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (AttributeValues::zeros(9, raw.len()), Vec::new());
@@ -387,7 +391,7 @@ impl NetworkMotionModel for NodeMotion {
         self.nodes.as_ref().map_or(0, |sparse| MAX_CACHE_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
     }
 
-    /// Returns the seconds measured by `benches/families.rs`.
+    /// Returns the CPU seconds per state, measured by `benches/families.rs`.
     fn seconds_per_state(&self) -> f64 {
         match &self.nodes {
             Some(_) => 2e-7,

@@ -1,8 +1,9 @@
 //! Control nodes, and the weights with which they move a Gaussian.
 //!
-//! For a Gaussian at x with features f: the K nodes nearest to [x, f] by squared distance d² over all values, ties to
-//! the first; u = exp(−d²/(2r²))·σ(weight) + 1e-7, divided by the sum of u. The weights are constant in time. Source:
-//! `cal_nn_weight` of the authors' code.
+//! A Gaussian at x with features f is moved by the K nodes nearest to [x, f]. Nearness is the squared distance d² over
+//! all values; in a tie the first node counts as nearer. The weight of a node is u = exp(−d²/(2r²))·σ(weight) + 1e-7
+//! with the radius r of the node and the logistic function σ, divided by the sum of u over the K nodes. The weights are
+//! constant in time. Source: `cal_nn_weight` of the authors' code.
 
 use std::path::Path;
 
@@ -10,35 +11,36 @@ use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, StoredParams, opacity};
 
-/// Value added to every kernel before normalization.
+/// Value added to the kernel (unnormalized weight) of every node before normalization.
 const FLOOR: f64 = 1e-7;
 
-/// Control nodes of a model, M in number, with h features each.
+/// Control nodes of a model: M nodes with h features each.
 #[derive(Debug)]
 pub(super) struct Nodes {
-    /// Positions and features, `[M, 3 + h]`.
+    /// Position and features of each node, `[M, 3 + h]`.
     values: Vec<f32>,
     /// Number of values per node, 3 + h.
     width: usize,
-    /// 1/(2r²) and σ(weight) of each node.
+    /// For each node 1/(2r²) with its radius r, and σ(weight) with the logistic function σ.
     kernels: Vec<[f64; 2]>,
-    /// Number K of nodes that move a Gaussian.
+    /// Number K of nodes that move each Gaussian.
     nearest: usize,
 }
 
-/// Node that moves a Gaussian, and its weight.
+/// Node that moves a given Gaussian, and its weight.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
     /// Index of the node.
     pub(super) node: u32,
-    /// Normalized weight u, between 0 and 1.
+    /// Weight of the node, between 0 and 1; the weights of all nodes of a Gaussian sum to 1.
     pub(super) weight: f64,
-    /// Kernel of the node before 1e-7 is added.
+    /// Weight of the node before 1e-7 is added and before normalization.
     kernel: f64,
 }
 
 impl Nodes {
-    /// Reads the nodes from `tensors`. `nearest` is the number K of nodes that move a Gaussian.
+    /// Reads the nodes from `tensors`, which come from `file`. `nearest` is the number K of nodes that move each
+    /// Gaussian.
     ///
     /// # Errors
     /// Fails if tensors are missing, have other shapes or are not finite.
@@ -81,7 +83,7 @@ impl Nodes {
         self.kernels.len()
     }
 
-    /// Returns the number K of nodes that move a Gaussian.
+    /// Returns the number K of nodes that move each Gaussian.
     pub(super) fn nearest(&self) -> usize {
         self.nearest
     }
@@ -92,7 +94,7 @@ impl Nodes {
         AttributeValues::from_planes(3, planes.collect())
     }
 
-    /// Appends the nodes that move Gaussian `row` of `raw` to `out`, nearest first.
+    /// Appends to `out` the K nodes that move the Gaussian in row `row` of `raw`, nearest first, with their weights.
     pub(super) fn shares(&self, raw: &StoredParams, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
         at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));
@@ -116,7 +118,7 @@ impl Nodes {
         }));
     }
 
-    /// Returns the derivative of each weight in `shares` with respect to the position `x`.
+    /// Returns for each node weight in `shares` its derivative with respect to the position `x` of the Gaussian.
     pub(super) fn slopes(&self, x: [f32; 3], shares: &[Share]) -> Vec<[f64; 3]> {
         let sum: f64 = shares.iter().map(|share| share.kernel + FLOOR).sum();
         let own = |share: &Share| {

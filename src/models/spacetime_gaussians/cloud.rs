@@ -1,8 +1,8 @@
-//! Point cloud file of a SpacetimeGaussians model, with the mapping of its properties to parameters.
+//! Point cloud file of a SpacetimeGaussians model, and which of its properties hold which parameters.
 //!
-//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`,
-//! in any order. The authors' loader counts properties by name prefix, so the file may have no other properties with
-//! these prefixes. Source: `save_ply`, `load_ply` of their code.
+//! Its properties are, in any order: `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity
+//! scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`. The authors' loader counts properties by name prefix, so the file may
+//! have no other properties with these prefixes. Source: `save_ply`, `load_ply` of their code.
 
 use std::path::Path;
 
@@ -14,22 +14,22 @@ use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{AttributeValues, Attributes, SH_C0, StoredParams, harmonic};
 
-/// Name of a property that no other format has.
+/// Name of a property that the point cloud file of no other format has.
 pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 
-/// Open point cloud file.
+/// Opened point cloud file of a SpacetimeGaussians model.
 #[derive(Debug)]
 pub(super) struct PointCloudFile {
     ply: Ply,
-    /// Property of each plane of [`StoredParams::own`].
+    /// Property of the file for each parameter in [`StoredParams::own`].
     own: Vec<Property>,
 }
 
 impl PointCloudFile {
-    /// Opens the PLY at `path`.
+    /// Opens the PLY file at `path`.
     ///
     /// # Errors
-    /// Fails if the PLY holds no Gaussians, or if properties are missing or too many.
+    /// Fails if the file holds no Gaussians, or if properties are missing or too many.
     pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<PointCloudFile> {
         let ply = Ply::open_with(path, options)?;
         let count_prefix =
@@ -65,12 +65,13 @@ impl PointCloudFile {
         Ok(PointCloudFile { own: own.collect::<Result<_>>()?, ply })
     }
 
-    /// Returns whether the file belongs to the full model.
+    /// Returns whether the file belongs to the full model (with features and a decoder network), not to the lite model.
     pub(super) fn is_full(&self) -> bool {
         self.own.len() == FULL_WIDTH
     }
 
-    /// Reads the parameters of all Gaussians. `activation` turns the first features of the full model into colors.
+    /// Reads the parameters of all Gaussians. `activation` turns the first three features of the full model into
+    /// colors.
     ///
     /// # Errors
     /// Fails if a value is not finite or the file was cut short since it was opened.
@@ -108,7 +109,7 @@ impl PointCloudFile {
         Ok([values("f_dc_0")?, values("f_dc_1")?, values("f_dc_2")?])
     }
 
-    /// Checks that the values of a property are finite.
+    /// Fails if a value of the property `name` is not finite.
     fn check(&self, name: &str, values: &[f32]) -> Result<()> {
         match values.iter().position(|x| !x.is_finite()) {
             Some(row) => {
@@ -121,8 +122,9 @@ impl PointCloudFile {
         }
     }
 
-    /// Writes the compressed model under the same header. Rows are copied byte for byte; proxies are written in place
-    /// of their leaders, and parameter deltas are added.
+    /// Writes the compressed model to a PLY file with the same properties. Rows are copied byte for byte, except that
+    /// proxies (Gaussians that replace merged ones) are written in place of their leaders, and parameter deltas are
+    /// added.
     ///
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.
@@ -176,7 +178,7 @@ impl PointCloudFile {
     }
 }
 
-/// Returns the property names of the planes of [`StoredParams::own`].
+/// Returns the name of the property for each parameter in [`StoredParams::own`].
 fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
@@ -187,8 +189,8 @@ fn own_property_names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Replaces stored colors by SH coefficients of degree 0. With `activation`, the color is `activation` of the first features;
-/// without, it is the stored color, which the PLY reader put where a coefficient would be.
+/// Replaces the colors in `raw` by SH coefficients of degree 0. With `activation`, a color is `activation` of the first
+/// three features. Without, it is the stored color, which the PLY reader put where a coefficient would be.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;

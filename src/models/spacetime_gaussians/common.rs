@@ -1,4 +1,4 @@
-//! Functions shared by model folders and `.splatv`.
+//! Functions shared by SpacetimeGaussians model folders and `.splatv` files.
 
 use crate::error::{Error, Result};
 use crate::model::{Attributes, Jacobian};
@@ -7,13 +7,13 @@ use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
-/// Returns the memory profile of an open model with `width` planes of format-specific parameters.
+/// Returns the memory and reading costs of an open model that has `width` format-specific parameters per Gaussian.
 pub(super) fn residence(width: usize) -> MemoryProfile {
     let whole = state_bytes(0, Attributes::all()) + 4 * width as u64;
     MemoryProfile {
         per_gaussian: whole,
         opening: whole,
-        // A copy of the raw parameters with the prepared values.
+        // A copy of the stored parameters with the values prepared from them.
         reader: whole + 16 + 8,
         reduced: 2 * whole,
         jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
@@ -27,7 +27,8 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
     }
 }
 
-/// Checks that an output can be of `kind`. The caller handles the kinds that store the model's own parameters.
+/// Checks that the model can be written as `kind`. The caller handles the kinds of output that store the model's own
+/// parameters. `is_full` states that it is a full model, not a lite one.
 pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
         OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),

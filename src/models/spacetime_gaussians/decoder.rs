@@ -1,34 +1,34 @@
-//! Network that computes pixel colors from the nine blended features of the full model.
+//! Network that computes pixel colors from the nine blended features of the full SpacetimeGaussians model.
 //!
-//! With features F of a pixel, camera center o and unit ray d, the color is act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])).
-//! W₁ is `mlp1.weight` [6, 12, 1, 1] and W₂ is `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias.
-//! Source: `helper_model.py` of the authors' code.
+//! With features F of a pixel, camera center o and unit ray d, the color is act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])),
+//! where act is the last function ([`ColorActivation`]). W₁ is `mlp1.weight` [6, 12, 1, 1] and W₂ is `mlp2.weight` [3,
+//! 6, 1, 1] of `point_cloud.pt`; neither has a bias. Source: `helper_model.py` of the authors' code.
 
 use std::path::Path;
 
 use crate::deform::Tensors;
 use crate::error::{Error, Result, quoted};
 
-/// Number of features that are blended.
+/// Number of features of a Gaussian, which the renderer blends for each pixel.
 pub(super) const FEATURES: usize = 9;
-/// Number of network inputs: features 3 to 8, camera center, ray.
+/// Number of network inputs: features 3 to 8, camera center (3 values) and ray (3 values).
 const INPUTS: usize = 12;
-/// Number of hidden units.
+/// Number of units in the hidden layer of the network.
 const HIDDEN: usize = 6;
 
 /// Function applied to a color as the last step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColorActivation {
-    /// Logistic function.
+    /// Logistic function, 1/(1 + exp(−x)).
     Sigmoid,
-    /// Clamp to 0 … 1.
+    /// Clamp to the range from 0 to 1.
     Clamp,
-    /// Identity.
+    /// Identity: the color stays unchanged.
     None,
 }
 
 impl ColorActivation {
-    /// Returns the function that `rgbfunction` of `cfg_args` names; `None` for other names.
+    /// Returns the function that has the name `name` as `rgbfunction` in `cfg_args`; `None` for unknown names.
     pub(super) fn named(name: &str) -> Option<ColorActivation> {
         match name {
             "sandwich" => Some(ColorActivation::Sigmoid),
@@ -38,7 +38,7 @@ impl ColorActivation {
         }
     }
 
-    /// Applies the function to a color value.
+    /// Returns the color value after the function is applied to `x`.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
             ColorActivation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
@@ -48,7 +48,7 @@ impl ColorActivation {
     }
 }
 
-/// Weights of the network, and its last function.
+/// Weights of the color network, and the function applied last.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],
@@ -57,7 +57,7 @@ pub(super) struct ColorDecoder {
 }
 
 impl ColorDecoder {
-    /// Reads the network from the state dict `tensors` of the file `path`.
+    /// Reads the network from the state dict `tensors` of the file `path`. `activation` is the function applied last.
     ///
     /// # Errors
     /// Fails if weights are missing, have other shapes or are not finite.
@@ -111,7 +111,7 @@ pub(crate) mod tests {
     use crate::deform::Tensor;
     use crate::model::opacity;
 
-    /// Returns the weights of a small network as in a state dict.
+    /// Returns the weights of a small network in the form of a state dict.
     pub(in super::super) fn weights() -> Tensors {
         let ramp = |n: usize, by: f32| (0..n).map(|i| by * ((i * 7 % 11) as f32 - 5.0)).collect::<Vec<f32>>();
         [

@@ -1,7 +1,8 @@
-//! Computation of frame states from the stored parameters of a model: [`SpacetimeMotion`] and its temporal window.
+//! Computes the states of Gaussians at a time from the stored parameters of a SpacetimeGaussians model.
 //!
-//! [`StoredParams::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH of degree
-//! 0. [`StoredParams::own`] holds the planes named here.
+//! [`StoredParams::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH
+//! of degree 0. [`StoredParams::own`] holds the other parameters, at the indices that the constants of this module
+//! give.
 
 use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
@@ -10,26 +11,26 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
-/// Plane of the center of the temporal window.
+/// Index in [`StoredParams::own`] of the center of the temporal window.
 pub(super) const CENTER: usize = 0;
-/// Plane of the natural logarithm of the width of the window.
+/// Index in [`StoredParams::own`] of the natural logarithm of the width of the temporal window.
 pub(super) const LOG_WIDTH: usize = 1;
-/// First of nine planes: coefficients of dt, dt², dt³, each for x, y, z.
+/// First of nine indices in [`StoredParams::own`]: coefficients of dt, dt², dt³ of the position, each for x, y, z.
 pub(super) const MOTION: usize = 2;
-/// First of four planes: change of the quaternion per unit of time.
+/// First of four indices in [`StoredParams::own`]: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
-/// Number of planes of [`StoredParams::own`] that both variants have.
+/// Number of parameters in [`StoredParams::own`] that both the lite and the full model have.
 pub(super) const WIDTH: usize = 15;
-/// First of six planes of the full model: features that are constant in time. The first three are a color before the
-/// last function.
+/// First of six indices in [`StoredParams::own`] of the full model: features that are constant in time. The first three
+/// are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
 pub(super) const FEATURES: usize = 15;
-/// First of three planes of the full model: features per unit of time.
+/// First of three indices in [`StoredParams::own`] of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
-/// Number of planes of [`StoredParams::own`] of the full model.
+/// Number of parameters in [`StoredParams::own`] of the full model.
 pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
-    /// Returns the motion of Gaussian `row`.
+    /// Returns the motion and temporal window of the Gaussian in row `row`.
     pub(super) fn from_raw(raw: &StoredParams, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
@@ -42,7 +43,7 @@ impl SpacetimeMotion {
         }
     }
 
-    /// Stores the motion as that of Gaussian `row`, rounded to f32.
+    /// Stores this motion and window as those of the Gaussian in row `row`, rounded to f32.
     pub(super) fn write(&self, raw: &mut StoredParams, row: usize) {
         let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
         own(CENTER, self.center);
@@ -56,25 +57,26 @@ impl SpacetimeMotion {
     }
 }
 
-/// Motion model of both variants. Colors of the full variant are those of [`StoredParams::gaussians`], without the network.
+/// Motion model of the lite and the full SpacetimeGaussians model. The colors of the full model are those in
+/// [`StoredParams::gaussians`], computed without the network.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
-    /// Whether pixel colors are computed from features by a network (full model).
+    /// Whether this is the full model, where a network computes pixel colors from features.
     pub(super) is_full: bool,
-    /// The network, if it is known.
+    /// Network that computes pixel colors; `None` if it is not known.
     pub(super) decoder: Option<ColorDecoder>,
 }
 
-/// Time-independent values of some Gaussians.
+/// Values of some Gaussians that do not depend on time.
 #[derive(Debug)]
 pub(super) struct PreparedGaussian {
-    /// 1 / width² of each Gaussian.
+    /// For each Gaussian 1 / width², where width is the width of its temporal window.
     inverse_squared: Vec<f64>,
-    /// exp(−o) of each opacity logit o.
+    /// For each Gaussian exp(−o), where o is the stored opacity logit.
     inverse_odds: Vec<f64>,
 }
 
-/// Returns the logarithm of the window at time `dt` from its center.
+/// Returns the natural logarithm of the temporal window (factor of the opacity) at time `dt` from its center.
 #[inline(always)]
 fn window_exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared
@@ -94,7 +96,8 @@ impl MotionModel for Spacetime {
         Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY
     }
 
-    /// Excludes the colors of the full model: they are computed from features, so no derivative leads to them.
+    /// Returns the attributes that the optimizer can change: all, but for the full model without colors. Those are
+    /// computed from features, so no derivative leads to them.
     fn movable(&self) -> Attributes {
         if self.is_full { Attributes::all().difference(Attributes::SH) } else { Attributes::all() }
     }
@@ -168,7 +171,8 @@ impl MotionModel for Spacetime {
 }
 
 impl Shading for Spacetime {
-    /// Returns six constant features and three that grow with the time since the center.
+    /// Returns nine features per Gaussian: six that are constant, and three that grow with the time since the center of
+    /// the temporal window.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues {
         let mut found = AttributeValues::zeros(decoder::FEATURES, raw.len());
         let centers = raw.own.plane(CENTER);

@@ -1,10 +1,10 @@
-//! SpacetimeGaussians (lite and full) as a model format: a folder as its training writes it, its PLY alone, or a
+//! SpacetimeGaussians (lite and full) as a model format: a folder as its training writes it, the PLY file alone, or a
 //! `.splatv`.
 //!
 //! The output has the same layout with fewer Gaussians. Rows of the PLY are kept byte for byte, except for values that
-//! merging or refinement changed; other files are copied. The renderer of the full model blends nine features and a
-//! network computes the color of each pixel from them. Statistics, merging and refinement here use the color that the
-//! first three features have without the network.
+//! merging or refinement changed; other files are copied. The renderer of the full model blends nine features, and a
+//! network computes the color of each pixel from them. Statistics, merging and refinement use the color that the first
+//! three features have without the network.
 
 mod cloud;
 mod common;
@@ -46,18 +46,18 @@ use decoder::{ColorActivation, ColorDecoder};
 use frame_state::{FULL_WIDTH, Spacetime, WIDTH};
 pub(super) use splatv::SPLATV;
 
-/// Name of the folder of iterations.
+/// Name of the folder that holds the folders `iteration_K`.
 const POINT_CLOUD_FOLDER: &str = "point_cloud";
-/// Name of the point cloud file in an iteration folder.
+/// Name of the point cloud file in a folder `iteration_K`.
 const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 /// Name of the file with the decoder network of the full model.
 const DECODER: &str = "point_cloud.pt";
 /// Name of the file with the training arguments.
 const CFG_ARGS: &str = "cfg_args";
-/// File of the model folder that is copied to the output if it exists.
+/// Name of the camera file of the model folder, which is copied to the output if it exists.
 const CAMERAS: &str = "cameras.json";
 
-/// SpacetimeGaussians model folder, or its PLY.
+/// Model folder of SpacetimeGaussians, or its PLY file.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None)
@@ -69,25 +69,25 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 
 /// Returns whether the header of the PLY at `path` has a property that only SpacetimeGaussians writes.
 pub(super) fn has_marker_property(path: &Path) -> bool {
-    // 16 KiB hold the whole header of any PLY of this format; the rest of the file is not read.
+    // The header of any PLY file of this format fits into 16 KiB; the rest of the file is not read.
     let mut head = Vec::new();
     let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
     let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
     read && header.windows(MARKER_PROPERTY.len()).any(|bytes| bytes == MARKER_PROPERTY.as_bytes())
 }
 
-/// Paths of the files of a model.
+/// Paths of the files of a SpacetimeGaussians model.
 #[derive(Debug, Clone)]
 struct Files {
     cloud: PathBuf,
-    /// Model folder and K of `iteration_K`; `None` for a PLY alone.
+    /// Path of the model folder and training iteration K; `None` for a PLY file alone.
     folder: Option<(PathBuf, u32)>,
-    /// File of the decoder network of the full model.
+    /// Path of the file with the decoder network of the full model.
     decoder: Option<PathBuf>,
 }
 
 impl Files {
-    /// Finds the files of the model at `path`, of the requested iteration or the largest.
+    /// Finds the files of the model at `path`, of the requested training iteration or the largest.
     fn find(path: &Path, options: &OpenOptions) -> Result<Files> {
         if !path.is_dir() {
             options.refuse_for(path)?;
@@ -103,23 +103,23 @@ impl Files {
         self.folder.as_ref().map(|(root, _)| root.join(name)).filter(|path| path.is_file())
     }
 
-    /// Returns the files that a renderer opens in addition to the point cloud file.
+    /// Returns the paths of the files that a renderer opens in addition to the point cloud file.
     fn other_files(&self) -> Vec<PathBuf> {
         self.decoder.clone().into_iter().chain(self.root_file(CFG_ARGS)).collect()
     }
 }
 
-/// Values of `cfg_args` that are used.
+/// Values of `cfg_args` that are used when the model is opened.
 #[derive(Debug, Clone, Default)]
 struct SpacetimeConfig {
     source_path: Option<String>,
     rgb_function: Option<String>,
-    /// Number of frames in the time span from 0 to 1.
+    /// Number of frames that the time span from 0 to 1 stands for.
     duration: Option<usize>,
 }
 
 impl SpacetimeConfig {
-    /// Reads the `Namespace(…)` of `cfg_args`.
+    /// Reads the used values from the `cfg_args` file at `path`.
     fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
@@ -140,7 +140,7 @@ impl SpacetimeConfig {
     }
 }
 
-/// Open SpacetimeGaussians model.
+/// Opened SpacetimeGaussians model folder or PLY file.
 #[derive(Debug)]
 struct SpacetimeGaussians {
     files: Files,
@@ -152,7 +152,7 @@ struct SpacetimeGaussians {
 }
 
 impl SpacetimeGaussians {
-    /// Opens the model folder or PLY at `path`.
+    /// Opens the model folder or PLY file at `path`.
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
         let files = Files::find(path, options)?;
         let cloud = PointCloudFile::open(&files.cloud, &options.ply())?;
@@ -204,7 +204,7 @@ impl SpacetimeGaussians {
         Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes })
     }
 
-    /// Writes the model folder of the compressed model.
+    /// Writes the compressed model as a model folder at `path`.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
         let folder = path.join(POINT_CLOUD_FOLDER).join(format!("iteration_{number}"));
@@ -218,8 +218,8 @@ impl SpacetimeGaussians {
     }
 }
 
-/// Returns a note with the number of Gaussians whose color is negative: the authors' renderer adds such colors, others
-/// clamp them to 0.
+/// Returns a note with the number of Gaussians whose color is negative; `None` if there are none. The authors' renderer
+/// adds such colors, others clamp them to 0.
 fn negative_color_note(raw: &StoredParams) -> Option<String> {
     let is_negative = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_negative(row)).count();
@@ -300,7 +300,7 @@ impl InputModel for SpacetimeGaussians {
         self.configuration.duration
     }
 
-    /// Returns black: training ignores `white_background` of `cfg_args`.
+    /// Returns black as the background color: training ignores `white_background` of `cfg_args`.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }
@@ -341,7 +341,8 @@ impl InputModel for SpacetimeGaussians {
             OutputKind::Ply => self.cloud.write(reduction, path)?,
             OutputKind::Splatv => {
                 let raw = compressed_raw(self.model.raw(), reduction);
-                // Keep the stored color where it did not change: converting it to SH and back can lose the last digit.
+                // Keep the stored color where it did not change: converting it to SH and back can change its last
+                // digit.
                 let (own, colors) = (&self.model.raw().gaussians.sh, self.cloud.colors()?);
                 let known = |i: usize| {
                     let id = reduction.kept[i] as usize;

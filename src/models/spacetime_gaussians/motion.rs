@@ -1,28 +1,29 @@
-//! Motion of a Gaussian: a cubic path, a quaternion that is linear in time, and a temporal window.
+//! Motion of a SpacetimeGaussians Gaussian: a cubic path, a quaternion that is linear in time, and a temporal window.
 //!
-//! With dt = t − center: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is
-//! multiplied by exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime Gaussian Feature Splatting", 2024, and its
-//! public code, which has no factor ½ in that exponent. All computations are in f64.
+//! With dt = t − center: the position is x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; the quaternion is q = rotation + dt·omega,
+//! of any length; the opacity is multiplied by the window exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime
+//! Gaussian Feature Splatting", 2024, and its public code, which has no factor ½ in that exponent. All computations are
+//! in f64.
 
 use crate::fit::polynomial;
 
-/// Motion and temporal window of a Gaussian.
+/// Motion of a Gaussian, and its temporal window (factor of the opacity over time).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SpacetimeMotion {
-    /// Center of the window, in the model's time unit.
+    /// Center of the temporal window, in the model's time unit.
     pub(super) center: f64,
-    /// Natural logarithm of √2 × the standard deviation in time.
+    /// Natural logarithm of the width of the temporal window, which is √2 times its standard deviation in time.
     pub(super) log_width: f64,
-    /// Coefficients of 1, dt, dt², dt³.
+    /// Coefficients of 1, dt, dt² and dt³ of the position, where dt is the time from the center.
     pub(super) path: [[f64; 3]; 4],
-    /// Quaternion wxyz at the center, of any length.
+    /// Quaternion wxyz at the center of the window, of any length.
     pub(super) rotation: [f64; 4],
     /// Change of the quaternion per unit of time.
     pub(super) omega: [f64; 4],
 }
 
 impl SpacetimeMotion {
-    /// Returns the position at `time`.
+    /// Returns the position at `time`, scene units.
     pub(super) fn position(&self, time: f64) -> [f64; 3] {
         let (dt, [p0, p1, p2, p3]) = (time - self.center, self.path);
         std::array::from_fn(|c| p0[c] + dt * (p1[c] + dt * (p2[c] + dt * p3[c])))
@@ -34,14 +35,14 @@ impl SpacetimeMotion {
         std::array::from_fn(|c| self.rotation[c] + dt * self.omega[c])
     }
 
-    /// Returns the factor of the opacity at `time`.
+    /// Returns the value of the temporal window at `time`, by which the opacity is multiplied.
     pub(super) fn window(&self, time: f64) -> f64 {
         let dt = (time - self.center) / self.log_width.exp();
         (-dt * dt).exp()
     }
 
-    /// Returns the same motion expressed around another `center`, with the window moved there. Positions agree up to
-    /// rounding. So do the directions of quaternions; `rotation` is normalized if it is not zero.
+    /// Returns the same motion expressed with another `center`, to which the window is moved. Positions and the
+    /// directions of quaternions stay the same up to rounding; `rotation` is normalized if it is not zero.
     pub(super) fn recentered(&self, center: f64) -> SpacetimeMotion {
         let (by, [_, p1, p2, p3]) = (center - self.center, self.path);
         let path = [
@@ -50,7 +51,7 @@ impl SpacetimeMotion {
             std::array::from_fn(|c| p2[c] + by * 3.0 * p3[c]),
             p3,
         ];
-        // The state depends only on the ratio of the two.
+        // The state depends only on the ratio of `rotation` and `omega`.
         let rotation = self.rotation(center);
         let length = dot(&rotation, &rotation).sqrt();
         let length = if length.is_normal() { length } else { 1.0 };
@@ -75,10 +76,10 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the center and log width of the window that has the same first and second moments in time as the weighted
-/// sum of the members' windows.
+/// Returns the center and log width of the temporal window that has the same first and second moments in time as the
+/// weighted sum of the windows of `members`.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
-    // Windows count by their area in time, relative to the widest one, so that no area overflows.
+    // Each window counts with its area in time, relative to the widest one, so that no area overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
     let area = |(weight, motion): &(f64, SpacetimeMotion)| weight * (motion.log_width - longest).exp();
     let total: f64 = members.iter().map(area).sum();
@@ -94,7 +95,7 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
 }
 
 /// Returns the weighted mean of motions that have the same center. Its state at any time is the weighted mean of their
-/// states, with quaternions in the sign of the heaviest member. `None` without members.
+/// states, where quaternions have the sign of that of the heaviest member. `None` without members.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);
@@ -111,24 +112,24 @@ pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion
     Some(SpacetimeMotion { path, rotation, omega, ..heaviest })
 }
 
-/// State that a fitted motion should approximate.
+/// State at one time that a fitted motion should approximate.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TargetState {
     pub(super) time: f64,
     pub(super) weight: f64,
     pub(super) position: [f64; 3],
-    /// Quaternion wxyz, with its sign chosen by the caller.
+    /// Quaternion wxyz; the caller chooses its sign.
     pub(super) rotation: [f64; 4],
 }
 
-/// Returns the least-squares fit to the states `targets`, with the center of `initial`; returns `initial` if there are none.
-/// A ridge term regularizes coefficients that the times do not determine.
+/// Returns the motion that fits the states `targets` best (least squares) and has the center of `initial`; returns
+/// `initial` if there are no targets. A ridge term regularizes coefficients that the times do not determine.
 ///
-/// Time is measured in window widths. Coefficients then have comparable magnitudes, so one ridge suits all.
+/// Time is measured in widths of the window. Coefficients then have comparable magnitudes, so one ridge term suits all.
 pub(super) fn fitted(initial: &SpacetimeMotion, targets: &[TargetState]) -> SpacetimeMotion {
     let unit = initial.log_width.exp().clamp(1e-6, 1e6);
     let ridge = if targets.len() < 4 { 1e-3 } else { 1e-6 };
-    // Fit the residuals, so that nothing changes where `initial` is already right.
+    // Fit the differences from `initial`, so that nothing changes where `initial` is already right.
     let residual = |target: &TargetState| {
         let [x, at] = [target.position, initial.position(target.time)];
         let [q, rotated] = [target.rotation, initial.rotation(target.time)];

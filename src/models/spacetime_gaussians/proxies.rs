@@ -1,10 +1,10 @@
-//! Proxies with raw parameters of SpacetimeGaussians.
+//! Computes proxies (Gaussians that replace merged ones) with stored parameters of SpacetimeGaussians.
 //!
-//! Members are re-expressed around the center of the proxy's window, which is exact. The weighted mean of their
-//! coefficients then gives the weighted mean of their states at every time. If their windows differ, so that different
-//! members are visible at different times, the path is a least-squares fit to the weighted mean of the visible members.
-//! Size and shape are second moments over the window, in axes that rotate with the proxy. Opacity is the amplitude of
-//! the window that best fits the opacity of the members' moment match.
+//! The motions of the members (merged Gaussians) are expressed around the center of the proxy's temporal window, which
+//! is exact. The weighted mean of their coefficients then gives the weighted mean of their states at every time. If
+//! their windows differ, so that different members are visible at different times, the path is a least-squares fit to
+//! the weighted mean of the visible members. Size and shape are second moments over the window, in axes that rotate
+//! with the proxy. The opacity is the amplitude of the window that best fits the opacity of the members' moment match.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -21,17 +21,18 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Windows are treated as different if one is wider than another by more than this factor, or off the proxy's center by
-/// more than half of its width.
+/// Factor of widths beyond which the temporal windows of a member and the proxy count as different. They also do if
+/// their centers differ by more than half of the proxy's width.
 const MAX_WIDTH_RATIO: f64 = 1.5;
-/// Fraction of its maximum below which a window is ignored.
+/// A temporal window, whose maximum is 1, is ignored at times where its value is below this.
 const MIN_WINDOW: f64 = 0.05;
-/// Maximum number of times at which shape and opacity are compared.
+/// Maximum number of times at which a proxy's shape and opacity are compared with those of its members.
 const SAMPLED_TIMES: usize = 12;
-/// Margin of proxy opacities from 0 and 1.
+/// Minimum difference of a proxy's opacity from 0 and from 1.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// Computes one proxy for each of `clusters`. `activation` turns the first features of the full model into colors.
+/// Computes the stored parameters of one proxy for each of `clusters`. `activation` turns the first three features of
+/// the full model into colors.
 ///
 /// # Errors
 /// Fails if states cannot be evaluated.
@@ -49,21 +50,21 @@ pub(super) fn propose(
     Ok(raw)
 }
 
-/// Members of a cluster, with values that are used repeatedly.
+/// Members of a cluster (Gaussians to be merged), with values that are used repeatedly.
 struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
     raw: StoredParams,
     prepared: <Spacetime as MotionModel>::Prepared,
-    /// Weight and motion of each member.
+    /// Weight in the proxy, and motion, of each member.
     motions: Vec<(f64, SpacetimeMotion)>,
-    /// Row in `raw` and weight of each member.
+    /// Row in `raw` and weight in the proxy of each member.
     rows: Vec<(u32, f64)>,
-    /// Row of the leader in `raw`.
+    /// Row in `raw` of the leader, the member to which the others were joined.
     leader: u32,
 }
 
 impl ClusterMembers<'_> {
-    /// Collects the members of `cluster`.
+    /// Collects the members of `cluster` from `model`.
     fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
@@ -74,15 +75,15 @@ impl ClusterMembers<'_> {
         ClusterMembers { prepared: model.motion_model().prepare(&raw), model, raw, motions, rows, leader }
     }
 
-    /// Returns the states of all members at `time`.
+    /// Returns the states of all members at `time`, one row per member.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
         self.model.motion_model().state(time, &self.raw, &self.prepared, Attributes::all(), &mut state)?;
         Ok(state)
     }
 
-    /// Returns up to [`SAMPLED_TIMES`] frame times at which the window of `motion` counts, evenly spread; its center if
-    /// there are none.
+    /// Returns up to [`SAMPLED_TIMES`] frame times, evenly spread, at which the window of `motion` is at least
+    /// [`MIN_WINDOW`]; the center of the window if there are none.
     fn times(&self, motion: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
         let open: Vec<f64> = times.iter().copied().filter(|&time| motion.window(time) >= MIN_WINDOW).collect();
@@ -95,7 +96,7 @@ impl ClusterMembers<'_> {
     }
 }
 
-/// Computes the raw parameters of the proxy of `cluster`, in one row.
+/// Computes the stored parameters of the proxy of `cluster`, in one row.
 fn proxy_parameters(
     model: &MotionModelFrames<Spacetime>,
     cluster: &Cluster,
@@ -135,13 +136,15 @@ fn proxy_parameters(
     Ok(out)
 }
 
-/// Returns the weighted mean of a plane over the members. Equal values are returned exactly.
+/// Returns the weighted mean over the members of the parameter `plane`, which has one value per member. If all values
+/// are equal, the result is exactly this value.
 fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
-/// Returns whether the windows differ so much that different members are visible at different times.
+/// Returns whether the windows of `members` differ so much from that of `proxy` that different members are visible at
+/// different times.
 fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MAX_WIDTH_RATIO.ln();
@@ -149,8 +152,8 @@ fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -
     })
 }
 
-/// Returns the states that the proxy should approximate at each frame: the mean of the members, weighted by their
-/// windows. Quaternions have the sign nearest to `mean`.
+/// Returns the state that the proxy should approximate at each frame: the mean of the members, weighted by their
+/// temporal windows. Quaternions have the sign that brings them nearest to that of `mean`.
 fn target_states(
     members: &ClusterMembers<'_>,
     recentered: &[(f64, SpacetimeMotion)],
@@ -177,7 +180,7 @@ fn target_states(
     members.model.info().times.iter().filter_map(of_time).collect()
 }
 
-/// Returns the natural logarithms of the proxy's scales and rotates its axes accordingly.
+/// Returns the natural logarithms of the proxy's scales, and rotates the axes of `motion` to those of the scales.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {
@@ -199,19 +202,19 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     parts.iter_mut().for_each(|part| part.weight /= total);
     let found = align_axes(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
     let turn = [found.rotation.w, found.rotation.x, found.rotation.y, found.rotation.z];
-    // A quaternion product is linear in either factor, so the quaternion stays linear in time.
+    // The product of two quaternions is linear in each factor, so the quaternion stays linear in time.
     (motion.rotation, motion.omega) = (product(motion.rotation, turn), product(motion.omega, turn));
     found.scales.to_array().map(|scale| scale.max(1e-7).ln())
 }
 
-/// Returns the normalized quaternion; the identity if it has no direction.
+/// Returns the quaternion scaled to length 1; the identity if it has no direction.
 fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     let found = DQuat::from_xyzw(x, y, z, w).normalize();
     if found.is_finite() { found } else { DQuat::IDENTITY }
 }
 
-/// Returns the logit of the amplitude that the window is multiplied by: the least-squares fit to the opacities of the
-/// moment match.
+/// Returns the logit of the proxy's opacity at the center of its temporal window: the amplitude of the window that fits
+/// the opacities of the members' moment match best (least squares).
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

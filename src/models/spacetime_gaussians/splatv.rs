@@ -1,7 +1,7 @@
-//! `.splatv` as an input, and as an output of the lite model.
+//! `.splatv` files as an input, and as an output of the lite SpacetimeGaussians model.
 //!
-//! Unchanged Gaussians keep their stored words. Rows that no player draws are left out. An infinite width is a window
-//! that is 1 at every time ([`rows`](crate::files::splatv::rows)).
+//! Unchanged Gaussians keep their stored words. Gaussians that no player draws are left out. An infinite width stands
+//! for a temporal window that is 1 at every time ([`rows`](crate::files::splatv::rows)).
 
 use std::fs;
 use std::path::Path;
@@ -34,12 +34,12 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum bytes of a camera list that is copied to the output: about seven thousand cameras.
+/// Maximum bytes of a camera list that is copied to the output; enough for about seven thousand cameras.
 const MAX_LISTED: u64 = 4 << 20;
-/// Minimum scale and width, so that their logarithms are finite.
+/// Minimum scale of a Gaussian and minimum width of its temporal window, so that their logarithms are finite.
 const MIN_LENGTH: f64 = 1e-7;
-/// Natural logarithm of the width of an unbounded window. It is finite, so that no inf·0 arises, and so wide that the
-/// window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
+/// Natural logarithm of the width that stands for an unbounded temporal window. It is finite, so that no inf·0 arises,
+/// and so wide that the window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
 const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
 /// Compressed SpacetimeGaussians lite model for web players (`.splatv`).
@@ -51,22 +51,22 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     },
 };
 
-/// Open `.splatv` file.
+/// Opened `.splatv` file.
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
-    /// Row in the file of each Gaussian; `None` if no row was left out.
+    /// Row in the file of each Gaussian of the model; `None` if no Gaussian was left out.
     rows: Option<Vec<u32>>,
-    /// Rows that were repaired or left out.
+    /// Gaussians of the file that were repaired or left out.
     defects: Defects,
     model: MotionModelFrames<Spacetime>,
 }
 
 impl SplatvModel {
-    /// Reads the file at `path` and leaves out rows that no player draws.
+    /// Reads the file at `path` and leaves out Gaussians that no player draws.
     fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
-        // Parameters and the row number.
+        // The parameters and the row number of each Gaussian.
         let values = (Attributes::all().width(0) + WIDTH + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
@@ -81,17 +81,18 @@ impl SplatvModel {
     }
 }
 
-/// Returns the row of Gaussian `i` in the file.
+/// Returns the row in the file of Gaussian `i`. `rows` holds the row of each Gaussian, or `None` if no Gaussian was
+/// left out.
 fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
     rows.map_or(i, |rows| rows[i] as usize)
 }
 
-/// Sets Gaussian `i` to the values of `row`.
+/// Sets the parameters of Gaussian `i` in `raw` to the values of `row` of a `.splatv`.
 fn set_from_row(raw: &mut StoredParams, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(MIN_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
     raw.gaussians.rotation.set_row(i, if has_zero_quaternion(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
-    // Players square the scales, so the sign has no effect.
+    // Players square the scales, so their sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MAX_LOGIT, MAX_LOGIT) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
@@ -102,7 +103,7 @@ fn set_from_row(raw: &mut StoredParams, i: usize, row: &SplatvGaussian) {
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
 }
 
-/// Returns Gaussian `i` as a row of a `.splatv`.
+/// Returns Gaussian `i` of `raw` as a row of a `.splatv`.
 fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
     SplatvGaussian {
@@ -118,8 +119,8 @@ fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
     }
 }
 
-/// Writes `raw` to `path`. `known` returns the exact color of a Gaussian if it has one. The cameras are those of the
-/// 3DGS file `cameras`, or else one camera that sees most of the Gaussians.
+/// Writes `raw` to the `.splatv` file `path`. `known` returns the exact color of a Gaussian if it has one. The cameras
+/// are those of the 3DGS camera list `cameras`, or else one camera that sees most of the Gaussians.
 ///
 /// # Errors
 /// Fails if half precision cannot hold the values or a write fails.
@@ -129,7 +130,7 @@ pub(super) fn write(
     cameras: Option<&Path>,
     path: &Path,
 ) -> Result<()> {
-    // A list above the limit is not used: no subset of its cameras would be better than another.
+    // A list above [`MAX_LISTED`] bytes is not used: no subset of its cameras would be better than another.
     let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());

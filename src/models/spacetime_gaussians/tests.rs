@@ -12,7 +12,7 @@ use crate::recipe::Recipe;
 
 const COUNT: usize = 7;
 
-/// Returns the names of the properties in the order in which training writes them.
+/// Returns the names of the properties of the PLY file in the order in which the training writes them.
 fn properties(is_full: bool) -> Vec<String> {
     let numbered = |name: &str, count: usize| (0..count).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
     let mut names: Vec<String> =
@@ -24,7 +24,7 @@ fn properties(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Returns the value of a property of Gaussian `i`.
+/// Returns the value of the property `name` of Gaussian `i` in the test model.
 fn value(name: &str, i: usize) -> f32 {
     let noise = |step: f32| {
         ((i as f32 + 1.0) * step + name.len() as f32 * 0.31 + name.as_bytes()[name.len() - 1] as f32 * 0.17).fract()
@@ -61,7 +61,7 @@ fn write_decoder(path: &Path, tensors: &Tensors) {
 const CFG_ARGS_TEXT: &str =
     "Namespace(model='ours', duration=50, white_background=True, source_path='data/x', rgbfunction='sandwich')";
 
-/// Writes a model folder as training does, with two iterations.
+/// Writes a model folder with two iterations, as the training does.
 fn folder(is_full: bool) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     for number in [7, 300] {
@@ -397,8 +397,8 @@ fn wrong_properties_and_values_are_named() {
         let message = refusal(&path);
         assert!(message.contains(&format!("Gaussian 1, {name}")) && message.contains("finite"), "{message}");
     }
-    // Without a folder, nothing names the last function of the network and the model opens with a note. A model without
-    // Gaussians opens too.
+    // Without a model folder, nothing names the last function of the network, and the model opens with a note. A model
+    // without Gaussians opens too.
     fs::write(&path, ply(&properties(true), 3, value)).unwrap();
     assert!(open(&path).unwrap().notes().iter().any(|note| note.contains("sandwich")));
     fs::write(&path, ply(&properties(false), 0, value)).unwrap();

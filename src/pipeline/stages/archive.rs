@@ -1,11 +1,11 @@
-//! Stage `archive`: chooses the quantization steps of the values of an archive.
+//! Stage `archive`: chooses the quantization steps of the values in an archive (compact file of the result).
 //!
-//! Quantization noise adds up. A group of values, an attribute or a tensor, that alone is quantized adds a squared
-//! error to renders proportional to the square of its step; the bits per value fall by about one for each octave of the
-//! step. For a given total error the bits are fewest if the error of every group is proportional to the bits that one
-//! octave saves there (reverse water-filling; Cover & Thomas, "Elements of Information Theory", 10.3.3). The stage
-//! measures both, the errors on renders. Then it makes all steps together as coarse as renders of the archive itself
-//! allow.
+//! Errors of quantization add up. If one group of values (an attribute or a tensor) is quantized alone, the squared
+//! error of renders grows in proportion to the square of its quantization step, and each octave (doubling) of the step
+//! saves about one bit per value. For a given total error the archive has the fewest bits if the error of every group
+//! is proportional to the bits that one octave saves in this group (reverse water-filling; Cover & Thomas, "Elements of
+//! Information Theory", 10.3.3). The stage measures the bits of every group, and its error on renders. Then it makes
+//! all steps together as coarse as the quality of renders of the archive allows.
 
 use std::collections::BTreeMap;
 
@@ -32,23 +32,24 @@ use crate::progress::Progress;
 use crate::render;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
-/// Maximum step in standard deviations of a group's values; a coarser one would erase the values.
+/// Maximum quantization step of a group, in standard deviations of its values; a coarser one would erase the values.
 const MAX_STEP: f64 = 4.0;
-/// Octaves added to the initial steps to estimate the size of an archive without rendering. With this value, the number
-/// of Gaussians that fits leaves 0.5 and 1.2 dB for quantization on two trained models.
+/// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
+/// without rendering. With this value, the number of Gaussians that fits leaves 0.5 and 1.2 dB for quantization on two
+/// trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
 
-/// Stage that makes an archive.
+/// Stage that quantizes and encodes the result as an archive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArchiveStage {
-    /// Required PSNR of its renders against the result before quantization, dB. `None`: derived from the loss against
-    /// the original.
+    /// Required PSNR, dB, of renders of the archive against renders of the result before quantization. `None`: derived
+    /// from a permitted loss against the original.
     pub psnr: Option<f64>,
 }
 
-/// Adds the stage if the output is an archive.
+/// Adds the stage to `stages` if the output is an archive.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.output == OutputKind::Archive {
         stages.add(Phase::Write, ArchiveStage { psnr: planning.request.archive_psnr });
@@ -80,7 +81,8 @@ impl Stage for ArchiveStage {
     }
 }
 
-/// Group of values with one quantization step.
+/// Group of values that share one quantization step: an attribute (by index) or a tensor of the deformation field (by
+/// name).
 #[derive(Debug, Clone)]
 enum ValueGroup {
     Attribute(usize),
@@ -95,8 +97,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns the initial number of steps per standard deviation of the values. These steps are finer than most final
-    /// ones.
+    /// Returns the standard deviation of the values divided by the initial quantization step. Initial steps are finer
+    /// than most final ones.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -108,11 +110,12 @@ impl ValueGroup {
 }
 
 impl ArchiveStage {
-    /// Returns the estimate: the result, its renders, the archive and the decoded archive.
+    /// Returns the resource estimate of the stage. Its memory holds the result, renders of it, the archive and the
+    /// decoded archive.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
         let count = pictures(work.pixels);
-        // About forty groups are quantized in every round, and all together in each halving.
+        // About forty groups of values are quantized alone in every balancing round, and all together in each halving.
         let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
@@ -129,17 +132,17 @@ impl ArchiveStage {
                 ("views", BYTES_PER_PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
-                // Archives of frames also encode a few blocks.
+                // An archive of frames also encodes a few blocks of Gaussians.
                 ("blocks", bounds::storing_memory(work).iter().map(|part| part.1).sum()),
             ],
         }
     }
 
-    /// Makes an archive of `compressed` that meets `asked`.
+    /// Makes an archive of `compressed` that meets the quality or size `asked`. Returns its content and its summary.
     ///
     /// # Errors
-    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if the
-    /// byte limit is too low.
+    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if no
+    /// archive of these Gaussians is as small as the byte limit.
     pub fn archive(
         &self,
         scene: &Scene,
@@ -197,7 +200,7 @@ impl ArchiveStage {
         };
         let (encoded, [psnr, loss]) = match quality_target {
             QualityTarget::Bytes(most) => {
-                // Take the finest steps that fit.
+                // Take the finest quantization steps with which the archive fits the byte limit.
                 let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
                 measure_views(match bisect(BYTES_OCTAVE_RANGE.map(|added| -added), BYTES_OCTAVE_HALVINGS, fits)? {
                     Some(best) => best,
@@ -218,7 +221,8 @@ impl ArchiveStage {
     }
 }
 
-/// Returns the estimated bytes of an archive of `compressed`, with steps or bounds that do not depend on renders.
+/// Returns the estimated size, bytes, of an archive of `compressed`. Its quantization steps or error bounds are fixed
+/// ones, chosen without renders.
 ///
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
@@ -230,7 +234,8 @@ pub fn bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
 }
 
-/// Returns the coarsest archive of `gaussians` Gaussians if it has at most `most` bytes, otherwise an error.
+/// Returns `encoded`, the archive of `gaussians` Gaussians with the coarsest steps, or an error if it has more than
+/// `most` bytes.
 fn check_coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
     let least = encoded.bytes.len();
     if least as u64 > most {
@@ -242,14 +247,14 @@ fn check_coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encod
     Ok(encoded)
 }
 
-/// Quantization steps of all groups of a content.
+/// Quantization steps of all groups of values (attributes and tensors) in the content of an archive.
 struct Grids {
     groups: Vec<ValueGroup>,
     /// Standard deviation of the values of each group.
     deviations: Vec<f64>,
-    /// Log2 of the step of each group.
+    /// Log2 of the quantization step of each group.
     octaves: Vec<f64>,
-    /// Offsets of the steps within each tensor, by name of the tensor.
+    /// For each tensor, by name: offsets of the steps of its parts from the step of the tensor.
     offsets: BTreeMap<String, Vec<i8>>,
 }
 
@@ -264,7 +269,7 @@ impl Grids {
         Grids { groups, deviations, octaves, offsets }
     }
 
-    /// Returns the steps, all coarser by `added` octaves.
+    /// Returns the quantization steps, each made coarser by `added` octaves (doublings).
     fn steps(&self, added: f64) -> Steps {
         let mut steps = Steps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
@@ -280,9 +285,9 @@ impl Grids {
         TensorSteps { step: nearest_step(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
-    /// Measures the squared error and the bits of every group. Sets the steps so that the error of each group is
-    /// proportional to the bits that one octave saves, with a total error of `error`. Returns the measurements: name,
-    /// log2 of the step, error, bits.
+    /// Measures the squared error on renders and the bits of every group of values. Sets the quantization steps so that
+    /// the error of each group is proportional to the bits that one octave of its step saves, and all errors together
+    /// are `error`. Returns the measurements: name, log2 of the step before, error, and bits.
     fn balance(
         &mut self,
         scene: &Scene,
@@ -296,7 +301,7 @@ impl Grids {
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
         let bits =
             |by_name: &BTreeMap<String, f64>, group: &ValueGroup| by_name.get(group.name()).copied().unwrap_or(0.0);
-        // At least 1: a group without bits left could become coarser without end.
+        // At least 1: a group whose bits no longer fall could otherwise become coarser without end.
         let saved = |group: &ValueGroup| {
             (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
         };
@@ -312,7 +317,8 @@ impl Grids {
         Ok(measured)
     }
 
-    /// Returns the squared errors of renders with one group quantized and all others exact. Leaves `content` unchanged.
+    /// Returns for each group of values the squared error of renders if this group is quantized and all others are
+    /// exact. Leaves `content` unchanged.
     fn errors(
         &self,
         scene: &Scene,
@@ -357,7 +363,7 @@ fn groups(content: &Content) -> Vec<ValueGroup> {
         .collect()
 }
 
-/// Returns the standard deviation of the values of a group, at least 1e-9.
+/// Returns the standard deviation of the values of `group`, at least 1e-9.
 fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     let deviation = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
@@ -376,7 +382,8 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     found.max(1e-9)
 }
 
-/// Returns the nearest step on the grid of eighths of octaves.
+/// Returns the quantization step nearest to 2^`octave`, as a number of eighths of an octave, limited to the valid
+/// steps.
 fn nearest_step(octave: f64) -> i32 {
     ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }

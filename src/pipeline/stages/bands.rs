@@ -1,6 +1,7 @@
-//! Stage `bands`: drops SH degrees of the result as long as renders hardly change.
+//! Stage `bands`: drops SH degrees of the result, from the highest down, as long as renders hardly change.
 //!
-//! Memory: one state of the original, two of the result, and three rendered views.
+//! Memory: one state of the original, two of the result (a state holds all Gaussians at one frame), and three rendered
+//! views.
 
 use super::field::{COMPARED_VIEWS, least};
 use crate::compressed_model::CompressedModel;
@@ -22,13 +23,14 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name of the omitted work if all SH degrees have to stay.
+/// Name under which dropping SH degrees is listed as omitted, if all degrees have to stay.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// Returns the highest SH degree of a result of `scene` if the user asks for degrees up to `degree`.
+/// Returns the SH degree of a result of `scene` if the user asks for degrees up to `degree`: the degree of the input if
+/// that is lower, or if its format needs all degrees.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
     match scene.input.needs_all_bands() {
@@ -44,15 +46,15 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
     }
 }
 
-/// Stage that chooses the SH degree of a result.
+/// Stage that lowers the SH degree of a result if renders hardly change.
 #[derive(Debug, Clone)]
 pub(crate) struct ShDegreeStage {
-    /// Required margin, dB: renders with the lower SH degree must be this much closer to those with all degrees than
-    /// those are to renders of the original.
+    /// Required margin, dB. The PSNR between renders with the lower degree and with all degrees must exceed, by this
+    /// margin, the PSNR between the result and the original.
     pub margin: f64,
 }
 
-/// Adds the stage if the output may have a lower SH degree.
+/// Adds the stage to `stages` if the output may have a lower SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = ShDegreeStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);
@@ -61,13 +63,13 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for ShDegreeStage {
     fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        // There is nothing to drop at degree 0.
+        // At SH degree 0 there is nothing to drop.
         (work.sh_degree > 0).then(|| self.need(work, limits, left)).into_iter().collect()
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let scene = run.scene;
-        // An SH degree that was chosen for a byte limit or by the user stays.
+        // An SH degree that the user or a byte limit determined stays.
         if run.template.sh_degree < scene.source().info().sh_degree {
             return Ok(());
         }
@@ -81,15 +83,16 @@ impl Stage for ShDegreeStage {
 }
 
 impl ShDegreeStage {
-    /// Returns the stage if the output may have a lower SH degree. An archive spends no bytes on coefficients that
-    /// nobody sees, so it needs no such stage.
+    /// Returns the stage if the output may have a lower SH degree. An archive needs no such stage, because quantization
+    /// already removes coefficients that do not change renders.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == ShDegreeRule::Needed;
         drops.then_some(ShDegreeStage { margin: bands.bands_margin })
     }
 
-    /// Returns the estimate: three states and renders of them. The fraction `left` of the Gaussians stays.
+    /// Returns the resource estimate of the stage. Its memory holds three states (all Gaussians at one frame) and
+    /// renders of them. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) =
             (work.state(Attributes::all()), work.input.reader, work.held(limits, Attributes::all()));
@@ -113,7 +116,7 @@ impl ShDegreeStage {
         }
     }
 
-    /// Returns `compressed` with the lowest SH degree at which renders change no more than allowed.
+    /// Returns `compressed` with the lowest SH degree at which renders change no more than the margin allows.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -138,7 +141,7 @@ impl ShDegreeStage {
         }
         let source = scene.input.reduced(&compressed)?;
         let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
-        // A lower degree is not tried after one that fails.
+        // A lower degree is tried only if the last one was accepted.
         while sh_degree > 0 && tried.len() == all - sh_degree {
             let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &pictures)?;
             found = [result, least(result, self.margin)];
@@ -156,8 +159,8 @@ impl ShDegreeStage {
     }
 }
 
-/// Returns two mean PSNRs over `pictures`, dB: `result` against the original, and `result` with SH coefficients up to
-/// `degree` against `result` with all.
+/// Returns two mean PSNRs over the views `pictures`, dB: of renders of `result` against the original, and of renders of
+/// `result` with SH degree `degree` against `result` with all degrees.
 fn quality_without_degrees(
     scene: &Scene,
     result: &dyn FrameSource,

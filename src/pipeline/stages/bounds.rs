@@ -1,10 +1,11 @@
 //! Error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
 //!
-//! An attribute with an error bound adds a squared error to renders proportional to the square of the bound; one octave
-//! of the bound saves one bit of every value that carries information. As for the steps of a model's archive, the bits
-//! are fewest for a given total error if the error of each attribute is proportional to the bits that one octave saves.
-//! Both are measured: errors on renders of values rounded to multiples of twice the bound, bits by encoding some
-//! blocks. Then all bounds together are made as wide as renders allow.
+//! If one attribute alone has an error bound, the squared error of renders grows in proportion to the square of the
+//! bound, and each octave (doubling) of the bound saves one bit of every value that carries information. As for the
+//! quantization steps of an archive of a model, the bits are fewest for a given total error if the error of each
+//! attribute is proportional to the bits that one octave saves. Errors are measured on renders of values rounded to
+//! multiples of twice the bound, bits by encoding some blocks. Then all bounds together are made as wide as the quality
+//! of renders allows.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -23,25 +24,26 @@ use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_box};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Compression level of zstd.
+/// Compression level of zstd for archives of frames.
 const LEVEL: i32 = 15;
-/// Initial bounds, finer than most final ones, in the units of the attributes; for positions, fractions of the scene
-/// extent.
+/// Initial error bounds of position, rotation, log scale, opacity and SH, in the units of the attributes; of positions,
+/// as a fraction of the scene extent. They are finer than most final bounds.
 const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Maximum factor on the initial bounds; with wider bounds no motion and no color would remain.
+/// Maximum factor by which initial error bounds are widened; with wider bounds no motion and no color would remain.
 const MAX_WIDENING: f64 = 64.0;
-/// Number of blocks of Gaussians whose bits are counted.
+/// Number of blocks of Gaussians that are encoded to count bits.
 const COUNTED_BLOCKS: usize = 4;
-/// Octaves added to the initial bounds to estimate the size of an archive without rendering.
+/// Octaves (doublings) by which the initial error bounds are widened to estimate the size of an archive without
+/// rendering.
 const ESTIMATE_OCTAVES: f64 = 2.0;
 
-/// Returns the storage options of a container within `bounds`.
+/// Returns the storage options of a container whose values may err by at most `bounds`.
 pub(crate) fn packing(bounds: Bounds) -> Packing {
     Packing::within(bounds, LEVEL)
 }
 
-/// Returns the memory for storing the frames of an input within bounds. Empty for models and point clouds, which have
-/// another kind of archive.
+/// Returns the memory that storing the frames of an input within error bounds takes. Empty for models and point clouds,
+/// whose archives store no frames.
 pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
@@ -49,10 +51,11 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     [work.writing_together(BOUNDED_FRAME_BLOCK), vec![work.compressing(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
 }
 
-/// Finds error bounds with which `source`, a result of `scene`, meets `asked`, or has the PSNR `psnr` against itself.
+/// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If
+/// `psnr` is given, renders within the bounds must have this PSNR, dB, against renders of `source`.
 ///
 /// # Errors
-/// Fails if frames cannot be read, if renders are not finite, or if the byte limit is too low.
+/// Fails if frames cannot be read, if renders are not finite, or if no bounds are wide enough for the byte limit.
 pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
@@ -90,7 +93,7 @@ pub(crate) fn find(
     };
     let (widths, [psnr, loss]) = match quality_target {
         QualityTarget::Bytes(most) => {
-            // Take the finest bounds that fit.
+            // Take the finest error bounds with which the archive fits the byte limit.
             let size = |widths| stored_bytes(scene, source, widths);
             let fits = |finer: f64| {
                 let found = widened(&widths, -finer);
@@ -128,7 +131,8 @@ pub(crate) fn find(
     Ok((Bounds::new(widths), summary))
 }
 
-/// Returns the estimated bytes of an archive of `source`, with bounds that do not depend on renders.
+/// Returns the estimated size, bytes, of an archive of the frames of `source`. Its error bounds are fixed ones, chosen
+/// without renders.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -136,7 +140,7 @@ pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
     stored_bytes(scene, source, widened(&initial_bounds(source)?, ESTIMATE_OCTAVES))
 }
 
-/// Writes `source` within bounds of the given widths to a scratch file. Returns its bytes.
+/// Writes `source` to a scratch file with the error bounds `widths`, one per attribute. Returns the bytes of the file.
 fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");
@@ -144,7 +148,7 @@ fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Re
     Ok(fs::metadata(&path).map_err(Error::io("read", &path))?.len())
 }
 
-/// Returns the initial bounds [`INITIAL_BOUNDS`] in the units of a scene.
+/// Returns the initial error bounds [`INITIAL_BOUNDS`], with that of positions in scene units.
 fn initial_bounds(source: &dyn FrameSource) -> Result<[f64; 5]> {
     let extent = first_box(source)?.map_or(1.0, |found| found.extent());
     let [position, others @ ..] = INITIAL_BOUNDS;
@@ -157,13 +161,15 @@ fn widened(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
     widths.map(|width| width * octaves.exp2())
 }
 
-/// Returns the squared errors of renders with one attribute rounded and all others exact.
+/// Returns for each attribute the squared error of renders if this attribute is rounded within its bound and all others
+/// are exact.
 fn errors(reference_views: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
     (0..5).map(|k| reference_views.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
 }
 
-/// Returns the bits of every attribute in some blocks of Gaussians, over one block of frames in the middle.
+/// Returns the number of bits of every attribute in some blocks of Gaussians and one block of frames in the middle,
+/// encoded with the error bounds `widths`.
 fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     let (info, packing) = (source.info(), packing(Bounds::new(widths)));
     let blocks = info.count.div_ceil(GAUSSIAN_BLOCK);
@@ -175,7 +181,7 @@ fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     Ok(bytes.into_iter().map(|bytes| 8.0 * bytes as f64).collect())
 }
 
-/// Frame source whose values are rounded to multiples of twice their bounds.
+/// Source that returns the values of another source rounded to multiples of twice their error bounds.
 struct Rounded<'a> {
     source: &'a dyn FrameSource,
     bounds: Bounds,

@@ -1,7 +1,8 @@
-//! Stage `choose`: compares merging with pruning to the same count by renders, and keeps the better result.
+//! Stage `choose`: compares merging with pruning to the same number of Gaussians by renders, and keeps the better
+//! result.
 //!
-//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: two states of one frame, of the
-//! original and of an alternative, and [`VIEWS_PER_BATCH`] rendered views.
+//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: the states of the original and of one
+//! alternative at one frame, and [`VIEWS_PER_BATCH`] rendered views.
 
 use super::merge::MergeOutcome;
 use crate::compressed_model::CompressedModel;
@@ -20,27 +21,28 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "choose";
 
-/// Number of scored views that are compared. The mean PSNR over them differs from that over all views by less than the
-/// alternatives usually differ from one another.
+/// Number of scored views on which merging and pruning are compared. The mean PSNR over these differs from that over
+/// all views by less than the two alternatives usually differ from each other.
 const COMPARED_VIEWS: usize = 24;
 
-/// Number of views of a frame that are rendered at a time.
+/// Number of views of one frame that are rendered at the same time.
 const VIEWS_PER_BATCH: usize = 4;
 
-/// Bytes per Gaussian for clusters, twice while alternatives are compared, and for reading members.
+/// Bytes of memory per Gaussian for the clusters of merging, which are held twice during the comparison, and for
+/// reading their members.
 pub(crate) const CLUSTERED: u64 = 125;
 
-/// Stage that chooses between merging and pruning.
+/// Stage that chooses between merging and pruning alone.
 #[derive(Debug, Clone)]
 pub(crate) struct Choose {
-    /// Whether the number of Gaussians in the output was requested.
+    /// Whether the user requested an exact number of Gaussians.
     pub has_target: bool,
 }
 
-/// Adds the stage if survivors are both pruned by views and merged.
+/// Adds the stage to `stages` if survivors (Gaussians that are not removed) are both pruned by views and merged.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.prunes_by_views() && planning.merges && planning.request.recipe.select.choose_by_views {
         stages.add(Phase::Reduce, Choose { has_target: planning.target.is_some() });
@@ -63,11 +65,11 @@ impl Stage for Choose {
 }
 
 impl Choose {
-    /// Returns the estimate: both alternatives, two states of a frame, and rendered views. The fraction `left` of the
-    /// Gaussians stays.
+    /// Returns the resource estimate of the stage. Its memory holds the merged and the pruned model, two states (all
+    /// Gaussians at one frame), and rendered views. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
-        // The trajectories of proxies are computed from all members.
+        // The trajectories of proxies, which replace merged clusters, are computed from all members.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
         let (reader, held) = (work.input.reader, work.held(limits, Attributes::all()));
         let per_gaussian = vec![
@@ -82,7 +84,7 @@ impl Choose {
         let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (COMPARED_VIEWS as u64).min(work.pictures);
-        // The original, and two alternatives of about half as many Gaussians.
+        // Renders of the original, and of two alternatives with about half as many Gaussians.
         let made = work.render_seconds(frames as f64, 2.0 * work.count(), RENDER)
             + work.render_seconds(2.0 * frames as f64, 0.0, RENDER);
         ResourceEstimate {
@@ -94,9 +96,9 @@ impl Choose {
         }
     }
 
-    /// Compares `merged` with the same number of Gaussians from the top of the ranking, by mean PSNR against the
-    /// original on scored views. Returns the better result; in a tie the one without merging. If merging loses and no
-    /// target requires this count, the result has as many survivors as selection kept.
+    /// Compares the model `merged` with the same number of unmerged Gaussians from the top of the ranking, by mean PSNR
+    /// against the original on scored views. Returns the better model; in a tie the one without merging. If merging
+    /// loses and no exact number was requested, the returned model has as many Gaussians as selection kept.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -133,7 +135,8 @@ impl Choose {
     }
 }
 
-/// Returns the mean PSNR over `pictures` of the Gaussians `pruned` and of `merged`, each against the original, dB.
+/// Returns two mean PSNRs against the original over the views `pictures`, dB: of the Gaussians `pruned`, unchanged, and
+/// of the model `merged`.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[FrameView]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
@@ -144,7 +147,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
-        // All views of a batch show one frame.
+        // All views of a batch show the same frame.
         let state = views[0].states[0].pick(pruned);
         let features = views[0].features(0).map(|features| features.pick(pruned));
         for (view, expected) in views.iter().zip(&expected) {
@@ -165,12 +168,13 @@ mod tests {
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
 
-    /// Returns the mean PSNR over the views by which the stage chooses.
+    /// Returns the mean PSNR of `compressed` against the original, dB, over the views on which this stage compares
+    /// models.
     fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
         mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
-    /// Returns the merged model of a scene, the result of the choice, and the journal.
+    /// Merges the Gaussians of a scene and runs the stage. Returns the merged model, the chosen model, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,
@@ -211,7 +215,7 @@ mod tests {
     fn losing_merge_without_target_keeps_all_survivors() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        // Nothing is pruned, so that dropping invisible Gaussians competes with merging.
+        // Nothing is pruned, so the alternative to merging is to drop invisible Gaussians.
         let mut recipe = Recipe::preset("default").unwrap();
         recipe.select.tau_static = 0.0;
         recipe.merge.max_color_difference = f64::INFINITY;

@@ -1,9 +1,9 @@
-//! Stage `degree`: finds the SH degree that gives the best quality within a byte limit.
+//! Stage `degree`: finds the SH degree that gives the best quality for a requested size on disk.
 //!
-//! A Gaussian of degree 3 takes as many bytes as three and a half of degree 0. Whether more Gaussians or more SH
+//! A Gaussian of SH degree 3 takes as many bytes as three and a half of degree 0. Whether more Gaussians or more SH
 //! coefficients give better renders depends on the scene. For each degree, from the highest down, as many Gaussians as
-//! fit are refined in a fraction of the steps, until the quality on validation views no longer grows. The best degree
-//! is then refined in full.
+//! fit the size are refined with a fraction of the optimization steps, until the quality on validation views no longer
+//! grows. The best degree is then refined in full by the stage `refine`.
 //!
 //! Memory: that of refinement.
 
@@ -20,19 +20,19 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "degree";
-/// Fraction of the optimization steps with which a degree is tried.
+/// Fraction of the recipe's optimization steps with which an SH degree is tried.
 const TRIAL_STEPS: f64 = 0.2;
 
-/// Stage that chooses the SH degree.
+/// Stage that chooses the SH degree for a requested size on disk.
 #[derive(Debug, Clone)]
 pub(crate) struct Degree {
-    /// Refinement with which a degree is tried.
+    /// Refinement stage with fewer optimization steps, by which a degree is tried.
     refine: RefineStage,
 }
 
-/// Adds the stage to a run with a byte limit that refines and may lower the SH degree.
+/// Adds the stage to `stages` if a size on disk is requested and the run refines and may lower the SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
@@ -57,15 +57,15 @@ impl Stage for Degree {
 }
 
 impl Degree {
-    /// Returns the estimate: one refinement for every degree.
+    /// Returns the resource estimate of the stage, which runs one refinement for every SH degree.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let need = self.refine.need(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
 
-    /// Returns the entry of `fits`, sorted by decreasing SH degree, with the best validation PSNR. `template` gives all
-    /// other settings of the model.
+    /// Returns the entry of `fits` (SH degrees with the numbers of Gaussians that fit, by decreasing degree) with the
+    /// best PSNR on validation views. `template` holds all other settings of the model.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a scratch file cannot be written.
@@ -93,7 +93,7 @@ impl Degree {
                     break;
                 }
             }
-            // In a tie the higher degree wins.
+            // Of two degrees with equal PSNR the higher one wins.
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
             let line = |(fit, psnr): &(ByteLimitFit, f64)| {
                 let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };

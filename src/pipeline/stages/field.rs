@@ -1,6 +1,6 @@
 //! Stage `field`: stores the deformation field of the result in half precision if renders hardly change by it.
 //!
-//! Memory: two states of one frame, and two rendered views.
+//! Memory: two states (all Gaussians at one frame), and two rendered views.
 
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -22,20 +22,20 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "field";
-/// Number of scored views that are compared.
+/// Number of scored views on which renders with both precisions are compared.
 pub(crate) const COMPARED_VIEWS: usize = 12;
 
-/// Stage that chooses the precision of the field of a result.
+/// Stage that chooses the precision in which the deformation field of a result is written.
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPrecisionStage {
-    /// Required margin, dB: renders with the half-precision field must be this much closer to those with the exact
-    /// field than those are to renders of the original.
+    /// Required margin, dB. The PSNR between renders with the half-precision field and with the exact field must
+    /// exceed, by this margin, the PSNR between the result and the original.
     pub margin: f64,
 }
 
-/// Adds the stage if the deformation field may be stored in half precision.
+/// Adds the stage to `stages` if the deformation field may be written in half precision.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = FieldPrecisionStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);
@@ -58,15 +58,15 @@ impl Stage for FieldPrecisionStage {
 }
 
 impl FieldPrecisionStage {
-    /// Returns the stage if the run writes a model and the recipe allows half precision.
+    /// Returns the stage if the run writes a model folder and the recipe allows half precision.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == Precision::Half)
             .then_some(FieldPrecisionStage { margin: field.field_margin })
     }
 
-    /// Returns the estimate: two states, rendered views, and a second copy of the field. The fraction `left` of the
-    /// Gaussians stays.
+    /// Returns the resource estimate of the stage. Its memory holds two states (all Gaussians at one frame), rendered
+    /// views, and a second copy of the deformation field. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
         let per_gaussian = vec![
@@ -92,8 +92,8 @@ impl FieldPrecisionStage {
         }
     }
 
-    /// Returns `compressed` with its field in half precision, if the input supports it and renders change no more than
-    /// allowed. Otherwise returns it unchanged and records why.
+    /// Returns `compressed` with its deformation field in half precision, if the input supports it and renders change
+    /// no more than the margin allows. Otherwise returns it unchanged and adds the reason to the journal.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -127,13 +127,14 @@ impl FieldPrecisionStage {
     }
 }
 
-/// Returns the minimum PSNR, dB, between renders of a result and of its coarser version, for which the coarser version
-/// is accepted: `margin` more than `result`, the PSNR of the result against the original, at most [`MAX_USEFUL_PSNR`].
+/// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result.
+/// `result` is the PSNR of the result against the original; the minimum is `margin` more, but at most
+/// [`MAX_USEFUL_PSNR`].
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }
 
-/// Returns the mean PSNR between renders of two sources over `pictures`, dB.
+/// Returns the mean PSNR between renders of two sources over the views `pictures`, dB.
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sum = 0.0;

@@ -1,4 +1,5 @@
-//! Stages `scan`, `visible` and `score`: from frames to a selection. The commands `score` and `report` run them, too.
+//! Stages `scan`, `visible` and `score`, which lead from frames to a selection of Gaussians. The commands `score` and
+//! `report` also run them.
 
 use std::sync::Arc;
 
@@ -18,7 +19,7 @@ use crate::recipe::{Coverage, Recipe};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
 
-/// Adds the stages that measure and score.
+/// Adds the stages that take statistics and score to `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
@@ -29,24 +30,25 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     stages.add(Phase::Rank, Measure::from_planning(planning));
 }
 
-/// Stages that measure and score.
+/// Stages that take statistics of the Gaussians and score them.
 #[derive(Debug, Clone)]
 pub struct Measure {
-    /// Scan of every frame.
+    /// Scan of every frame for statistics of motion, opacity and shape.
     pub scan: ScanStage,
-    /// Rendering of views, if the contribution C is measured on them.
+    /// Rendering of views, if the contribution C of Gaussians is measured on renders.
     pub visible: Option<Visible>,
-    /// Scoring and selection.
+    /// Scoring of Gaussians and selection of those that stay.
     pub score: ScoreStage,
 }
 
 impl Measure {
-    /// Returns the stages that a run needs.
+    /// Returns the stages for the request and the input of `planning`.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Measure {
         Measure::new(&planning.request.recipe, planning.input.has_cameras, planning.user.clone())
     }
 
-    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own.
+    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own; `user` holds
+    /// Gaussians that the user keeps or drops.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
             scan: ScanStage { recipe: recipe.scan.clone() },
@@ -61,14 +63,15 @@ impl Measure {
         }
     }
 
-    /// Returns the estimates of measuring and scoring, without statistics that are `measured` already.
+    /// Returns the resource estimates of the stages. Statistics that are `measured` already are not counted.
     pub fn needs(&self, work: &Workload, limits: &Limits, measured: MeasuredOnArrival) -> Vec<ResourceEstimate> {
         let scan = (!measured.scanned).then(|| self.scan.need(work, limits));
         let visible = self.visible.as_ref().filter(|_| !measured.seen).map(|visible| visible.need(work, limits));
         [scan, visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
     }
 
-    /// Measures the scene, unless this was done while it arrived, and scores its Gaussians.
+    /// Takes the statistics of the Gaussians of `scene`, unless they were taken while it arrived (`arrived`), and
+    /// scores the Gaussians.
     ///
     /// # Errors
     /// Fails if a stage fails.
@@ -85,11 +88,11 @@ impl Measure {
         scored.within(&scene.limits, &scene.scratch)
     }
 
-    /// Scans all frames. If the recipe drops Gaussians that are not finite, they are marked as absent from the scene,
-    /// and the scene is scanned again without them.
+    /// Scans all frames. If the recipe drops Gaussians with NaN or infinity, these are marked as absent from the scene,
+    /// which is then scanned again without them.
     ///
     /// # Errors
-    /// Fails if frames cannot be read or their times cannot be scanned.
+    /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         scene.set_absent(&[]);
         let scanned = self.scan.run(scene, journal)?;

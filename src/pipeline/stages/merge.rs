@@ -1,7 +1,8 @@
-//! Stage `merge`: merges similar survivors into proxies.
+//! Stage `merge`: replaces clusters of similar survivors (Gaussians that are not removed) by one Gaussian each, a
+//! proxy.
 //!
-//! Memory: [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive, the memory of survivors and candidate pairs in
-//! [`crate::merging`], and of pairs that are measured together in [`crate::merging::motion_pass`].
+//! Memory: [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive, plus the memory of survivors and candidate pairs
+//! stated in [`crate::merging`], and of pairs measured at the same time stated in [`crate::merging::motion_pass`].
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -38,53 +39,54 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "merge";
 
-/// Name of the measurement of pairs in the cache; it can be divided into shards.
+/// Name under which measured motions of pairs of Gaussians are cached. The measurement can be divided into shards.
 pub(crate) const PAIRS: &str = "pairs";
-/// Minimum number of pairs whose measurement is divided.
+/// Minimum number of pairs whose measurement is divided into shards.
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
-/// Bytes per Gaussian that may survive: id, state with base colors only, whether the state is finite, and merge class.
-/// Ids count twice because merging is tried on subsets.
+/// Bytes of memory per Gaussian that may survive: id, state with base colors only, whether the state is finite, and
+/// merge class. Ids count twice because merging is tried on subsets.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Assumed number of merge trials until the target is met, for the estimate of reads. The secant search usually needs
-/// fewer.
+/// Assumed number of times that merging is tried until it leaves the requested number of Gaussians; used to estimate
+/// reads. The secant search usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
-/// Number of Gaussians whose full state is in memory at a time while attributes that merging does not use are dropped.
+/// Number of Gaussians whose full state is in memory at a time while the attributes that merging does not use are
+/// dropped.
 const GATHER_CHUNK: usize = 16 * BLOCK;
 
-/// Time per Gaussian, seconds: neighbors, tests and clusters (`benches/merge.rs`).
+/// Processor time per Gaussian of finding neighbors, tests and clusters, seconds (`benches/merge.rs`).
 const SECONDS_TO_MERGE: f64 = 1e-5;
-/// Approximate fraction of the Gaussians whose pairs are followed over the frames.
+/// Approximate fraction of the Gaussians that belong to a pair whose motion is followed over the frames.
 const FOLLOWED_FRACTION: f64 = 0.3;
 
-/// Stage that merges.
+/// Stage that merges similar survivors.
 #[derive(Debug, Clone)]
 pub(crate) struct MergeStage {
-    /// Parameters of tests, passes and proxies.
+    /// Parameters of the tests for similarity, of the merge passes and of the proxies.
     pub recipe: recipe::MergeParams,
-    /// Parameters of the scan, which define life spans and steps.
+    /// Parameters of the scan, which define life spans (frames in which a Gaussian is alive) and steps between frames.
     pub scan: recipe::ScanParams,
-    /// Whether survivors may be pruned to reach the target.
+    /// Whether survivors may be pruned, too, to reach the requested number of Gaussians.
     pub prunes: bool,
     /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
 }
 
-/// Result of merging: the compressed model and the counts of the passes.
+/// Result of merging: the compressed model, and counts of the merge passes.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct MergeOutcome {
-    /// Compressed model.
+    /// Compressed model with its merged clusters.
     pub compressed: CompressedModel,
-    /// Counts of every pass.
+    /// Counts of every merge pass; `None` if nothing was merged.
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage if survivors are merged; otherwise records why they are not.
+/// Adds the stage to `stages` if survivors are merged; otherwise adds the reason why they are not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -134,14 +136,16 @@ impl Stage for MergeStage {
 }
 
 impl MergeStage {
-    /// Returns the estimate: pairs that are measured together, all Gaussians that may survive, and the proxies.
+    /// Returns the resource estimate of the stage. Its memory holds the pairs that are measured at the same time, all
+    /// Gaussians that may survive, and the proxies.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
-        // Only base colors are compared. There is at most one proxy for every two Gaussians, before and after a pass,
-        // and then once with all SH coefficients.
+        // Only base colors are compared. There is at most one proxy for every two Gaussians, held before and after a
+        // pass, and then once with all SH coefficients.
         let proxies = state_bytes(0, Attributes::all()).max(work.state(Attributes::all()).div_ceil(2));
         let per_gaussian = vec![
-            // The importances C and Vis are read back from disk.
+            // The importances C (contribution) and Vis (fraction of views that may show the Gaussian) are read back
+            // from disk if they were moved there.
             ("importance", if limits.rows_aside { 16 } else { 0 }),
             ("pool", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
@@ -150,8 +154,8 @@ impl MergeStage {
             ("readers", work.input.reader),
             ("followed", motion_pass::bytes_per_gaussian(limits.frames_held) as u64),
         ];
-        // States are read once. Every pass of every trial follows its pairs over all frames, twice: coinciding pairs
-        // are merged first, if there are any.
+        // States are read once. Every pass of every trial follows its pairs over all frames twice, because coinciding
+        // pairs, if there are any, are merged first.
         let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
         let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
         ResourceEstimate {
@@ -164,11 +168,11 @@ impl MergeStage {
         }
     }
 
-    /// Merges the first `survivors` of a ranking; with a target, as many of them as merge into exactly the target. Then
-    /// solves the parameters of the proxies.
+    /// Merges the first `survivors` Gaussians of the ranking. If an exact number is requested and Gaussians may be
+    /// pruned, merges only as many of them as leave exactly this number. Then computes the parameters of the proxies.
     ///
     /// # Errors
-    /// Fails if frames cannot be read, or if merging alone cannot reach the target.
+    /// Fails if frames cannot be read, or if merging without pruning cannot reach the requested number.
     pub(crate) fn merge(
         &self,
         scene: &Scene,
@@ -177,7 +181,7 @@ impl MergeStage {
         survivors: usize,
         journal: &mut Journal,
     ) -> Result<MergeOutcome> {
-        // Importances may have to be read from disk, so they are read only if the cache needs a key.
+        // Importances may have to be read from disk, so they are read only if a cache key is needed.
         let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
         let key = scene.work.key(&(
             (&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors),
@@ -185,7 +189,7 @@ impl MergeStage {
         ));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, survivors, scene.source(), |_| {
-                // The progress task also covers the solution of the proxies.
+                // The progress task also covers the computation of the proxies.
                 let progress = scene.events.counting_task(NAME, "sets of survivors");
                 let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
                 let mut merged = match self.target {
@@ -214,10 +218,10 @@ impl MergeStage {
     }
 }
 
-/// Returns the largest number m of survivors, up to `all`, that the search finds to merge into at most `target`
-/// Gaussians; m = `target` always does. `merged` returns the count after merging m survivors. Counts grow with m except
-/// for small dips, so the bracket is narrowed by the secant method. The search stops if less than a thousandth of the
-/// target is missing; merging then ends early by that many joins.
+/// Searches for the largest number m of survivors, up to `all`, whose merging leaves at most `target` Gaussians. m =
+/// `target` always does. `merged` returns the number that merging m survivors leaves; it grows with m except for small
+/// dips, so the interval of possible m is narrowed by the secant method. The search ends early if less than a
+/// thousandth of `target` is missing; merging can then stop that many joins early to leave exactly `target`.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -227,7 +231,7 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
     let mut low_count = merged(low)?;
     while high - low > 1 && target - low_count > target / 1000 {
         let slope = (target - low_count) as f64 / (high_count - low_count) as f64;
-        // Stay away from the ends, so that a curved count cannot stall the search.
+        // Stay away from the ends of the interval, so that a curved count cannot stall the search.
         let m = low + ((high - low) as f64 * slope.clamp(0.1, 0.9)) as usize;
         let m = m.clamp(low + 1, high - 1);
         let count = merged(m)?;
@@ -240,26 +244,26 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
     Ok(low)
 }
 
-/// Input of merging in memory, so that merging can be tried on many sets of survivors.
+/// Input of merging, kept in memory so that merging can be tried on many sets of survivors.
 struct Trial<'a> {
     scored: &'a Scored,
-    /// Merge parameters of the recipe, with a motion noise of at least the resolution of the positions.
+    /// Merge parameters of the recipe; the motion noise is raised to at least the resolution of the positions.
     merge: recipe::MergeParams,
-    /// Increasing ids of the Gaussians whose states are in memory.
+    /// Ids of the Gaussians whose states are in memory, the pool, in increasing order.
     pool: Vec<u32>,
-    /// States of the pool at the reference frame, with base colors only.
+    /// States of the Gaussians of the pool at the reference frame, with base colors only.
     states: Gaussians,
-    /// Merge class of each Gaussian of the pool; only Gaussians of one class may merge. `None`: never merges.
+    /// Merge class of each Gaussian of the pool. Only Gaussians of the same class may merge; `None`: never merges.
     classes: Vec<Option<u8>>,
-    /// Importances C and Vis of all Gaussians, by id.
+    /// Importances of all Gaussians, by id: contribution C, and fraction Vis of the views that may show the Gaussian.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
     work: &'a Cache,
-    /// Maximum number of pairs that are measured together.
+    /// Maximum number of pairs whose motion is measured at the same time.
     pairs_together: usize,
-    /// Motion likeness of pairs of the pool; it does not depend on the other survivors.
+    /// Measured similarities of motion for pairs of the pool. They stay valid for every set of survivors.
     known: KnownPairs,
-    /// Progress of the trials: one unit per set of survivors.
+    /// Progress of the stage: one unit per set of survivors on which merging was tried.
     progress: &'a Progress,
 }
 
@@ -298,7 +302,7 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` to exactly `target` Gaussians.
+    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
         let left = merged.compressed.len();
@@ -311,7 +315,8 @@ impl<'a> Trial<'a> {
         Ok(merged)
     }
 
-    /// Merges `survivors` (increasing ids, all in the pool). Stops after `limit` joins.
+    /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory). Stops after `limit` joins, if
+    /// given.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
         let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
             self;
@@ -341,8 +346,8 @@ impl<'a> Trial<'a> {
     }
 }
 
-/// Returns the motion likeness of each of `pairs`, in any order. A large number of pairs is divided into shards by
-/// position.
+/// Returns the similarity of motion of each of `pairs`, not in the order of `pairs`. A large number of pairs is sorted
+/// by position and divided into shards.
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,
@@ -354,7 +359,7 @@ fn measure(
     if !work.keeps() || pairs.len() < MIN_DIVIDED_PAIRS {
         return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
     }
-    // Sort pairs by position, so that few shards read the same Gaussians.
+    // Pairs are sorted by position, so that few shards read the same Gaussians.
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
     let order = voxel_order(&rows, |row| reference.row(row as usize), asked.reach);
     let mut place = rows;
@@ -364,7 +369,7 @@ fn measure(
     let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
     let compute = |some: Range<usize>| match some.len() == pairs.len() {
         true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),
-        // A shard is read once and shares no buffers with others.
+        // The pairs of a shard are measured once, and share no buffers with other shards.
         false => fresh.fresh().measure(pool, reference, pairs[some].to_vec(), asked.reach, false),
     };
     work.divided(PAIRS, key, pairs.len(), compute, |parts| {
@@ -376,7 +381,7 @@ fn measure(
     })
 }
 
-/// Returns the compressed model and the counts for the groups in `merged`.
+/// Returns the compressed model made of the merged groups in `merged`, with the counts of the passes.
 fn outcome(
     survivors: &Survivors<'_>,
     merged: &Merged,
@@ -410,8 +415,8 @@ fn outcome(
     }
 }
 
-/// Returns the states of the Gaussians `ids` (increasing) at `frame` with base colors only, and whether each full state
-/// is finite. All values are zero if there are no frames.
+/// Returns the states of the Gaussians `ids` (increasing) at `frame` with base colors only, and for each Gaussian
+/// whether its full state is finite. All values are zero if there are no frames.
 fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
     let mut states = Gaussians::zeros(ids.len(), 0);
     let mut finite = vec![true; ids.len()];
@@ -428,7 +433,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
     Ok((states, finite))
 }
 
-/// Returns the index of each of `ids` in `pool`. Both are increasing, and `ids` is a subset of `pool`.
+/// Returns the index in `pool` of each of `ids`. Both are increasing, and `ids` is a subset of `pool`.
 fn indices_in(ids: &[u32], pool: &[u32]) -> Vec<u32> {
     let mut place = 0;
     ids.iter()

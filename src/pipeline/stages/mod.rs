@@ -1,5 +1,5 @@
-//! Stages of a run, one file each, in the order of [`STAGES`]. The computations are in the folders of their topics
-//! (`statistics`, `pruning`, `merging`, `refinement`, `archive`).
+//! Stages of a run, one file each, listed in [`STAGES`] in the order in which they run. Their computations are in the
+//! modules of their topics (`statistics`, `pruning`, `merging`, `refinement`, `archive`).
 
 pub mod archive;
 pub(crate) mod bands;
@@ -21,10 +21,10 @@ pub mod write;
 use super::planning::Planning;
 use super::stage::StageList;
 
-/// Function that adds a stage to the list if the request needs it, or records why the run omits it.
+/// Function that adds a stage to the list of a run if the request needs it, or adds the reason why the run omits it.
 pub(super) type PlanStage = fn(&Planning<'_>, &mut StageList);
 
-/// Planning functions of all stages, in the order in which stages run.
+/// Functions that plan the stages, in the order in which stages run.
 pub(super) const STAGES: &[PlanStage] = &[
     measure::plan,
     size::plan_count,

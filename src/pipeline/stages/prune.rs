@@ -1,4 +1,4 @@
-//! Stage `prune`: takes the survivors from the ranking, as far as their number is known before merging.
+//! Stage `prune`: keeps the first Gaussians of the ranking as survivors. Later stages may reduce their number.
 
 use crate::error::{Error, Result};
 use crate::journal::Journal;
@@ -9,19 +9,19 @@ use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "prune";
 
-/// Stage that prunes.
+/// Stage that keeps the first Gaussians of the ranking.
 #[derive(Debug, Clone)]
 pub(crate) struct Prune {
-    /// Whether pruning is enabled; Gaussians that the user drops are removed in either case.
+    /// Whether Gaussians are pruned by rank. Gaussians that the user drops are removed in either case.
     pub prunes: bool,
-    /// Whether survivors are merged afterwards.
+    /// Whether survivors (Gaussians that are not removed) are merged afterwards.
     pub merges: bool,
 }
 
-/// Adds the stage.
+/// Adds the stage to `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if !planning.prunes {
         stages.leave_out("pruning", "--merge-only");
@@ -37,7 +37,7 @@ impl Stage for Prune {
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let most = ranking.order().len();
-        // A byte limit may have space for more Gaussians than may stay.
+        // With a byte limit, more Gaussians may fit than may stay.
         let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
         run.wanted = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
         let survivors = run.stages.counts.before_refinement(run.wanted, scored.count()).min(most);
@@ -47,11 +47,12 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors, exactly `target` if it is given. If merging reduces them to the target, all
-    /// Gaussians that may stay survive here, because only merging can tell how many it needs.
+    /// Returns the number of survivors (Gaussians that are not removed); with a `target`, this number. If merging later
+    /// reduces them to the target, returns all Gaussians that may stay, because only merging can tell how many it
+    /// needs.
     ///
     /// # Errors
-    /// Fails if the numbers of protected or dropped Gaussians make the target impossible.
+    /// Fails if the target is below the number of Gaussians that must stay or above the number that may stay.
     pub(crate) fn survivors(
         &self,
         scene: &Scene,

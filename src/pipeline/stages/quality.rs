@@ -1,11 +1,11 @@
-//! Stage `quality`: PSNR and SSIM of the result against the original on views that nothing was fitted to or chosen by, and
-//! the time of a render before and after.
+//! Stage `quality`: measures PSNR and SSIM of the result against the original, on views that were used neither to fit
+//! nor to choose anything, and the time of a render before and after.
 //!
-//! Test views are measured where the cameras have a test split: at most [`MOST_VIEWS`], spread over frames and views, fewer
-//! where the run itself is short ([`SHARE`]). Without a test split the figure is that of the validation views of refinement,
-//! which chose the best state and are labeled so. Without either, training views are measured.
+//! If the cameras have a test split, test views are measured: at most [`MOST_VIEWS`], spread over frames and views, and
+//! fewer in a short run ([`SHARE`]). Without a test split, the result on the validation views of refinement is
+//! reported, with this label because they chose the best state. Without either, training views are measured.
 //!
-//! Memory: one frame state of each model, two views per thread, and the scores.
+//! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
 use std::fs;
 use std::time::Instant;
@@ -28,24 +28,24 @@ use crate::scene::pictures::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "quality";
-/// Maximum number of views that are measured.
+/// Maximum number of views on which quality is measured.
 const MOST_VIEWS: usize = 60;
-/// Minimum number of views, however short the run is.
+/// Minimum number of views on which quality is measured, however short the run is.
 const FEWEST_VIEWS: usize = 4;
-/// Share of the run's estimated processor time that measuring may take.
+/// Fraction of the run's estimated processor time that measuring quality may take.
 const SHARE: f64 = 0.02;
 /// Number of views whose rendering is timed, on one thread.
 const TIMED_VIEWS: usize = 3;
 
-/// Measurement of the result's quality.
+/// Stage that measures the quality of the result.
 #[derive(Debug, Clone)]
 pub(crate) struct QualityStage {
     input: InputOptions,
 }
 
-/// Adds the stage, unless it does not fit within the memory limit or was left out on purpose.
+/// Adds the stage to `stages`, unless it does not fit within the memory limit or is not wanted.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
         true => stages.add(Phase::Write, QualityStage { input: planning.request.input.clone() }),
@@ -73,14 +73,15 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
-    /// Returns the estimate for rendering views of both models; a fraction `left` of the Gaussians is in the result.
+    /// Returns the resource estimate of rendering views of the original and of the result, which has the fraction
+    /// `left` of the Gaussians.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
         let of_views = pictures::need(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result =
             vec![("kept", bytes_of_survivors(left, 24)), ("result", bytes_of_survivors(left, 2 * work.input.reduced))];
         ResourceEstimate {
-            // The number of views follows from the time of all other stages; see `view_count`.
+            // The number of views is derived from the estimated time of all other stages; see `view_count`.
             seconds: 0.0,
             // Views of the original and of the result, which may be computed from the same input, and the timed views.
             reads: 2.5 * work.reads(views, limits),
@@ -90,7 +91,8 @@ impl QualityStage {
         }
     }
 
-    /// Measures the result of `run`. Returns `None` where it has no frames that can be rendered.
+    /// Measures the quality of the result of `run`. Returns `None` if the result has no frames that can be rendered
+    /// yet.
     fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;
@@ -116,7 +118,7 @@ impl QualityStage {
                 opened = open_compressed(&path, scene, &self.input)?;
                 opened.source()
             }
-            // Frames within bounds exist only once they are written.
+            // Frames with error bounds exist only once they are written.
             Some(Archived::Frames(_)) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
@@ -128,8 +130,9 @@ impl QualityStage {
         Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))
     }
 
-    /// Returns how many views are measured: [`MOST_VIEWS`], or fewer where they would take more than [`SHARE`] of the run. The
-    /// figures are estimates for a reference machine, so that the number is the same on every machine.
+    /// Returns on how many views quality is measured: [`MOST_VIEWS`], or fewer if they would take more than the
+    /// fraction [`SHARE`] of the run. Times are estimates for a reference machine, so that the number of views is the
+    /// same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
         let work = Workload { pace: Throughput::UNKNOWN, ..scene.workload() };
@@ -143,10 +146,10 @@ impl QualityStage {
     }
 }
 
-/// Processor seconds of PSNR and SSIM per pixel, about (`benches/filters.rs`).
+/// Approximate processor time of PSNR and SSIM per pixel, seconds (`benches/filters.rs`).
 const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
 
-/// Returns the mean PSNR, dB, and the mean SSIM of `result` against the original over `views`.
+/// Returns the mean PSNR, dB, and the mean SSIM of renders of `result` against the original over `views`.
 fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<(f64, f64)> {
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
@@ -164,8 +167,9 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     Ok((mean(|score| score.0), mean(|score| score.1)))
 }
 
-/// Returns the median time of rendering one view of both models on one thread, in milliseconds, without the evaluation of the
-/// deformation field. The first render of each view warms the caches and is not counted.
+/// Returns the median times of rendering one view of the original and of the result on one thread, milliseconds,
+/// without the evaluation of the deformation field. Each view is rendered once before its time is taken, to warm the
+/// processor's caches.
 pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<Option<RenderTime>> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
     let views = spread_views(views.to_vec(), TIMED_VIEWS);

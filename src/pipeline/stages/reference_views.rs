@@ -1,4 +1,4 @@
-//! Quality targets of archives, and the views by which an archive is compared with the result before quantization.
+//! Quality targets of archives, and the views on which an archive is compared with the result before quantization.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -11,69 +11,72 @@ use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Minimum and maximum number of compared views; fewer if the views are large.
+/// Minimum and maximum number of views on which an archive is compared. Between these, [`MAX_VIEW_BYTES`] decides.
 const VIEW_COUNTS: [u64; 2] = [4, 12];
-/// Maximum bytes of the renders of the result and of the original together, from which the number of views follows.
+/// Maximum bytes of memory of all renders of the result and of the original, from which the number of compared views
+/// follows.
 const MAX_VIEW_BYTES: u64 = 128 << 20;
-/// Maximum loss of an archive against the original if nothing is requested, dB.
+/// Maximum loss of PSNR against the original by quantization if the user requests nothing, dB.
 const DEFAULT_LOSS: f64 = 0.5;
-/// PSNR of the result against the original, dB, above which pruning caused too little error to hide quantization noise.
-/// The archive then has to reach this PSNR against the result.
+/// PSNR of the result against the original, dB, above which the errors of pruning are too small to hide quantization
+/// noise. The archive then has to reach this PSNR against the result before quantization.
 const ENOUGH_PSNR: f64 = 50.0;
-/// Surplus of quality that a search leaves for the archive, dB: a third of the squared error of pruning. At the best
-/// trade-off, errors are proportional to how fast bytes fall with them: about three times as fast for the number of
-/// Gaussians.
+/// Surplus of quality that a search for a quality leaves for quantization, dB. It corresponds to a third of the squared
+/// error of pruning: at the best trade-off, errors are proportional to how fast bytes fall with them, which is about
+/// three times as fast for the number of Gaussians as for quantization.
 pub(crate) const ARCHIVE_HEADROOM: f64 = 1.2;
-/// Maximum shortfall of an archive against its target, dB.
+/// Maximum shortfall of the PSNR of an archive against its target, dB.
 const MAX_SHORTFALL: f64 = 10.0;
-/// Bytes of a pixel of a rendered view.
+/// Bytes of memory per pixel of a rendered view.
 pub(crate) const BYTES_PER_PIXEL: u64 = 3 * size_of::<f32>() as u64;
-/// Number of times that errors and bits are measured.
+/// Number of rounds in which the error and the bits of every group of values are measured and the quantization steps
+/// adjusted.
 pub(crate) const BALANCING_ROUNDS: usize = 2;
-/// Maximum change of a step after one measurement, octaves.
+/// Maximum change of a quantization step after one measurement, octaves (doublings).
 const MAX_STEP_CHANGE: f64 = 2.5;
-/// Smallest squared error that is distinguished.
+/// Smallest squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
-/// Range of the final change of all steps, octaves, from finer to coarser.
+/// Range of the final common change of all quantization steps, octaves (doublings), from finer to coarser.
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
-/// Number of times that this range is halved.
+/// Number of times that [`OCTAVE_RANGE`] is halved to find the change.
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range of the final change of all steps for a byte limit, octaves, from coarser to finer.
+/// Range of the final common change of all quantization steps for a byte limit, octaves (doublings), from coarser to
+/// finer.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
-/// Number of times that [`BYTES_OCTAVE_RANGE`] is halved.
+/// Number of times that [`BYTES_OCTAVE_RANGE`] is halved to find the change.
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
-/// Returns the number of compared views of `pixels` pixels each.
+/// Returns the number of views on which an archive is compared, for views of `pixels` pixels each.
 pub(crate) fn pictures(pixels: u64) -> u64 {
     let [fewest, most] = VIEW_COUNTS;
     (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
 
-/// Request for an archive from the goal of the run, beside the option `--archive-psnr`.
+/// What the goal of the run requires of an archive. The PSNR of the option `--archive-psnr` is passed separately.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub enum ArchiveTarget {
-    /// No request.
+    /// The goal requires nothing.
     Nothing,
-    /// Maximum loss of PSNR against the original, dB.
+    /// Maximum loss of PSNR against the original by quantization, dB.
     Loss(f64),
-    /// Maximum number of bytes.
+    /// Maximum number of bytes of the archive.
     Bytes(u64),
 }
 
-/// Requirement that the steps of an archive have to meet.
+/// Requirement that the quantization steps of an archive have to meet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum QualityTarget {
     /// Minimum PSNR against the result before quantization, dB.
     Close(f64),
     /// Maximum loss of PSNR against the original, compared with the result before quantization, dB.
     Loss(f64),
-    /// Maximum number of bytes.
+    /// Maximum number of bytes of the archive.
     Bytes(u64),
 }
 
 impl QualityTarget {
-    /// Returns the requirement for a result with the PSNR `level` against the original. `psnr` is the value of
-    /// `--archive-psnr`, if given.
+    /// Returns the requirement for an archive of a result whose PSNR against the original is `level`, dB. `psnr` is the
+    /// value of the option `--archive-psnr`, if given; `asked` is what the goal of the run requires.
     pub(crate) fn new(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
         match (psnr, asked) {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
@@ -84,8 +87,9 @@ impl QualityTarget {
         }
     }
 
-    /// Returns whether an archive with PSNR `psnr` against the result and loss `loss`, both in dB, meets the
-    /// requirement. `asked` is the value of [`required_psnr`](QualityTarget::required_psnr).
+    /// Returns whether an archive meets the requirement. `psnr` is its PSNR against the result before quantization,
+    /// `loss` its loss of PSNR against the original, both in dB. `asked` is the value of
+    /// [`required_psnr`](QualityTarget::required_psnr).
     pub(crate) fn is_met_by(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
         match self {
             QualityTarget::Loss(most) => loss <= most,
@@ -93,19 +97,19 @@ impl QualityTarget {
         }
     }
 
-    /// Returns the PSNR against the result before quantization, dB, that the requirement implies for a result with the
-    /// PSNR `level` against the original.
+    /// Returns the PSNR against the result before quantization, dB, that corresponds to the requirement. `level` is the
+    /// PSNR of the result against the original, dB.
     pub(crate) fn required_psnr(self, level: f64) -> f64 {
         match self {
             QualityTarget::Close(psnr) => psnr,
-            // Squared errors of pruning and quantization add up.
+            // The squared errors of pruning and of quantization add up.
             QualityTarget::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
             QualityTarget::Bytes(_) => QualityTarget::Loss(ARCHIVE_HEADROOM).required_psnr(level.min(ENOUGH_PSNR)),
         }
     }
 }
 
-/// Renders of the result before quantization, with which other renders are compared.
+/// Renders of one model (usually the result before quantization), with which renders of other models are compared.
 pub(crate) struct ReferenceViews<'a> {
     scene: &'a Scene,
     pictures: Vec<FrameView>,
@@ -135,13 +139,13 @@ impl ReferenceViews<'_> {
         Ok(rendered)
     }
 
-    /// Returns the mean PSNR of renders of `source` against the reference, dB.
+    /// Returns the mean PSNR of renders of `source` against the reference renders, dB.
     pub(crate) fn psnr(&self, source: &dyn FrameSource) -> Result<f64> {
         let found = self.render(source, |k, image| psnr(&image, &self.images[k]))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
     }
 
-    /// Returns the mean squared error of renders of `source` against the reference.
+    /// Returns the mean squared error of renders of `source` against the reference renders.
     pub(crate) fn error(&self, source: &dyn FrameSource) -> Result<f64> {
         let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
@@ -151,7 +155,7 @@ impl ReferenceViews<'_> {
 /// Returns `psnr`, the PSNR of a result against the original, if it is a number.
 ///
 /// # Errors
-/// Fails for NaN, which means that some pixels are NaN.
+/// Fails if `psnr` is NaN, which means that some pixels are NaN.
 pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     if psnr.is_nan() {
         return Err(Error::usage(
@@ -163,12 +167,12 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     Ok(psnr)
 }
 
-/// Checks that an archive has about the PSNR `asked` against the result, dB. An archive with a byte limit always
-/// passes.
+/// Checks that the PSNR `found` of an archive against the result before quantization is about as high as `asked`, dB.
+/// An archive with a byte limit always passes.
 ///
 /// # Errors
-/// Fails if the PSNR is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]: then some values
-/// are so large that their grid cannot represent the others.
+/// Fails if `found` is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]. Then some values
+/// are so large that a quantization grid for them cannot represent the others.
 pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -> Result<()> {
     let is_met = matches!(quality_target, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     match is_met {
@@ -182,8 +186,8 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
     }
 }
 
-/// Returns the result of `evaluate` at the largest number of a range for which it returns one, found by bisection with
-/// `halvings` steps. Returns `None` if no tried number has a result.
+/// Searches a range for the number nearest to its second end at which `evaluate` returns a result, by bisection with
+/// `halvings` steps from the first end. Returns this result, or `None` if no tried number has one.
 pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],
     halvings: usize,
@@ -200,8 +204,8 @@ pub(crate) fn bisect<T>(
     Ok(best)
 }
 
-/// Returns the octaves by which a step that causes the squared error `found` must grow to cause about `error`. The
-/// change is limited to [`MAX_STEP_CHANGE`].
+/// Returns by how many octaves (doublings) a quantization step that causes the squared error `found` must grow to cause
+/// about `error`. The change is limited to [`MAX_STEP_CHANGE`] in both directions.
 pub(crate) fn step_change(error: f64, found: f64) -> f64 {
     (0.5 * (error / found.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
 }

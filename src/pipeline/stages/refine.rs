@@ -1,4 +1,5 @@
-//! Stage `refine`: fits the survivors to renders of the original, and removes Gaussians in prune steps in between.
+//! Stage `refine`: fits the survivors (Gaussians that are not removed) to renders of the original by optimization.
+//! Between optimization steps, prune steps remove the lowest-ranked Gaussians.
 
 use crate::error::Result;
 use crate::memory_plan::ResourceEstimate;
@@ -8,7 +9,8 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets;
 use crate::scene::Scene;
 
-/// Adds the stage if the recipe refines and memory suffices; records the parts that are omitted for lack of memory.
+/// Adds the stage to `stages` if the recipe refines and memory suffices. Adds the reason for parts that are omitted for
+/// lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     for (what, bytes) in planning.fallback.left_out() {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
@@ -29,8 +31,8 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
     }
 
-    /// Returns whether at most the fraction `hardly_seen` of the Gaussians is removed: then the result may already be
-    /// close enough to the original.
+    /// Returns whether at most the fraction `hardly_seen` of the Gaussians is removed, so that the result may be close
+    /// enough to the original without refinement.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
         input.left >= 1.0 - hardly_seen
     }
@@ -45,7 +47,7 @@ impl Stage for RefineStage {
         let start = run.take_result();
         run.result = match &mut run.prune_steps {
             None => self.run(run.scene, &scored, start, wanted, &mut run.journal)?,
-            // A result with all Gaussians needs no refinement.
+            // A model with all Gaussians needs no refinement.
             Some(_) if wanted >= ranking.order().len() => start,
             Some(steps) => steps.refined(start, wanted, &mut run.journal)?,
         };

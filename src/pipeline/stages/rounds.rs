@@ -1,9 +1,11 @@
-//! Stage `rounds`: ranks by removal error in pruning rounds, measured anew as the model shrinks.
+//! Stage `rounds`: ranks the Gaussians by removal error (squared error of renders caused by removing one) in pruning
+//! rounds, each of which measures the errors anew on a smaller model.
 //!
-//! One measurement on the full model cannot rank for strong reductions: when a Gaussian is removed, the ones behind it
-//! become visible, and others that it made redundant are needed. So each round measures the survivors, ranks them by
-//! [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors of a round do not depend on the
-//! final count, so a smaller target keeps a subset of a larger one. Memory: see [`removal_error`].
+//! For strong reductions, one measurement on the full model is not enough: when a Gaussian is removed, those behind it
+//! become visible, and others that it made redundant are needed. So each round measures the survivors (Gaussians not
+//! removed so far), ranks them by [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors
+//! of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a larger one.
+//! Memory: see [`removal_error`].
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -26,33 +28,34 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "rounds";
 
-/// Stage that ranks in pruning rounds.
+/// Stage that ranks Gaussians in pruning rounds.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Fraction of the Gaussians that survives a round.
+    /// Fraction of the Gaussians that a round leaves.
     pub fraction: f64,
-    /// Number of views by which Gaussians are ranked; does not grow with the number of frames.
+    /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
-    /// Number of groups (turns) into which the views are divided. A round renders one group; for the others it uses the
-    /// errors that were measured in earlier rounds.
+    /// Number of groups (turns) into which the views are divided. A round renders the views of one group; for the other
+    /// groups it uses errors measured in earlier rounds.
     pub turns: usize,
-    /// Minimum contrast assumed between a Gaussian and the content behind it.
+    /// Minimum contrast that is assumed between a Gaussian and what is behind it.
     pub contrast_floor: f64,
-    /// Assumed smallest fraction of the Gaussians after the last round, which bounds the number of rounds in estimates.
+    /// Smallest fraction of the Gaussians that the last round is assumed to leave; bounds the number of rounds in
+    /// estimates.
     pub fewest: f64,
-    /// Usual fraction of the Gaussians after the last round, for time estimates.
+    /// Fraction of the Gaussians that the last round usually leaves; used for estimates of time.
     pub usual: f64,
 }
 
-/// Value of [`Rounds::fewest`] if no size is requested.
+/// Smallest fraction left ([`Rounds::fewest`]) if no size is requested.
 const MIN_LEFT: f64 = 0.05;
-/// Value of [`Rounds::usual`] if no size is requested.
+/// Usual fraction left ([`Rounds::usual`]) if no size is requested.
 const USUAL_LEFT: f64 = 0.5;
 
-/// Adds the stage if Gaussians are ranked by views.
+/// Adds the stage to `stages` if Gaussians are ranked by views.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.part());
     if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {
@@ -89,7 +92,7 @@ impl Stage for Rounds {
 
 impl Rounds {
     /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians.
-    /// The stage needs visible contributions.
+    /// The stage needs the visible contributions of the Gaussians.
     pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
         let recipe::SelectParams {
             round_fraction: fraction,
@@ -102,7 +105,8 @@ impl Rounds {
         (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
-    /// Returns the estimate: the ranking, and renders of all survivors.
+    /// Returns the resource estimate of the stage. Its memory holds the ranking, and what rendering all survivors
+    /// needs.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.looking(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
@@ -115,29 +119,30 @@ impl Rounds {
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.render_seconds(pictures, left, REMOVE)
         });
-        // The first round renders all groups, each with its own frames.
+        // The first round renders the views of all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
         let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
-    /// Returns the number of rounds until at most the fraction `fewest` is left. It is at most 2207, because the
-    /// fraction of a recipe is at most [`MAX_ROUND_FRACTION`](recipe::MOST_LEFT_BY_ROUND) and there are at most
-    /// `u32::MAX` Gaussians.
+    /// Returns the number of rounds until at most the fraction `fewest` of the Gaussians is left. It is at most 2207,
+    /// because the fraction left by a round is at most [`MAX_ROUND_FRACTION`](recipe::MAX_ROUND_FRACTION) and there are
+    /// at most `u32::MAX` Gaussians.
     fn rounds(&self, fewest: f64) -> u32 {
         let fewest = fewest.max(1.0 / f64::from(u32::MAX));
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
-    /// Returns the rounds that leave `fewest` of `count` Gaussians, one line each for display.
+    /// Returns the rounds from `count` Gaussians down to `fewest`, for display: one line each with the number of views.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
         let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
+    /// Returns the views divided into groups (turns). Views of a frame stay together if there are enough frames,
+    /// otherwise views are divided one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
@@ -148,9 +153,9 @@ impl Rounds {
         turns
     }
 
-    /// Ranks all Gaussians that are not dropped in rounds, until a round leaves at most `fewest`. Gaussians removed in
-    /// one round, and the survivors of the last, are ordered by error; ties keep the order of `before`. Protected
-    /// Gaussians come first.
+    /// Ranks all Gaussians that are not dropped in rounds, until a round leaves at most `fewest`. The Gaussians removed
+    /// in one round, and the survivors of the last round, are ordered by removal error; ties keep the order of the
+    /// ranking `before`. Gaussians that must stay come first.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -176,7 +181,7 @@ impl Rounds {
         }
         let turns = self.turns(scene, scored);
         state.errors = vec![vec![0; scored.count()]; turns.len()];
-        // The key does not contain `fewest`: the survivors of a round do not depend on it.
+        // The key does not depend on `fewest`, because the survivors of a round do not.
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
@@ -198,8 +203,8 @@ impl Rounds {
         Ok(Ranking::new(protected.iter().copied().chain(free).chain(removed).collect()))
     }
 
-    /// Returns how many of `free` Gaussians each round leaves, until at most `fewest` are left including the
-    /// `protected` ones. Every round removes at least one.
+    /// Returns how many of `free` Gaussians (which may be removed) each round leaves, until these and the `protected`
+    /// Gaussians together are at most `fewest`. Every round removes at least one.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
@@ -210,7 +215,8 @@ impl Rounds {
         sizes
     }
 
-    /// Runs one round, which leaves `left` free Gaussians. The views can be divided among shards.
+    /// Runs round number `round`, which leaves `left` of the Gaussians that may be removed. Its views can be divided
+    /// among shards.
     fn round(
         &self,
         scene: &Scene,
@@ -225,8 +231,8 @@ impl Rounds {
         let active: Vec<usize> = active_turns(turns, round).collect();
         let (background, floor) = (scene.background, self.contrast_floor as f32);
         let units = active.iter().map(|&turn| turns[turn].len()).sum();
-        // Removal errors of each active group, summed over the views of that group that are in `some`; empty if there
-        // are none.
+        // Removal errors of each group of views that this round renders, summed over the views of that group whose unit
+        // numbers are in `some`; empty if there are none.
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
             let turn_errors = |&turn: &usize| {
@@ -257,7 +263,7 @@ impl Rounds {
             }
             let error =
                 |id: &u32| state.errors.iter().fold(0u64, |sum, errors| sum.saturating_add(errors[*id as usize]));
-            // The sort is stable: ties keep the earlier order.
+            // The sort is stable, so ties keep the earlier order.
             state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
             let mut worst = state.free.split_off(left);
             worst.append(&mut state.removed);
@@ -267,23 +273,24 @@ impl Rounds {
     }
 }
 
-/// State after a round.
+/// State of the ranking after a round.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Survivors that are not protected, best first.
+    /// Ids of the survivors that may be removed, best first.
     free: Vec<u32>,
-    /// Removed Gaussians, worst last.
+    /// Ids of the removed Gaussians, worst last.
     removed: Vec<u32>,
-    /// Removal error of every Gaussian by group of views, when the group was last rendered.
+    /// For each group of views: removal error of every Gaussian, by id, from the last round that rendered this group.
     errors: Vec<Vec<u64>>,
 }
 
-/// Returns the name of a round in the cache.
+/// Returns the name under which a round is cached.
 fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Returns the groups of views that a round renders: all in the first round, then one after the other.
+/// Returns the indices of the groups of views that a round renders: all groups in the first round, then one per round
+/// in turn.
 fn active_turns(turns: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
     let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
@@ -300,7 +307,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::render::render;
 
-    /// Returns the ranking by score and the ranking of the rounds.
+    /// Returns the ranking by score, and the ranking by rounds down to `fewest` Gaussians.
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);

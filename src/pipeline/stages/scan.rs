@@ -1,4 +1,4 @@
-//! Stage `scan`: one pass over every Gaussian at every frame, with one accumulator of fixed size per Gaussian.
+//! Stage `scan`: reads every Gaussian at every frame once and gathers its statistics in a state of fixed size.
 
 use crate::error::Result;
 use crate::journal::Journal;
@@ -12,25 +12,26 @@ use crate::statistics;
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::{ScanResult, scan_blocks, scan_units};
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 pub(crate) const NAME: &str = "scan";
 
-/// Time to add a state to an accumulator, seconds (`benches/scan.rs`).
+/// Processor time of adding one Gaussian at one frame to its statistics, seconds (`benches/scan.rs`).
 const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
-/// Time to project a state to a view, seconds (`benches/projection.rs`).
+/// Processor time of projecting one Gaussian at one frame to a view, seconds (`benches/projection.rs`).
 const SECONDS_TO_PROJECT: f64 = 8e-9;
 
-/// Stage that scans.
+/// Stage that gathers the statistics of all Gaussians.
 #[derive(Debug, Clone)]
 pub struct ScanStage {
-    /// Parameters of the scan.
+    /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
 }
 
 impl ScanStage {
-    /// Returns the estimate: one block of Gaussians per thread, and the joined rows of all.
+    /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
+    /// statistics rows (one per Gaussian) of all blocks.
     pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
-        // Within the stage a second reader may decode while the first is read.
+        // Frames held by readers count twice, because a second reader may decode while the first is read.
         let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
@@ -51,10 +52,10 @@ impl ScanStage {
         }
     }
 
-    /// Computes statistics of every Gaussian of `scene`.
+    /// Reads all frames of `scene` and returns the statistics of every Gaussian.
     ///
     /// # Errors
-    /// Fails if frames cannot be read or their times cannot be scanned.
+    /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         let source = scene.source();
         let info = source.info();

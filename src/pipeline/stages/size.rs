@@ -1,5 +1,6 @@
-//! Stages `size` of a run with a byte limit. The first finds how many Gaussians fit before anything is ranked. The
-//! second shrinks the result at the end if its values take more bytes than those by which the count was found.
+//! The two stages `size` of a run with a requested size on disk. The first finds how many Gaussians fit, before
+//! anything is ranked. The second removes Gaussians from the result at the end if its refined values take more bytes
+//! than the values with which the number was found.
 
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
@@ -19,31 +20,31 @@ use crate::pruning::score::Scored;
 use crate::recipe::Precision;
 use crate::scene::Scene;
 
-/// Name of the stages.
+/// Name of both stages in plans, progress and summaries.
 const NAME: &str = "size";
 /// Fraction of the byte limit that may remain unused.
 const MAX_UNUSED: f64 = 0.01;
-/// Maximum number of sizes that are written to measure their bytes.
+/// Maximum number of sizes (numbers of Gaussians) that are written to measure their bytes.
 const MAX_TRIED: usize = 8;
-/// Number of views used to rank removals if the result exceeds the byte limit.
+/// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
 const RANKING_VIEWS: usize = 48;
 
-/// Adds the stage that finds how many Gaussians fit.
+/// Adds the stage that finds how many Gaussians fit the byte limit to `stages`, if one is requested.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning) {
         stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_degree(), limit });
     }
 }
 
-/// Adds the stage that shrinks a result that does not fit. An archive needs no such stage: its quantization steps
-/// adapt.
+/// Adds the stage that shrinks a result above the byte limit to `stages`. An archive needs no such stage, because its
+/// quantization steps are adapted to the limit.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
     }
 }
 
-/// Stage that finds how many Gaussians fit.
+/// Stage that finds how many Gaussians fit the byte limit.
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
@@ -65,7 +66,7 @@ impl Stage for CountByBytes {
     }
 }
 
-/// Stage that shrinks a result that does not fit.
+/// Stage that removes Gaussians from a result above the byte limit.
 #[derive(Debug)]
 struct ShrinkToBytes {
     limit: ByteLimit,
@@ -83,14 +84,14 @@ impl Stage for ShrinkToBytes {
     }
 }
 
-/// Byte limit of all files that are written.
+/// Limit on the bytes of all output files together.
 #[derive(Debug, Clone)]
 struct ByteLimit {
-    /// Stage that writes the files.
+    /// Stage that writes the output files, by which sizes are measured.
     writer: WriteStage,
-    /// Maximum number of bytes.
+    /// Maximum number of bytes of all output files together.
     most: u64,
-    /// Assumed precision of the field: half precision if the field may be rounded.
+    /// Precision of the deformation field that is assumed: half precision if the recipe allows it.
     field: Precision,
 }
 
@@ -102,8 +103,9 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped,
-    /// for every lower one, until all Gaussians fit. See [`ByteLimit::count`].
+    /// Returns how many of the Gaussians `ids` fit the byte limit with the SH degree of `template` and, if `drops`,
+    /// with every lower degree, until all Gaussians fit. `recipe` is the size of the recipe file, bytes. See
+    /// [`ByteLimit::count`].
     ///
     /// # Errors
     /// Fails where [`ByteLimit::count`] fails.
@@ -129,16 +131,17 @@ impl ByteLimit {
         Ok(fits)
     }
 
-    /// Returns the cache key of everything that the bytes depend on, with a recipe of `recipe` bytes beside the result.
+    /// Returns the cache key of everything on which the size of an output with the model `compressed` depends. `recipe`
+    /// is the size of the recipe file beside the result, bytes.
     fn key(&self, scene: &Scene, recipe: u64, compressed: &CompressedModel) -> CacheKey {
         scene.work.key(&(self.writer.kind, self.writer.merges, self.most, recipe, compressed))
     }
 
-    /// Returns how many of the Gaussians `ids`, evenly sampled, fit the limit, with the merge parameters and the field
-    /// of `template`.
+    /// Returns how many of the Gaussians `ids`, evenly sampled, fit the byte limit. `template` holds the other settings
+    /// of the model, `recipe` is the size of the recipe file, bytes.
     ///
     /// # Errors
-    /// Fails if not even one fits, if frames cannot be read, or if a write fails.
+    /// Fails if not even one Gaussian fits, if frames cannot be read, or if a write fails.
     fn count(
         &self,
         scene: &Scene,
@@ -152,7 +155,7 @@ impl ByteLimit {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
                 let some = template.with(kept);
                 match self.writer.kind {
-                    // The files beside an archive are neither stored nor sent with it, so they do not count.
+                    // The files beside an archive are neither stored nor sent with it, so their bytes do not count.
                     OutputKind::Archive => archive::bytes(scene, &some),
                     _ => self.writer.bytes(scene, &some, recipe),
                 }
@@ -165,8 +168,8 @@ impl ByteLimit {
                      all of it is not Gaussians), found {most}"
                 )));
             }
-            // Numbers of Gaussians with their bytes: `fits` is the largest that fits, `over` the smallest that does
-            // not.
+            // Numbers of Gaussians with their bytes: `fits` is the largest number that fits, `over` the smallest that
+            // does not.
             let (mut fits, mut over) = ((one, least), None);
             let (mut next, mut overs) = (all, 0);
             for _ in 0..MAX_TRIED {
@@ -181,8 +184,7 @@ impl ByteLimit {
                     break;
                 }
                 let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
-                // Linear interpolation makes slow progress if the first few Gaussians take most bytes, as in an
-                // archive.
+                // Linear interpolation is slow if the first few Gaussians take most bytes, as in an archive.
                 let part = if overs > 1 { part.min(0.5) } else { part };
                 next = fits.0 + ((0.998 * part * (over.0 - fits.0) as f64) as usize).clamp(1, over.0 - fits.0 - 1);
             }
@@ -190,11 +192,12 @@ impl ByteLimit {
         })
     }
 
-    /// Removes the Gaussians of `compressed` with the lowest removal error until the result fits. This is needed
-    /// because refined values may compress worse than those by which the count was found. Protected Gaussians stay.
+    /// Removes the Gaussians with the lowest removal error (squared error of renders caused by removing one) from
+    /// `compressed` until the output fits the byte limit. Refined values may compress worse than those with which the
+    /// number of Gaussians was found. Gaussians that must stay are not removed.
     ///
     /// # Errors
-    /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails.
+    /// Fails if the Gaussians that must stay do not fit alone, if frames cannot be read, or if a write fails.
     fn shrink(
         &self,
         scene: &Scene,
@@ -231,7 +234,8 @@ impl ByteLimit {
         })
     }
 
-    /// Returns the indices of the `count` Gaussians that are protected or have the highest removal errors.
+    /// Returns the indices in `compressed` of `count` Gaussians: those that must stay, then those with the highest
+    /// removal errors.
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
@@ -242,10 +246,10 @@ impl ByteLimit {
     }
 }
 
-/// Returns how many of `count` Gaussians to try next if the fraction `part` of their bytes is expected to fit, after
-/// `tried` sizes. `protected` Gaussians, fewer than `count`, stay. The result is less than `count`, and after
-/// [`MAX_TRIED`] sizes at most half of it, so that the search ends after at most 32 more sizes even if bytes follow no
-/// line.
+/// Returns how many of `count` Gaussians to try next, after `tried` sizes, if the fraction `part` of their bytes is
+/// expected to fit. At least `protected` Gaussians, fewer than `count`, stay. The result is less than `count`. After
+/// [`MAX_TRIED`] sizes it is at most half of `count`, so that the search ends after at most 32 more sizes, however
+/// bytes depend on the number of Gaussians.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)

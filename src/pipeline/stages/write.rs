@@ -1,4 +1,5 @@
-//! Stage `emit`: writes the compressed model and, beside it, the recipe, the index map and the summary.
+//! Stage `emit`: writes the compressed model and, beside it, the recipe, the index map (output index of every input
+//! Gaussian) and the summary.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -30,24 +31,25 @@ use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "emit";
 
-/// Usual fraction of the Gaussians that is written, for time estimates.
+/// Fraction of the Gaussians that is usually written; used for estimates of time.
 const USUAL_LEFT: f64 = 0.5;
-/// Time to encode and write a state, seconds (`benches/pack.rs`).
+/// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
 pub const SECONDS_TO_ENCODE: f64 = 3.5e-7;
 
-/// Assumed maximum bytes of the summary and a file header beside a result; long lists of files or notes may exceed it.
+/// Assumed maximum number of bytes of the summary and a file header beside a result. Long lists of files or notes may
+/// exceed it.
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
-/// Name of the file beside every result with all parameters of its run.
+/// Name of the file, beside every result, that holds all parameters of its run.
 pub const RECIPE: &str = "recipe.toml";
-/// Name of the file beside every result with the output index of every input Gaussian.
+/// Name of the file, beside every result, that holds for every input Gaussian its index in the output.
 pub const INDEX_MAP: &str = "index_map.npy";
 
-/// Returns the path of a file beside the result: inside the result if that is a folder, otherwise next to the result
-/// file and named after it.
+/// Returns the path of the accompanying file `name` of a result: inside the result if it is a folder, otherwise next to
+/// the result file, with the name of the result as prefix.
 pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     if is_folder {
         return result.join(name);
@@ -58,25 +60,26 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     result.with_file_name(file)
 }
 
-/// Returns the paths of the files beside a result of `kind` at `output`.
+/// Returns the paths of the files (recipe, index map, summary) that accompany a result of kind `kind` at the path
+/// `output`.
 pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
     [RECIPE, INDEX_MAP, MARKER]
         .into_iter()
         .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
 }
 
-/// Stage that writes the result.
+/// Stage that writes the compressed model and the files beside it.
 #[derive(Debug, Clone)]
 pub struct WriteStage {
-    /// Kind of output.
+    /// Kind of output, such as archive or model folder.
     pub kind: OutputKind,
-    /// Whether the result may have proxies.
+    /// Whether the result may have proxies (Gaussians that replace merged clusters).
     pub merges: bool,
     output: PathBuf,
     overwrite: Replace,
 }
 
-/// Adds the stage.
+/// Adds the stage to `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     stages.add(Phase::Write, WriteStage::from_planning(planning));
 }
@@ -130,7 +133,7 @@ impl Stage for WriteStage {
         };
         let archived = run.archived.as_ref();
         let mut summary = self.write(run.scene, &run.result, (&map, archived), &run.recipe, journal, summarize)?;
-        // The file may be published, so it has only file names. The caller gets the paths as given by the user.
+        // The summary file may be published, so it has only file names. The caller gets the paths as given by the user.
         summary.input.path = run.scene.path.to_string_lossy().into_owned();
         summary.output = self.output.to_string_lossy().into_owned();
         run.written = Some((summary, map));
@@ -138,7 +141,7 @@ impl Stage for WriteStage {
     }
 }
 
-/// Replaces the indices in `map` by those in an archive, whose Gaussian `i` had the index `order[i]`.
+/// Replaces the output indices in `map` by indices in the archive, whose Gaussian `i` had the index `order[i]` before.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     let mut places = vec![0; order.len()];
     order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
@@ -146,13 +149,13 @@ fn reorder(map: &mut [Option<u32>], order: &[u32]) {
 }
 
 impl WriteStage {
-    /// Returns the stage for the output of a run.
+    /// Returns the stage that writes the output of the run that `planning` describes.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> WriteStage {
         let Planning { request, output, merges, .. } = *planning;
         WriteStage { kind: output, merges, output: request.output.clone(), overwrite: request.overwrite }
     }
 
-    /// Checks, before any work, that a run which reads `inputs` can write the result and the files beside it.
+    /// Checks, before any work, that a run which reads the files `inputs` can write the result and the files beside it.
     ///
     /// # Errors
     /// Fails if an output exists already or cannot be created; see [`check_target`].
@@ -163,12 +166,12 @@ impl WriteStage {
         check_targets(&self.output, &self.companions(), inputs, self.overwrite)
     }
 
-    /// Returns the paths of the files beside a result that is a file.
+    /// Returns the paths of the summary, the recipe and the index map, which lie next to the result if it is a file.
     fn companions(&self) -> [PathBuf; 3] {
         [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
     }
 
-    /// Returns the folder in which the recipe of the result will be.
+    /// Returns the folder in which the recipe file of the result is written.
     pub fn recipe_folder(&self) -> PathBuf {
         if self.kind.is_folder() {
             return self.output.clone();
@@ -176,7 +179,8 @@ impl WriteStage {
         self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
-    /// Returns the estimate: the result with the fraction `left` of the Gaussians, and write buffers.
+    /// Returns the resource estimate of the stage. Its memory holds the result, which has the fraction `left` of the
+    /// Gaussians, and write buffers.
     pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
         let is_solved = work.input.reduced > 0;
@@ -187,7 +191,7 @@ impl WriteStage {
         let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
-                // Frames of one block, and one state, of each member and of each proxy.
+                // States at the frames of one block, and one full state, of each member and of each proxy.
                 let mixed = Attributes::all().difference(Attributes::SH) | work.varying;
                 let waiting = work.held(&Limits::NONE, Attributes::all()) + FRAME_BLOCK as u64 * work.state(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
@@ -195,10 +199,10 @@ impl WriteStage {
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
             }
             OutputKind::Gseq => (),
-            // Template file and output rows, including proxies, for each thread; or one state and the data it is
-            // computed from.
+            // Template file and output rows (one per Gaussian or proxy) for each thread; or one state and the data it
+            // is computed from.
             _ => {
-                // The trajectories of proxies are computed from all members.
+                // The trajectories of proxies are computed from all members of their clusters.
                 let merging = if is_solved { left } else { 1.0 };
                 per_gaussian.push(("readers", bytes_of_survivors(merging, work.input.reader)));
                 per_gaussian.push(("held", bytes_of_survivors(merging, work.held(limits, Attributes::all()))));
@@ -208,11 +212,11 @@ impl WriteStage {
             }
         }
         if self.kind == OutputKind::Model {
-            // Tensors of the field as they are read and as they are stored.
+            // Tensors of the deformation field, once as read and once as stored.
             fixed.push(("field", work.input.fixed));
         }
-        // Formats whose proxies are solved read states only to write sequences. For others, proxies are read part by
-        // part.
+        // Formats that store proxies as parameters read states only to write sequences. For other formats, proxies are
+        // read part by part.
         let parts = match self.kind {
             OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),
             _ => 1,
@@ -227,8 +231,8 @@ impl WriteStage {
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Returns the bytes of all files for `compressed` with a recipe of `recipe` bytes. Writes the result to a scratch
-    /// folder and removes it again.
+    /// Returns the bytes of all output files of `compressed`, with a recipe file of `recipe` bytes. Writes the result
+    /// to a scratch folder and removes it again.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
@@ -240,8 +244,9 @@ impl WriteStage {
         Ok(written + beside)
     }
 
-    /// Writes the result and the files beside it under temporary names and renames them at the end: a folder in one
-    /// step, a file after the files beside it. `summarize` receives the size of the result.
+    /// Writes the result and the files beside it under temporary names, and renames them at the end: a folder in one
+    /// step, a result file after the files beside it. `summarize` makes the summary from the journal and the size of
+    /// the result.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails; no output is left behind then.
@@ -257,7 +262,7 @@ impl WriteStage {
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, compressed.len(), scene.source(), |journal| {
                 let count = compressed.len() as u64;
-                // Outputs of frames report their own progress.
+                // Outputs that hold frames report their own progress.
                 let has_frames = self.kind.holds_frames() || matches!(archive, Some(Archived::Frames(_)));
                 let progress = match has_frames {
                     true => Progress::IGNORED,
@@ -311,7 +316,8 @@ impl WriteStage {
     }
 }
 
-/// Writes `compressed` as a result of `kind`, without files beside it. Returns its bytes.
+/// Writes `compressed` to `path` as an output of kind `kind`, without the files beside it. Returns the bytes of the
+/// output.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -330,7 +336,7 @@ pub fn write_alone(
     Ok(input.size_written(kind, path)?.whole())
 }
 
-/// Writes a container within `bounds`.
+/// Writes the frames of `source` as a container to `path`, with values that err by at most `bounds`.
 fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);

@@ -1,4 +1,4 @@
-//! Blocks of Gaussians of one scan: the data that they share, and the scan of a single block.
+//! Scan of single blocks of Gaussians, and the data that the scans of all blocks share.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -10,17 +10,17 @@ use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::statistics::{BlockScan, ScanPlan, wanted};
 
-/// Data that the scans of all blocks share.
+/// Data that the scans of all blocks of Gaussians share.
 pub(crate) struct BlockScans<'a> {
     pub(crate) source: &'a dyn FrameSource,
-    /// Cameras of each frame.
+    /// Cameras that see each frame.
     pub(crate) schedule: &'a ViewSchedule,
     pub(crate) plan: &'a ScanPlan,
-    /// Blocks to scan.
+    /// Numbers of the blocks of Gaussians to scan.
     pub(crate) blocks: Range<usize>,
     pub(crate) progress: Progress,
-    /// Number of Gaussians alive in each frame. The order in which blocks finish does not matter, as the sums are
-    /// integers.
+    /// Number of Gaussians alive in each frame, summed over finished blocks. The sums are integers, so the order in
+    /// which blocks finish does not matter.
     pub(crate) alive: Mutex<Vec<u32>>,
 }
 
@@ -33,25 +33,25 @@ impl<'a> BlockScans<'a> {
         self.source.info().times.len()
     }
 
-    /// Returns the Gaussians of block number `block`, counted from the first block to scan.
+    /// Returns the ids of the Gaussians of block `block`, counted from the first block to scan.
     pub(crate) fn range(&self, block: usize) -> Range<usize> {
         let block = self.blocks.start + block;
         block * BLOCK..self.source.info().count.min((block + 1) * BLOCK)
     }
 
-    /// Returns the columns that may have changed since the previous frame.
+    /// Returns the attributes that may have changed from the previous frame to frame `frame`.
     pub(crate) fn changed(&self, frame: usize) -> Attributes {
         wanted(frame, self.source.info().varying)
     }
 
-    /// Returns an empty scan of a block, with a buffer for its state at one frame.
+    /// Returns a scan of block `block` without frames, and a buffer for the block's attributes at one frame.
     pub(crate) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
         let range = self.range(block);
         let state = Gaussians::zeros(range.len(), self.source.info().sh_degree);
         (BlockScan::new(range.len(), range.start, self.plan), state)
     }
 
-    /// Adds the next frames of a block.
+    /// Reads the frames `frames` of a block with `reader` and adds them to the block's scan.
     ///
     /// # Errors
     /// Frames that cannot be read.
@@ -74,7 +74,7 @@ impl<'a> BlockScans<'a> {
         Ok(())
     }
 
-    /// Returns the rows of a block whose frames have all been added, and its largest coordinate.
+    /// Returns the rows of a block whose frames have all been added, and the largest |coordinate| of its positions.
     pub(crate) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (Rows, f32) {
         let found = scan.finish();
         let mut alive = self.alive.lock().unwrap_or_else(PoisonError::into_inner);
@@ -84,7 +84,7 @@ impl<'a> BlockScans<'a> {
         (found.rows, found.largest_coordinate)
     }
 
-    /// Scans all frames of one block and returns its rows and its largest coordinate.
+    /// Scans all frames of block `block`. Returns its rows and the largest |coordinate| of its positions.
     ///
     /// # Errors
     /// Frames that cannot be read.

@@ -1,15 +1,15 @@
-//! Scan of a source on a slow disk as a pipeline: one thread fetches bytes, some decode tiles, and as many accumulate
-//! frames. Disk, decoder and arithmetic overlap.
+//! Scan of a source on a slow disk as a pipeline: one thread fetches bytes from the disk, several threads decode tiles,
+//! and as many accumulate statistics. Disk, decoding and arithmetic overlap.
 //!
-//! The unit of work is a block of Gaussians over a frame block. The number of lanes is the number of threads of the
-//! pool (at most one per block). A lane is a decoder and an accumulator with a bounded channel between them. A block of
-//! Gaussians stays in its lane, so its frames arrive in order and no result depends on the number of threads. As many
-//! blocks as there are lanes advance together, frame block by frame block, because their tiles are adjacent in a
-//! container. The stages run on threads of their own because they wait for one another, which tasks of a thread pool
-//! must not do.
+//! The unit of work is a block of Gaussians over a frame block (the frames of one tile). A lane is a thread that
+//! decodes and a thread that accumulates, with a bounded channel between them. There are as many lanes as the thread
+//! pool has threads, but at most one per block of Gaussians. A block of Gaussians stays in its lane, so its frames
+//! arrive in order, and no result depends on the number of threads. As many blocks as there are lanes advance together,
+//! frame block by frame block, because their tiles are adjacent in a container. The pipeline has threads of its own
+//! because they wait for one another, which tasks of a thread pool must not do.
 //!
-//! Memory: two readers per lane, each with the frames it keeps of a frame block: one that decodes and one that is read.
-//! Fetched bytes stay in the file cache of the system.
+//! Memory: two readers per lane, one that decodes and one that is read, each with the frames that it keeps of a frame
+//! block. Fetched bytes stay in the file cache of the system.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -22,26 +22,26 @@ use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
-/// Maximum number of fetched units that wait for the decoder of a lane.
+/// Maximum number of units in a lane whose bytes have been fetched and that wait to be decoded.
 const FETCHED: usize = 4;
 
-/// Unit of work: a block of Gaussians over a frame block.
+/// Unit of work: a block of Gaussians at the frames of one frame block.
 struct Unit {
     block: usize,
     frames: Range<usize>,
 }
 
-/// Number of a block, and a reader for its Gaussians.
+/// Number of a block of Gaussians, and a reader of this block.
 type BlockReaderOf<'a> = (usize, Box<dyn BlockReader + 'a>);
 
-/// Results of the blocks.
+/// Results of the blocks of Gaussians that have been scanned, or an error.
 struct StagedResult {
     blocks: Vec<Option<(Rows, f32)>>,
-    /// Error of the lowest-numbered block that failed, with that number.
+    /// Number and error of the lowest-numbered block whose scan failed.
     error: Option<(usize, Error)>,
 }
 
-/// Scans all blocks of `scan` and returns their rows and largest coordinates, in order.
+/// Scans all blocks of `scan`. Returns for each, in order, its rows and the largest |coordinate| of its positions.
 ///
 /// # Errors
 /// Frames that cannot be read: the error of the lowest-numbered block that failed.
@@ -53,8 +53,8 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
         let mut to_lanes = Vec::with_capacity(lanes);
         for _ in 0..lanes {
             let (to_lane, fetched) = bounded(FETCHED);
-            // A channel without capacity: the decoder waits until the accumulator takes the reader, so there are at
-            // most two readers.
+            // A channel without capacity: the decoding thread waits until the other thread takes the reader, so a lane
+            // has at most two readers.
             let (decoded, ready) = bounded(0);
             let (done, free) = bounded(2);
             let found = &found;
@@ -71,7 +71,8 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
     }
 }
 
-/// Fetches the bytes of every unit and sends the unit to its lane; stops when a lane has ended.
+/// Fetches the bytes of every unit of work into the system's file cache and sends the unit to its lane. Stops when a
+/// lane has ended.
 fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>>) {
     let frame_block = ahead.frame_block().max(1);
     for first in (0..scan.blocks()).step_by(to_lanes.len().max(1)) {
@@ -87,7 +88,8 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
     }
 }
 
-/// Decodes the units of a lane. Reuses a reader that the accumulator returned if it is of the same block.
+/// Decodes the units that a lane receives. Uses a reader again that the accumulating thread returned, if it reads the
+/// same block of Gaussians.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,
@@ -108,7 +110,7 @@ fn decode<'a>(
     }
 }
 
-/// Accumulates the frames of the units of a lane, and returns the readers to the decoder.
+/// Adds the frames of the units that a lane receives to the statistics, and returns the readers to the decoding thread.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,
@@ -120,8 +122,8 @@ fn accumulate<'a>(
         let added = prepared.and_then(|(block, mut reader)| {
             let running = running.get_or_insert_with(|| scan.begin(block));
             scan.add(running, unit.frames.clone(), &mut *reader)?;
-            // The channel has room, as there are at most two readers. If the decoder has ended, the reader is not
-            // needed.
+            // The channel has space, as there are at most two readers. If the decoding thread has ended, nobody needs
+            // the reader.
             _ = done.send((block, reader));
             Ok(())
         });
@@ -150,11 +152,11 @@ mod tests {
     use crate::statistics::pass::ScanResult;
     use crate::statistics::pass::scan;
 
-    /// Gaussians, frames and columns of one call of `fetch`.
+    /// Gaussians, frames and attributes of one call of `fetch`.
     type Fetched = (Range<usize>, Range<usize>, Attributes);
 
-    /// Scene that asks to be fetched in blocks of `frame_block` frames, and whose frames from `fails_from` on cannot be
-    /// read.
+    /// Scene whose bytes are to be fetched in blocks of `frame_block` frames, and whose frames from `fails_from` on
+    /// cannot be read.
     struct SlowScene {
         scene: Scene,
         frame_block: Option<usize>,

@@ -1,8 +1,8 @@
 //! Robust normalization and scores (method.md, sections 2 and 3).
 //!
-//! Input: rows of statistics. Output: the score S, its static and dynamic parts, and both parts normalized. Memory: six
-//! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact 4D Gaussian
-//! Splatting Models", section 3.2.
+//! Input: rows of statistics. Output: the score S of every Gaussian, its static and its dynamic part, and both parts
+//! normalized. Memory: at most six f64 per Gaussian, and one histogram at a time. Source: "Temporally-Aware Pruning for
+//! Compact 4D Gaussian Splatting Models", section 3.2.
 
 mod norm;
 pub mod sketch;
@@ -18,45 +18,48 @@ use crate::recipe::{self, StaticTerm};
 /// Scores of N Gaussians; every array has N entries, all finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scores {
-    /// S_static = norm(C) + λ·norm(E). The recipe may replace C by W or √(C·W).
+    /// Static score S_static = norm(C) + λ·norm(E), from contribution C and anisotropy E. The recipe may replace C by
+    /// the largest weight W or by √(C·W).
     pub static_score: Vec<f64>,
-    /// S_dynamic = norm(D) + μ·norm(κ) + η·norm(V) + ξ·norm(Life).
+    /// Dynamic score S_dynamic = norm(D) + μ·norm(κ) + η·norm(V) + ξ·norm(Life), from trajectory magnitude D, curvature
+    /// κ, opacity variance V, and the fraction of frames in which the Gaussian is alive.
     pub dynamic_score: Vec<f64>,
-    /// S = w_s·S_static + w_d·S_dynamic.
+    /// Score S = w_s·S_static + w_d·S_dynamic, by which Gaussians are ranked.
     pub score: Vec<f64>,
-    /// norm(S_static), for stage 2.
+    /// Normalized static score norm(S_static), which stage 2 of the selection (the OR rule) compares with a threshold.
     pub static_norm: Vec<f64>,
-    /// norm(S_dynamic), for stage 2.
+    /// Normalized dynamic score norm(S_dynamic), which stage 2 of the selection (the OR rule) compares with a
+    /// threshold.
     pub dynamic_norm: Vec<f64>,
-    /// Normalization of every term: first the terms of S_static, then those of S_dynamic, then S_static and S_dynamic
-    /// themselves. Terms of weight 0 are not computed and are missing.
+    /// Normalization of every term of the scores: first the terms of S_static, then those of S_dynamic, then S_static
+    /// and S_dynamic themselves. Terms of weight 0 are not computed and are missing.
     pub terms: Vec<Term>,
 }
 
 impl Scores {
-    /// Bytes of the scores of one Gaussian.
+    /// Bytes of memory that the scores of one Gaussian take.
     pub const BYTES_PER_GAUSSIAN: usize = 5 * size_of::<f64>();
 }
 
-/// Term of a score, with its normalization.
+/// Term of a score: a quantity and how it is normalized.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
-    /// Quantity that is normalized.
+    /// Quantity that the term normalizes.
     pub of: Quantity,
-    /// Normalization of the quantity.
+    /// Normalization of the quantity, from its percentiles over all Gaussians.
     pub norm: Norm,
 }
 
-/// Quantity that grades Gaussians: a statistic, or a combination of several.
+/// Quantity by which Gaussians are scored: a statistic, or a combination of several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Quantity {
     /// A single statistic.
     By(Statistic),
-    /// √(C·W).
+    /// √(C·W): geometric mean of the contribution C and the largest weight W in any pixel.
     Geometric,
-    /// S_static.
+    /// Static score S_static.
     Static,
-    /// S_dynamic.
+    /// Dynamic score S_dynamic.
     Dynamic,
 }
 
@@ -81,7 +84,7 @@ impl Quantity {
         }
     }
 
-    /// Returns the property of a Gaussian that the quantity measures, in words.
+    /// Returns in words which property of a Gaussian the quantity measures.
     pub fn property(self) -> &'static str {
         match self {
             Quantity::By(statistic) => statistic.property(),
@@ -94,13 +97,13 @@ impl Quantity {
 
 /// Computes the scores of `rows`, which come from a sequence of `frames` frames.
 ///
-/// Rows with [`Flags::NON_FINITE`] are excluded from the percentiles and have score 0 throughout. `rows.e` is used only
-/// if λ > 0. An empty list of rows gives empty scores.
+/// Rows with [`Flags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy `rows.e`
+/// is used only if its weight λ is above 0. An empty list of rows gives empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
 
-/// Computes the scores as [`score`] does, with percentiles found in the given number of passes.
+/// Computes the scores as [`score`] does, with percentiles that are found in one pass or two as `passes` states.
 pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     use Quantity::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
@@ -134,7 +137,7 @@ pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, r
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// Sum of normalized terms in the making.
+/// Sum of normalized terms that is being computed.
 struct Summation<'a> {
     is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,
@@ -143,8 +146,8 @@ struct Summation<'a> {
 }
 
 impl Summation<'_> {
-    /// Adds weight · norm(value) to `total` in all rows that are finite, and records the term. Does nothing if the
-    /// weight is 0.
+    /// Adds `weight` · norm(`value`) to `total` in all rows that are finite, and records the term under the quantity
+    /// `of`. Does nothing if the weight is 0.
     fn add(&mut self, total: &mut [f64], of: Quantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;

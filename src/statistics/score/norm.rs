@@ -1,36 +1,38 @@
-//! Robust min-max normalization between the 1st and the 99th percentile.
+//! Robust normalization of a statistic: the range between its 1st and its 99th percentile is mapped to 0 to 1.
 
 use serde::{Deserialize, Serialize};
 
 use super::FloatSketch;
 use crate::recipe;
 
-/// Normalization norm(X) = (X − P1) / (P99 − P1 + ε), clipped to [0, 1] if the recipe asks for it.
+/// Normalization norm(X) = (X − P1) / (P99 − P1 + ε) of a quantity X with the 1st percentile P1 and the 99th percentile
+/// P99; clipped to [0, 1] if the recipe asks for it.
 ///
 /// If P99 ≤ P1 (at most 1% of the values differ from the rest), there is no scale to normalize by. norm is then 1 above
 /// P99 and 0 elsewhere, and the term is *inactive*. This rule also applies if ε > 0: dividing by ε = 1e-8 would let the
 /// few different values outweigh every other term by a factor of a million.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Norm {
-    /// 1st percentile, nearest rank; 0 if there are no values.
+    /// 1st percentile by nearest rank (always one of the values); 0 if there are no values.
     pub p1: f64,
-    /// 99th percentile, nearest rank; 0 if there are no values.
+    /// 99th percentile by nearest rank (always one of the values); 0 if there are no values.
     pub p99: f64,
     epsilon: f64,
     clip: bool,
 }
 
-/// Number of passes over the values that find a percentile.
+/// Number of passes over the values in which a percentile is found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PercentilePasses {
-    /// Two passes: exact.
+    /// Two passes, which find the exact value.
     Two,
-    /// One pass with this number of mantissa bits: the percentile is the middle of the histogram bucket that holds it.
+    /// One pass, with a histogram whose keys have this number of mantissa bits. The result is the middle of the
+    /// histogram bucket that contains the percentile.
     One(u32),
 }
 
 impl Norm {
-    /// Computes the normalization of a set of values. NaN and infinities are ignored.
+    /// Computes the normalization of the values that `values` iterates over. NaN and infinities are ignored.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,
@@ -50,12 +52,12 @@ impl Norm {
         Norm { p1, p99, epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
     }
 
-    /// Returns whether the percentiles differ, so that the term grades values on a scale.
+    /// Returns whether the 1st and the 99th percentile differ, so that the normalized term grades Gaussians on a scale.
     pub fn is_active(&self) -> bool {
         self.p99 > self.p1
     }
 
-    /// Returns norm(x).
+    /// Returns the normalized value norm(x).
     pub fn apply(&self, x: f64) -> f64 {
         if !self.is_active() {
             return f64::from(u8::from(x > self.p99));

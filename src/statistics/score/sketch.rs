@@ -1,36 +1,36 @@
-//! Exact percentiles in two passes: a histogram of order-preserving float bits finds the bucket that holds the
-//! percentile, and a second pass over the values in that bucket finds the value.
+//! Exact percentiles in two passes over the values. The first pass counts values in a histogram and so finds the bucket
+//! that contains the percentile. The second pass finds the percentile among the values of this bucket.
 //!
-//! A value is rounded to f32 and keyed by its sign, exponent and upper mantissa bits, so that keys order as values do.
-//! With 7 mantissa bits, values in one bucket are within 0.8% of each other, and the counts take 256 KiB. The second
-//! pass copies the values of one bucket. Counts are integers, so the result does not depend on the order of the values.
-//! Rank-error sketches (KLL, t-digest) are random or depend on the order, and were off by 3–47% in value at P99 of a
-//! heavy tail.
+//! The histogram's key of a value consists of the sign, the exponent and the upper mantissa bits of the value as f32,
+//! rearranged so that keys order as values do. With 7 mantissa bits, the values of one bucket are within 0.8% of each
+//! other, and the counts take 256 KiB. The second pass copies the values of one bucket. Counts are integers, so the
+//! result does not depend on the order of the values. Rank-error sketches (KLL, t-digest) are random or depend on the
+//! order, and were off by 3–47% in value at P99 of a heavy tail.
 
-/// Default number of mantissa bits of a key.
+/// Number of mantissa bits of a histogram key, unless another is requested.
 const MANTISSA_BITS: u32 = 7;
-/// Maximum number of mantissa bits of a key; the counts then take 16 MiB.
+/// Maximum number of mantissa bits of a histogram key; the counts then take 16 MiB.
 pub const MOST_BITS: u32 = 13;
-/// Number of mantissa bits of an f32.
+/// Number of mantissa bits that an f32 stores.
 const ALL_BITS: u32 = 23;
 
-/// Histogram of the finite values among up to 2³² − 1 values.
+/// Histogram of the finite values among at most 2³² − 1 values.
 pub struct FloatSketch {
-    /// Number of low f32 mantissa bits that a key omits.
+    /// Number of low f32 mantissa bits that a histogram key omits.
     dropped: u32,
     counts: Vec<u32>,
     finite: u64,
 }
 
 impl FloatSketch {
-    /// Counts `values` with the default number of mantissa bits. NaN and infinities are ignored. −0 counts as 0, and a
-    /// finite value beyond the range of f32 as the largest f32 of its sign.
+    /// Counts `values` in a histogram with the default number of mantissa bits. NaN and infinities are ignored. −0
+    /// counts as 0, and a finite value beyond the range of f32 as the largest f32 of its sign.
     pub fn from_values(values: impl IntoIterator<Item = f64>) -> Self {
         Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
-    /// Counts `values` with keys of `bits` mantissa bits, at most [`MOST_BITS`]. There are 2^(9 + bits) counts of 4
-    /// bytes.
+    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MOST_BITS`]. The histogram has
+    /// 2^(9 + bits) counts of 4 bytes.
     pub fn with_mantissa_bits(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
         let dropped = ALL_BITS - bits.min(MOST_BITS);
         let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
@@ -41,28 +41,29 @@ impl FloatSketch {
         sketch
     }
 
-    /// Returns the middle of the bucket that holds the `p`-th percentile, without a second pass; `None` if there are no
-    /// finite values.
+    /// Returns the middle of the histogram bucket that contains the `p`-th percentile (`p` from 0 to 100), without a
+    /// second pass; `None` if there are no finite values.
     pub fn rough_percentile(&self, p: f64) -> Option<f64> {
         let (bucket, _) = self.locate(p)?;
         let [low, high] = [bucket << self.dropped, (bucket << self.dropped) | ((1 << self.dropped) - 1)].map(value_of);
         Some(0.5 * (low + high))
     }
 
-    /// Returns the `p`-th percentile (0 to 100) by nearest rank, ⌈p·n/100⌉ but at least 1, over the n finite values;
-    /// `None` if n = 0. `values` are the values of the sketch again. The values in one bucket are copied; these may be
-    /// all values.
+    /// Returns the `p`-th percentile (`p` from 0 to 100) by nearest rank: the value of rank ⌈p·n/100⌉, at least 1,
+    /// among the n finite values; `None` if n = 0. `values` must be the values that were counted. Those of one bucket
+    /// are copied; these may be all values.
     pub fn percentile(&self, p: f64, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let (bucket, rank) = self.locate(p)?;
         let mut inside: Vec<f64> =
             values.into_iter().filter(|x| x.is_finite() && key(*x, self.dropped) == bucket).map(|x| x + 0.0).collect();
-        // A rank beyond the bucket shows that `values` differ from the values that were counted.
+        // A rank beyond the bucket shows that `values` are not the values that were counted.
         (rank < inside.len()).then(|| *inside.select_nth_unstable_by(rank, f64::total_cmp).1)
     }
 
-    /// Returns the key of the bucket that holds the `p`-th percentile, and the rank inside that bucket, counted from 0.
+    /// Returns the key of the bucket that contains the `p`-th percentile, and the percentile's rank within the bucket,
+    /// counted from 0.
     fn locate(&self, p: f64) -> Option<(u32, usize)> {
-        // Multiplying before dividing is exact for whole p, so P1 of 100 values is the first one.
+        // Multiplying before dividing is exact for whole p, so the 1st percentile of 100 values is the smallest.
         let mut rank = ((p * self.finite as f64 / 100.0).ceil() as u64).max(1) - 1;
         for (key, &count) in self.counts.iter().enumerate() {
             if rank < u64::from(count) {
@@ -74,16 +75,17 @@ impl FloatSketch {
     }
 }
 
-/// Returns the f32 bits of `value` without the lowest `dropped` bits, mapped so that keys order as values do.
+/// Returns the histogram key of `value`: its f32 bits without the lowest `dropped` bits, mapped so that keys order as
+/// values do.
 fn key(value: f64, dropped: u32) -> u32 {
     let bits = (value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32 + 0.0).to_bits();
-    // The bits of negative floats order backwards, so all bits are flipped; positive floats must come after them, so
-    // their sign bit is set.
+    // The bits of negative floats order backward, so all of them are inverted. Positive floats must come after negative
+    // ones, so their sign bit is set.
     let ordered = if bits >> 31 == 1 { !bits } else { bits | 1 << 31 };
     ordered >> dropped
 }
 
-/// Returns the value whose bits were mapped to `ordered`.
+/// Returns the value whose bits were mapped to `ordered` by the order-preserving map.
 fn value_of(ordered: u32) -> f64 {
     let bits = if ordered >> 31 == 1 { ordered ^ (1 << 31) } else { !ordered };
     f64::from(f32::from_bits(bits))
@@ -94,7 +96,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Returns the percentile by nearest rank on the sorted values.
+    /// Returns the `p`-th percentile by nearest rank of `values`, which must be sorted.
     fn sorted_percentile(values: &[f64], p: u32) -> Option<f64> {
         let mut finite: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
         finite.sort_by(|a, b| a.partial_cmp(b).unwrap());
@@ -140,8 +142,8 @@ mod tests {
             let exact = sorted_percentile(&values, p).unwrap();
             let sketch = FloatSketch::with_mantissa_bits(bits, values.iter().copied());
             let rough = sketch.rough_percentile(f64::from(p)).unwrap();
-            // Half of a bucket [m, m + 1)·2^(e − bits) is at most 2^−bits / 2 of its least value, except for
-            // subnormals.
+            // A bucket is an interval [m, m + 1)·2^(e − bits), where m has `bits` bits after the leading one. Half its
+            // width is at most 2^−bits / 2 of its smallest value, except for subnormals.
             prop_assert!((rough - exact).abs() <= 0.51 * exact.abs().max(1e-37) * 0.5f64.powi(bits as i32));
         }
     }

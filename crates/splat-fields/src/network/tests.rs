@@ -4,12 +4,12 @@ use crate::synthetic::deep::{DeepVariant, KINDS, tensors};
 
 const FILE: &str = "deform.pth";
 
-/// Builds a network with random weights.
+/// Builds a network with random weights of the architecture `kind`.
 fn network(kind: DeepVariant) -> Network {
     Network::new(&tensors(kind), "network.", Path::new(FILE)).unwrap()
 }
 
-/// Returns random positions.
+/// Returns random positions of `rows` Gaussians, from −1.5 to 1.5.
 fn positions(rows: usize) -> AttributeValues {
     let mut noise = Noise(11);
     let mut values = AttributeValues::zeros(3, rows);
@@ -17,11 +17,11 @@ fn positions(rows: usize) -> AttributeValues {
     values
 }
 
-/// Reference evaluation of the network in f64, layer by layer as defined. Holds the state dict.
+/// Slow reference evaluation (oracle) of the network in f64, layer by layer as defined. Holds the state dict.
 struct NetworkOracle(Tensors);
 
 impl NetworkOracle {
-    /// Returns W·x + b of the layer `name`.
+    /// Returns the output W·x + b of the fully connected layer `name` for the input `x`.
     fn linear(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let [weight, bias] = ["weight", "bias"].map(|part| &self.0[&format!("network.{name}.{part}")]);
         let row = |(row, &bias): (&[f32], &f32)| -> f64 {
@@ -31,7 +31,7 @@ impl NetworkOracle {
         weight.data.chunks(x.len()).zip(&bias.data).map(row).collect()
     }
 
-    /// Returns the encoding of `v`.
+    /// Returns the encoding of the vector `v`: `v`, then the sine and cosine of 2ᵏ·`v` for each octave k.
     fn encoding(v: &[f64], octaves: i32) -> Vec<f64> {
         let waves = (0..octaves).flat_map(|k| {
             let wave = move |f: fn(f64) -> f64| v.iter().map(move |x| f(2f64.powi(k) * x));
@@ -40,7 +40,7 @@ impl NetworkOracle {
         v.iter().copied().chain(waves).collect()
     }
 
-    /// Returns the outputs of the heads, one after the other.
+    /// Returns the outputs of all heads (output layers) for one Gaussian, one head after the other.
     fn motion(&self, kind: DeepVariant, position: [f64; 3], time: f64) -> Vec<f64> {
         let relu = |x: Vec<f64>| x.into_iter().map(|x| x.max(0.0)).collect::<Vec<f64>>();
         let encoded_time = match kind.time_network {
@@ -62,7 +62,7 @@ impl NetworkOracle {
     }
 }
 
-/// Returns all outputs for Gaussian `i`.
+/// Returns all outputs of the network for Gaussian `i`.
 fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
     let PredictedMotion { warp, rotation, scaling, opacity, color } = motion;
     let columns = [warp, rotation, scaling, opacity, color];
@@ -86,7 +86,7 @@ fn every_variant_matches_the_f64_oracle() {
                 let found = row(&motion, i);
                 assert_eq!(found.len(), expected.len());
                 for (o, (got, expected)) in found.iter().zip(&expected).enumerate() {
-                    // Some hundred f32 roundings of numbers of this size.
+                    // The limit allows for some hundred f32 roundings of numbers of this size.
                     let off = (got - expected).abs();
                     assert!(
                         off < 4e-6,
@@ -107,7 +107,7 @@ fn encoded_values_are_correctly_rounded() {
         for (octave, pair) in encode_scalar(value, POSITION_OCTAVES)[1..].chunks(2).enumerate() {
             let (sine, cosine) = (f64::from(value) * 2f64.powi(octave as i32)).sin_cos();
             for (got, expected) in pair.iter().zip([sine, cosine]) {
-                // Half a unit in the last place of f32, and the error of the double-angle formulas.
+                // Subtracts half a unit in the last place of f32; the rest is the error of the double-angle formulas.
                 let unit = f64::from(f32::EPSILON) * expected.abs().log2().floor().exp2() / 2.0;
                 off = off.max(((f64::from(*got) - expected).abs() - unit) / 1e-13);
             }
@@ -130,7 +130,8 @@ fn slopes_match_finite_differences() {
                     moved[axis] += by;
                     oracle.motion(*kind, moved, 0.25)
                 };
-                // The step is small beside the shortest wavelength, 1/512. ReLUs that switch within the step are rare.
+                // The step of the finite difference is small beside the shortest wavelength, 1/512. ReLUs that switch
+                // within the step are rare.
                 let (above, below) = (at(1e-7), at(-1e-7));
                 for o in 0..outputs {
                     let (got, expected) = (f64::from(slopes.plane(3 * o + axis)[i]), (above[o] - below[o]) / 2e-7);

@@ -1,34 +1,35 @@
-//! Deep MLPs of position and time with random weights.
+//! Deep MLPs of position and time with random weights, for tests.
 
 use super::Noise;
 use crate::{Tensor, Tensors};
 
-/// Width of the hidden layers. Not a multiple of the number of outputs that are summed together.
+/// Number of outputs of the hidden layers. Deliberately not a multiple of the number of outputs that a layer sums
+/// together.
 const WIDTH: usize = 22;
 
-/// Number of values in the encoding of a position: itself, and 10 octaves of sine and cosine.
+/// Number of values in the encoding of a position: its 3 components, and their sines and cosines in 10 octaves.
 const POSITION_INPUTS: usize = 3 + 2 * 3 * 10;
 
-/// Variant of the architecture.
+/// Variant of the architecture of the network.
 #[derive(Clone, Copy, Debug)]
 pub struct DeepVariant {
     /// Whether a separate network encodes the time.
     pub time_network: bool,
     /// Whether positions move by screw motions (rotation and translation) instead of offsets.
     pub screws: bool,
-    /// Whether opacity and color also have heads.
+    /// Whether the network also has output layers (heads) for opacity and color.
     pub all_heads: bool,
 }
 
-/// Variants in which each option is once on and once off.
+/// Variants to test: each option is on in one and off in another.
 pub const KINDS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },
     DeepVariant { time_network: true, screws: false, all_heads: true },
 ];
 
-/// Returns tensors `network.*` of five layers, of which the fourth has a skip connection. Outputs are of the order of
-/// 1.
+/// Returns the tensors `network.*` of a network with five layers, of which the fourth has a skip connection. Its
+/// outputs are of the order of 1.
 pub fn tensors(kind: DeepVariant) -> Tensors {
     let mut noise = Noise(5);
     let mut tensors = Tensors::new();

@@ -1,18 +1,21 @@
-//! Truncation of a mapped input file by another program: an error that names the file instead of SIGBUS.
+//! Handling of an input file that is mapped to memory while another program truncates it: the process ends with an
+//! error message that names the file, and is not killed by the signal SIGBUS.
 //!
-//! Readers check lengths before they access a map, but the file may shrink in between. The kernel then sends SIGBUS to
-//! the thread that touches the missing page. Reading cannot continue, so the handler reports the file and ends the
-//! process with code 1. It removes no files: the next run removes outputs that were begun under a temporary name.
+//! Readers check the length of a file before they access its memory map, but the file may shrink in between. The kernel
+//! then sends SIGBUS to the thread that touches the missing page. Reading cannot continue, so the handler reports the
+//! file and ends the process with code 1. It removes no files; the next run removes unfinished outputs, which have
+//! temporary names.
 
 use std::sync::OnceLock;
 
 use crate::TruncatedMapMessage;
 
-/// Text of the handler. It is set before the handler is installed.
+/// Message that the signal handler writes. It is set before the handler is installed.
 static MESSAGE: OnceLock<TruncatedMapMessage> = OnceLock::new();
 
-/// Installs a handler for access to a mapped file that has been truncated. The handler writes `message` with the path
-/// of the file to standard error and ends the process with code 1. The message of the first call stays.
+/// Installs a handler for the case that this process accesses a mapped file that another program has truncated. The
+/// handler writes `message` with the path of the file to standard error and ends the process with code 1. If this
+/// function is called again, the first message stays.
 pub fn report_cut_short_maps(message: TruncatedMapMessage) {
     MESSAGE.get_or_init(|| message);
     let mut action: libc::sigaction = unsafe {
@@ -22,11 +25,12 @@ pub fn report_cut_short_maps(message: TruncatedMapMessage) {
     action.sa_sigaction = handler as extern "C" fn(i32, *mut libc::siginfo_t, *mut libc::c_void) as usize;
     action.sa_flags = libc::SA_SIGINFO | libc::SA_ONSTACK;
     // SAFETY: `action` is initialized, with an empty mask and a handler that calls only async-signal-safe functions. If
-    // the system refuses, the default stays, which ends the process.
+    // the system refuses, the default action stays, which ends the process.
     unsafe { libc::sigaction(libc::SIGBUS, &action, std::ptr::null_mut()) };
 }
 
-/// Reports the truncated file and ends the process. Restores the default for any other cause of the signal.
+/// Handles SIGBUS: reports the truncated file and ends the process. For any other cause of the signal, restores the
+/// default action and raises the signal again.
 extern "C" fn handler(signal: i32, info: *mut libc::siginfo_t, _: *mut libc::c_void) {
     // SAFETY: the kernel passes a valid `siginfo_t` to a handler installed with SA_SIGINFO, and for SIGBUS with this
     // code it holds the address. signal, raise, write and _exit are async-signal-safe, and so is reading MESSAGE, a
@@ -47,16 +51,17 @@ extern "C" fn handler(signal: i32, info: *mut libc::siginfo_t, _: *mut libc::c_v
     }
 }
 
-/// Maximum number of bytes of the path in the message.
+/// Maximum number of bytes of the path in the message; a longer path is cut off.
 const PATH_BYTES: usize = 1024;
 
-/// Writes bytes to standard error.
+/// Writes `bytes` to standard error, from within the signal handler.
 fn write(bytes: &[u8]) {
     // SAFETY: the pointer and length are those of a slice. A short write only loses a part of the message.
     unsafe { libc::write(libc::STDERR_FILENO, bytes.as_ptr().cast(), bytes.len()) };
 }
 
-/// Writes the path of the file that is mapped at `address` to `path`. Returns its length, or 0 if the file is unknown.
+/// Writes the path of the file that is mapped at the memory address `address` to `path`. Returns the number of bytes of
+/// the path, or 0 if the file is unknown.
 ///
 /// Reads `/proc/self/maps` with only open and read, which are async-signal-safe, and allocates nothing.
 fn path_mapped_at(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
@@ -87,25 +92,25 @@ fn path_mapped_at(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
     }
 }
 
-/// State of a parser that reads a line of `/proc/self/maps`, `START-END MODE OFFSET DEVICE INODE PATH`, byte by byte.
+/// Parser that reads a line of `/proc/self/maps` byte by byte: `START-END MODE OFFSET DEVICE INODE PATH`.
 struct MapsLine {
-    /// Start and end address.
+    /// Start and end address of the memory region that the line describes.
     range: [usize; 2],
-    /// Number of separators read so far: a dash and five runs of blanks precede the path.
+    /// Number of separators read so far: a dash and five runs of blanks come before the path.
     field: usize,
     /// Whether the last byte was a blank.
     after_blank: bool,
-    /// Number of path bytes so far.
+    /// Number of bytes of the path read so far.
     length: usize,
 }
 
 impl MapsLine {
-    /// Creates the parser at the start of a line.
+    /// Creates a parser that has read nothing of its line.
     fn new() -> MapsLine {
         MapsLine { range: [0; 2], field: 0, after_blank: false, length: 0 }
     }
 
-    /// Reads the next byte of the line. Appends bytes of the path to `path`.
+    /// Reads `byte`, the next byte of the line. Appends it to `path` if it belongs to the path.
     fn push(&mut self, byte: u8, path: &mut [u8; PATH_BYTES]) {
         const PATH: usize = 6;
         if self.field < PATH && (byte == b' ' || self.field == 0 && byte == b'-') {
@@ -123,7 +128,7 @@ impl MapsLine {
                 self.range[self.field] = self.range[self.field] << 4 | digit;
             }
             PATH if self.length < PATH_BYTES => {
-                // Control characters could contain terminal escape sequences.
+                // Control characters are replaced, because they could form terminal escape sequences.
                 path[self.length] = if byte.is_ascii_control() { b'?' } else { byte };
                 self.length += 1;
             }

@@ -1,6 +1,7 @@
-//! Memory limits and memory use of this process.
+//! Memory limits and memory use of this process on Linux.
 //!
-//! The files below a root folder are read: `/proc` and the control groups. The root is `/` outside tests.
+//! The limits are read from files in `/proc` and in the folders of control groups. Tests read copies of such files
+//! below another root folder than `/`.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
@@ -8,12 +9,12 @@ use std::path::{Component, Path, PathBuf};
 use crate::{LimitSource, MemoryLimit, MemoryLimits};
 
 /// Returns the physical memory of the machine, the limits of the control group of this process and of its parent
-/// groups, and the limits that `ulimit` sets for the process. Empty if the system does not tell.
+/// groups, and the limits that `ulimit` sets for this process. Limits that the system does not report are missing.
 pub fn memory_limits() -> MemoryLimits {
     limits_under(Path::new("/"))
 }
 
-/// Returns the memory limits that the files below `root` state.
+/// Reads the memory limits of this process from the system files below the folder `root`, which stands for `/`.
 fn limits_under(root: &Path) -> MemoryLimits {
     let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
     let mut around = Vec::from_iter(machine_limit(&read));
@@ -21,7 +22,7 @@ fn limits_under(root: &Path) -> MemoryLimits {
     MemoryLimits { around, own: process_limits(&read) }
 }
 
-/// Returns the physical memory of the machine.
+/// Returns the physical memory of the machine as a limit. `read` returns the text of a system file.
 fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit> {
     let info = read(Path::new("/proc/meminfo"))?;
     let total = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
@@ -29,7 +30,8 @@ fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit>
     Some(MemoryLimit { bytes: kibibytes.saturating_mul(1024), source: LimitSource::Machine })
 }
 
-/// Adds the limits of the control group of this process and of every visible parent group. All of these limits apply.
+/// Appends to `limits` the limits of the control group of this process and of all its parent groups that are visible.
+/// Each of these limits applies. `read` returns the text of a system file.
 fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLimit>) {
     let (Some(memberships), Some(mounts)) =
         (read(Path::new("/proc/self/cgroup")), read(Path::new("/proc/self/mountinfo")))
@@ -37,7 +39,8 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
         return;
     };
     for membership in memberships.lines() {
-        // Fields of a line: hierarchy number, controllers (empty in version 2), path.
+        // Fields of a line of `/proc/self/cgroup`: number of the hierarchy, controllers (empty in version 2), path of
+        // the group.
         let mut fields = membership.splitn(3, ':').skip(1);
         let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else { continue };
         let (kind, files): (&str, &[&str]) = match controllers {
@@ -58,20 +61,21 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
     }
 }
 
-/// Mount of a control group hierarchy, or of a part of one.
+/// Mount of a hierarchy of control groups, or of a part of one, in the file system.
 struct Mount {
-    /// Path of the mounted part within the hierarchy.
+    /// Path of the mounted part within the hierarchy of control groups.
     root: PathBuf,
-    /// Mount point.
+    /// Folder at which the hierarchy is mounted.
     point: PathBuf,
-    /// File system type.
+    /// File system type: `cgroup2`, or `cgroup` for version 1.
     kind: String,
-    /// Whether groups of this hierarchy limit memory. Some version 1 hierarchies do not.
+    /// Whether the control groups of this hierarchy can limit memory. Some hierarchies of version 1 cannot.
     limits_memory: bool,
 }
 
 impl Mount {
-    /// Parses a line of `mountinfo`: numbers, device, root, mount point, options, a dash, type, source, options.
+    /// Parses a line of `/proc/self/mountinfo`: numbers, device, root, mount point, options, a dash, file system type,
+    /// source, options. Returns `None` if fields are missing.
     fn from_line(line: &str) -> Option<Mount> {
         let (before_dash, after_dash) = line.split_once(" - ")?;
         let mut before_dash = before_dash.split(' ').skip(3);
@@ -83,10 +87,11 @@ impl Mount {
         Some(Mount { root, point, kind, limits_memory })
     }
 
-    /// Returns the folder of the group `path`, or the mount point if the group is outside the mounted part.
+    /// Returns the folder of the control group `path` in the file system, or the mount point if the group is outside
+    /// the mounted part.
     fn folder_of(&self, path: &str) -> PathBuf {
         let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
-        // The path is relative to the root of a control group namespace that does not contain this process.
+        // With `..`, the path is relative to the root of a control group namespace that does not contain this process.
         if inside.components().any(|component| component == Component::ParentDir) {
             return self.point.clone();
         }
@@ -94,7 +99,8 @@ impl Mount {
     }
 }
 
-/// Returns the soft limits of the address space and the data size of this process.
+/// Returns the soft limits of the address space and of the data size of this process. `read` returns the text of a
+/// system file.
 fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
     let text = read(Path::new("/proc/self/limits")).unwrap_or_default();
     let soft = |name: &str, source| {
@@ -105,15 +111,15 @@ fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
     limits.into_iter().flatten().collect()
 }
 
-/// Returns the largest resident memory of this process so far in bytes, including mapped pages (`VmHWM`). `None` if the
-/// system does not tell.
+/// Returns the largest resident memory (in physical memory, mapped files included) that this process has had so far, in
+/// bytes (`VmHWM`). Returns `None` if the system gives no answer.
 pub fn peak_memory_bytes() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Resets [`peak_memory_bytes`] to the present resident memory. Returns whether the system did so.
+/// Makes [`peak_memory_bytes`] start again at the present resident memory. Returns whether the system did so.
 pub fn reset_peak_memory() -> bool {
     fs::write("/proc/self/clear_refs", "5").is_ok()
 }
@@ -129,7 +135,8 @@ mod tests {
         Max data size             unlimited            unlimited            bytes\n\
         Max address space         unlimited            unlimited            bytes\n";
 
-    /// Returns the lowest limit of a machine with 64 GiB and these files.
+    /// Returns the lowest memory limit that is found on a simulated machine with 64 GiB, whose system files have the
+    /// paths and texts `files`.
     fn limit(files: &[(&str, &str)]) -> (u64, LimitSource) {
         let root = tempfile::tempdir().unwrap();
         let machine =

@@ -1,4 +1,4 @@
-//! Linux: memory limits, page cache, and truncation of mapped files.
+//! Functions with an implementation for Linux alone: memory limits, page cache, and truncation of mapped files.
 
 mod cut_short;
 mod memory;
@@ -11,7 +11,8 @@ use rustix::io::{Errno, ReadWriteFlags, preadv2};
 pub use cut_short::report_cut_short_maps;
 pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
 
-/// Returns whether reading the byte at `offset` needs no disk access. `None` if the system does not tell.
+/// Returns whether the byte at `offset` of `file` is in memory (the page cache), so that reading it needs no disk
+/// access. Returns `None` if the system gives no answer.
 pub fn is_cached(file: &File, offset: u64) -> Option<bool> {
     let mut byte = [0];
     match preadv2(file, &mut [IoSliceMut::new(&mut byte)], offset, ReadWriteFlags::NOWAIT) {

@@ -1,4 +1,5 @@
-//! Folders addressed by open handles, so that no rename and no link can redirect an operation to another folder.
+//! Folders that are addressed by open handles, so that no renamed folder and no link can redirect an operation to
+//! another folder.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -12,34 +13,34 @@ use rustix::fs::{AtFlags, CWD, Dir, FileType, Mode, OFlags};
 
 use crate::{FileIdentity, FolderStatus};
 
-/// Open folder. Names are relative to it. Links are never followed.
+/// Open folder. Its methods take the names of entries of this folder, and never follow links.
 #[derive(Debug)]
 pub struct FolderHandle(OwnedFd);
 
 impl FolderHandle {
-    /// Opens the folder at `path`, or the folder that a link at `path` leads to.
+    /// Opens the folder at `path`. Follows links in `path`.
     ///
     /// # Errors
-    /// The folder does not exist; the system refuses.
+    /// Fails if the folder does not exist or the system refuses.
     pub fn open(path: &Path) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         Ok(FolderHandle(rustix::fs::open(path, flags, Mode::empty())?))
     }
 
-    /// Opens the folder `name` in this folder. A link is an error.
+    /// Opens the folder `name` in this folder.
     ///
     /// # Errors
-    /// No folder has this name; the system refuses.
+    /// Fails if the entry `name` is missing, is not a folder, or is a link, or if the system refuses.
     pub fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         Ok(FolderHandle(rustix::fs::openat(&self.0, name.as_ref(), flags, Mode::empty())?))
     }
 
-    /// Opens the regular file `name` for reading and, if `writes`, for writing. Any other kind of entry is an error; a
-    /// FIFO does not block.
+    /// Opens the regular file `name` for reading and, if `writes`, also for writing. Does not wait if the entry is a
+    /// FIFO (named pipe), but fails.
     ///
     /// # Errors
-    /// No regular file has this name; the system refuses.
+    /// Fails if the entry `name` is missing or is not a regular file, or if the system refuses.
     pub fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
         let access = if writes { OFlags::RDWR } else { OFlags::RDONLY };
         let flags = access | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -50,18 +51,18 @@ impl FolderHandle {
         }
     }
 
-    /// Creates the file `name`.
+    /// Creates the file `name` in this folder and opens it for reading and writing.
     ///
     /// # Errors
-    /// An entry has this name; the system refuses.
+    /// Fails if an entry named `name` exists or the system refuses.
     pub fn create_file(&self, name: &str) -> io::Result<File> {
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
         Ok(File::from(rustix::fs::openat(&self.0, name, flags, Mode::RUSR | Mode::WUSR)?))
     }
 
-    /// Returns whether the entry `name` is the open file `file`.
+    /// Returns whether the entry `name` of this folder is the file that is open as `file`.
     pub fn names_file(&self, name: &str, file: &File) -> bool {
-        // Does not open the file again: on network file systems that could release a lock on it.
+        // The file is not opened again: on network file systems that could release a lock on it.
         let named = rustix::fs::statat(&self.0, name, AtFlags::SYMLINK_NOFOLLOW);
         let open = rustix::fs::fstat(file);
         named.is_ok_and(|named| open.is_ok_and(|open| (named.st_dev, named.st_ino) == (open.st_dev, open.st_ino)))
@@ -70,7 +71,7 @@ impl FolderHandle {
     /// Returns the identity, owner and permissions of this folder.
     ///
     /// # Errors
-    /// The system refuses.
+    /// Fails if the system refuses.
     pub fn status(&self) -> io::Result<FolderStatus> {
         let found = File::from(self.0.try_clone()?).metadata()?;
         Ok(FolderStatus {
@@ -80,10 +81,10 @@ impl FolderHandle {
         })
     }
 
-    /// Returns the names of all entries, sorted.
+    /// Returns the names of all entries of this folder in sorted order.
     ///
     /// # Errors
-    /// The system refuses.
+    /// Fails if the system refuses.
     pub fn entries(&self) -> io::Result<Vec<OsString>> {
         let mut names = Vec::new();
         for entry in Dir::read_from(&self.0)? {
@@ -96,32 +97,32 @@ impl FolderHandle {
         Ok(names)
     }
 
-    /// Returns whether an entry has this name, including a link whose target does not exist.
+    /// Returns whether this folder has an entry `name`, which may be a link whose target does not exist.
     pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW).is_ok()
     }
 
-    /// Returns whether the entry is a folder and not a link to one.
+    /// Returns whether the entry `name` is a folder, and not a link to one.
     pub fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
         let found = rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| FileType::from_raw_mode(found.st_mode) == FileType::Directory)
     }
 
-    /// Renames the entry `from` to `name` in the folder `to`.
+    /// Moves the entry `from` of this folder to the folder `to`, under the name `name`.
     ///
     /// # Errors
-    /// No entry has this name; the system refuses.
+    /// Fails if there is no entry `from` or the system refuses.
     pub fn rename(&self, from: impl AsRef<OsStr>, to: &FolderHandle, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::renameat(&self.0, from.as_ref(), &to.0, name.as_ref())?)
     }
 
-    /// Moves the entry at the relative path `from` to the path `to`.
+    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder.
     ///
-    /// The system moves a folder to another parent only if the folder itself is writable. A read-only folder of this
-    /// user is therefore made writable during its move.
+    /// Systems move a folder to another parent only if the folder itself is writable. A read-only folder of this user
+    /// is therefore made writable while it is moved.
     ///
     /// # Errors
-    /// As for [`FolderHandle::rename`].
+    /// Fails if there is no entry `from` or the system refuses.
     pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
         let moved = || rustix::fs::renameat(&self.0, from, CWD, to);
         let refused = match moved() {
@@ -136,12 +137,12 @@ impl FolderHandle {
         Ok(moved?)
     }
 
-    /// Removes the entry `name`; a folder is removed with its content. A link is removed, its target is not.
+    /// Removes the entry `name`, a folder together with its content. If the entry is a link, its target stays.
     ///
-    /// Read-only folders of this user are made writable first.
+    /// Read-only folders of this user that cannot be emptied otherwise are made writable first.
     ///
     /// # Errors
-    /// No entry has this name; an entry cannot be removed.
+    /// Fails if there is no entry `name` or an entry cannot be removed.
     pub fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         let name = name.as_ref();
         if !self.has_folder(name) {
@@ -161,24 +162,25 @@ impl FolderHandle {
         result.and_then(|()| self.remove_empty(name))
     }
 
-    /// Removes the empty folder `name`. Any other entry stays and is an error.
+    /// Removes the entry `name` if it is an empty folder.
     ///
     /// # Errors
-    /// No empty folder has this name; the system refuses.
+    /// Fails, and removes nothing, if the entry `name` is missing or is not an empty folder, or if the system refuses.
     pub fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::unlinkat(&self.0, name.as_ref(), AtFlags::REMOVEDIR)?)
     }
 
-    /// Writes the entries of the folder, their names, through to the disk.
+    /// Makes the system write the list of entries of this folder to the disk, so that a finished rename survives a
+    /// power failure.
     ///
     /// # Errors
-    /// A write fails.
+    /// Fails if a write fails.
     pub fn sync(&self) -> io::Result<()> {
         Ok(rustix::fs::fsync(&self.0)?)
     }
 }
 
-/// Returns whether the system refused an operation for lack of permission.
+/// Returns whether `error` says that the process lacks a permission.
 fn is_denied(error: rustix::io::Errno) -> bool {
     error == rustix::io::Errno::ACCESS || error == rustix::io::Errno::PERM
 }

@@ -1,4 +1,4 @@
-//! Linux and macOS: files and folders.
+//! Implementation for Linux and macOS: files, folders and memory maps.
 
 mod folder;
 mod signals;
@@ -18,48 +18,48 @@ use crate::{FileIdentity, FileKind, FileStatus};
 pub use folder::FolderHandle;
 pub use signals::end_on_signals;
 
-/// Permissions of a folder that only its owner may enter, read or write.
+/// Permissions (mode bits) of a private folder, which only its owner may enter, read or write.
 const PRIVATE: u32 = 0o700;
 
-/// Reads `bytes.len()` bytes at byte `offset` of `file`. Several threads may read one file at the same time.
+/// Fills `bytes` with the bytes of `file` from byte `offset` on. Several threads may read one file at the same time.
 ///
 /// # Errors
-/// A read fails; the file ends before the last byte.
+/// Fails if a read fails or the file ends before `bytes` is full.
 pub fn read_exact_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
     file.read_exact_at(bytes, offset)
 }
 
 impl FileIdentity {
-    /// Returns the identity of a file or folder with this metadata.
+    /// Returns the identity of the file or folder that has the metadata `found`.
     fn from_metadata(found: &Metadata) -> FileIdentity {
         FileIdentity { volume: found.dev(), number: found.ino() }
     }
 }
 
 impl FileStatus {
-    /// Returns the status of a file with this metadata.
+    /// Returns the status of the file that has the metadata `found`.
     fn from_metadata(found: &Metadata) -> FileStatus {
         FileStatus { identity: FileIdentity::from_metadata(found), length: found.len() }
     }
 
-    /// Returns the status of an open file.
+    /// Returns the identity and length of an open file.
     ///
     /// # Errors
-    /// The system refuses.
+    /// Fails if the system refuses.
     pub fn from_file(file: &File) -> io::Result<FileStatus> {
         Ok(FileStatus::from_metadata(&file.metadata()?))
     }
 
-    /// Returns the status of the file at `path`, or of the file that a link at `path` leads to.
+    /// Returns the identity and length of the file at `path`. Follows links.
     ///
     /// # Errors
-    /// The path does not exist; the system refuses.
+    /// Fails if the path does not exist or the system refuses.
     pub fn from_path(path: &Path) -> io::Result<FileStatus> {
         Ok(FileStatus::from_metadata(&std::fs::metadata(path)?))
     }
 }
 
-/// Returns the kind of an entry that is not a file, folder or link.
+/// Returns the kind of a folder entry that is not a regular file, folder or link.
 pub(crate) fn special_kind(found: FileType) -> FileKind {
     match found {
         found if found.is_fifo() => FileKind::Fifo,
@@ -70,20 +70,20 @@ pub(crate) fn special_kind(found: FileType) -> FileKind {
     }
 }
 
-/// Opens `path` for reading. Opens a named pipe at once even if it has no writer. Reading a regular file is not
-/// affected.
+/// Opens the file at `path` for reading. Does not wait if `path` is a named pipe without a writer. Later reads of a
+/// regular file are not affected.
 ///
 /// # Errors
-/// The path does not exist; the system refuses.
+/// Fails if the path does not exist or the system refuses.
 pub fn open_without_waiting(path: &Path) -> io::Result<File> {
     OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)
 }
 
-/// Opens the character device or FIFO `path` for writing. Returns `None` for a FIFO that no program has opened for
-/// reading. Writes to the opened file block until there is space.
+/// Opens the character device or FIFO (named pipe) `path` for writing. Returns `None` for a FIFO that no program has
+/// opened for reading. Writes to the returned file wait until there is space.
 ///
 /// # Errors
-/// The path does not exist; the system refuses.
+/// Fails if the path does not exist or the system refuses.
 pub fn open_stream(path: &Path) -> io::Result<Option<File>> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let opened = OpenOptions::new().write(true).custom_flags(flags.bits() as i32).open(path);
@@ -97,18 +97,19 @@ pub fn open_stream(path: &Path) -> io::Result<Option<File>> {
     Ok(Some(file))
 }
 
-/// Returns whether `file` is the file, device or pipe of standard output.
+/// Returns whether `file` is the same file, device or pipe as the standard output of this process.
 ///
 /// # Errors
-/// The status of `file` cannot be read.
+/// Fails if the status of `file` cannot be read.
 pub fn is_standard_output(file: &File) -> io::Result<bool> {
     let found = FileStatus::from_file(file)?;
     let out = io::stdout().as_fd().try_clone_to_owned().and_then(|out| FileStatus::from_file(&File::from(out)));
     Ok(out.is_ok_and(|out| out.identity == found.identity))
 }
 
-/// Returns whether `folder` is or lies in a folder whose links belong to the system, such as `/dev` with `/dev/stdout`.
-/// `folder` is a path without links. Files in the shared memory `/dev/shm` belong to users.
+/// Returns whether `folder` belongs to the system, like `/dev` and `/proc`, so that links in it, such as `/dev/stdout`,
+/// can be trusted. `folder` must be a path without links. The shared memory `/dev/shm` does not count, because its
+/// files belong to users.
 pub fn is_system_folder(folder: &Path) -> bool {
     (folder.starts_with("/dev") && !folder.starts_with("/dev/shm")) || folder.starts_with("/proc")
 }
@@ -116,40 +117,42 @@ pub fn is_system_folder(folder: &Path) -> bool {
 /// Creates the folder `path`, which only its owner may enter, read or write.
 ///
 /// # Errors
-/// An entry has this name; the system refuses.
+/// Fails if an entry named `path` exists or the system refuses.
 pub fn create_private_folder(path: &Path) -> io::Result<()> {
     DirBuilder::new().mode(PRIVATE).create(path)
 }
 
-/// Returns the permissions of a private folder, for callers that create one without [`create_private_folder`]. Returns
-/// `None` on systems where the parent decides about permissions.
+/// Returns the permissions of a folder that only its owner may access, for callers that create one without
+/// [`create_private_folder`]. Returns `None` on systems on which a folder has the permissions of its parent.
 pub fn private_permissions() -> Option<Permissions> {
     Some(Permissions::from_mode(PRIVATE))
 }
 
-/// Writes the content of the file `path` through to the disk.
+/// Makes the system write the content of the file `path` to the disk, and waits for it.
 ///
 /// # Errors
-/// The path does not exist; a write fails.
+/// Fails if the path does not exist or a write fails.
 pub fn sync_file(path: &Path) -> io::Result<()> {
     File::open(path)?.sync_all()
 }
 
-/// Writes the entries of the folder `path` through to the disk, so that a finished rename survives a power failure.
+/// Makes the system write the entries of the folder `path` to the disk, so that a finished rename survives a power
+/// failure.
 ///
 /// # Errors
-/// The path does not exist; a write fails.
+/// Fails if the path does not exist or a write fails.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     sync_file(path)
 }
 
-/// Tells the system that the bytes `range` of `map` will be read soon. Has no effect if the system refuses.
+/// Tells the system that the bytes `range` of the memory map `map` will be read soon. Has no effect if the system
+/// refuses.
 pub fn expect_pages(map: &Mmap, range: Range<usize>) {
     _ = map.advise_range(Advice::WillNeed, range.start, range.len());
 }
 
-/// Returns the pages of the bytes `range` of `map` to the system, so that they no longer count as memory of this
-/// process. Later access reads the file again. Has no effect if the system refuses.
+/// Gives the memory of the bytes `range` of the memory map `map` back to the system, so that they no longer count as
+/// memory of this process. A later access reads the file again. Has no effect if the system refuses.
 ///
 /// # Safety
 /// `map` must be backed by a file and not by anonymous memory: the content of anonymous pages would be lost.

@@ -1,18 +1,18 @@
-//! Signals that ask the process to end.
+//! Handling of the signals that ask the process to end, on Linux and macOS.
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
 
-/// Installs a handler for SIGINT, SIGTERM and SIGHUP. The handler calls `clean_up` and ends the process with the code
-/// that `exit_code` returns for the signal number. The value that `clean_up` returns is kept until the process ends. A
-/// signal that is already ignored, for example by `nohup`, stays ignored.
+/// Installs a handler for the signals SIGINT, SIGTERM and SIGHUP. The handler calls `clean_up` and ends the process
+/// with the code that `exit_code` returns for the number of the signal. The value that `clean_up` returns is kept until
+/// the process ends. A signal that the process already ignores, for example because of `nohup`, stays ignored.
 ///
-/// Also ignores SIGXFSZ from now on: writing beyond the limit of `ulimit -f` becomes an error and no longer ends the
-/// process.
+/// Also makes the process ignore SIGXFSZ: a write beyond the file size limit of `ulimit -f` then fails with an error
+/// instead of ending the process.
 ///
-/// Call this function before the process has started other threads. If the system refuses, a signal ends the process at
-/// once.
+/// Call this function before the process starts other threads. If the system refuses to install the handler, a signal
+/// ends the process at once, without `clean_up`.
 pub fn end_on_signals<T>(clean_up: impl FnOnce() -> T + Send + 'static, exit_code: fn(u8) -> u8) {
     // SAFETY: SIG_IGN is a valid disposition of SIGXFSZ; no other thread exists yet.
     unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };

@@ -1,9 +1,9 @@
-//! Folders addressed by their paths, because the documented interface of Windows has no operations relative to an open
-//! folder.
+//! Folders that are addressed by their paths, because the documented interface of Windows has no operations relative to
+//! an open folder.
 //!
-//! Before each operation the path is checked: it must still lead to the folder that was opened, without a link. Another
-//! program may replace the folder between this check and the operation; Linux and macOS exclude that. No folder counts
-//! as the user's own, so the program takes over and removes only folders of its own process.
+//! Each operation first checks that the path still leads to the folder that was opened, without a link. Another program
+//! may replace the folder between this check and the operation; Linux and macOS exclude that. No folder counts as one
+//! of this user, so the program reuses and removes only folders that this process has created.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions};
@@ -15,40 +15,40 @@ use windows_sys::Win32::Storage::FileSystem::{FILE_FLAG_BACKUP_SEMANTICS, FILE_F
 
 use crate::{FileIdentity, FileStatus, FolderStatus};
 
-/// Open folder. Names are relative to it. Links are never followed.
+/// Open folder. Its methods take the names of entries of this folder, and never follow links.
 #[derive(Debug)]
 pub struct FolderHandle {
-    /// Absolute path without links.
+    /// Absolute path of the folder, without links.
     path: PathBuf,
-    /// Identity of the folder that was opened.
+    /// Identity of the folder when it was opened.
     identity: FileIdentity,
 }
 
 impl FolderHandle {
-    /// Opens the folder at `path`, or the folder that a link at `path` leads to.
+    /// Opens the folder at `path`. Follows links in `path`.
     ///
     /// # Errors
-    /// The folder does not exist; the system refuses.
+    /// Fails if the folder does not exist or the system refuses.
     pub fn open(path: &Path) -> io::Result<FolderHandle> {
         let path = fs::canonicalize(path)?;
         let identity = folder_identity(&path)?;
         Ok(FolderHandle { path, identity })
     }
 
-    /// Opens the folder `name` in this folder. A link is an error.
+    /// Opens the folder `name` in this folder.
     ///
     /// # Errors
-    /// No folder has this name; the system refuses.
+    /// Fails if the entry `name` is missing, is not a folder, or is a link, or if the system refuses.
     pub fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<FolderHandle> {
         let path = self.entry_path(name)?;
         let identity = folder_identity(&path)?;
         Ok(FolderHandle { path, identity })
     }
 
-    /// Opens the regular file `name` for reading and, if `writes`, for writing. Any other kind of entry is an error.
+    /// Opens the regular file `name` for reading and, if `writes`, also for writing.
     ///
     /// # Errors
-    /// No regular file has this name; the system refuses.
+    /// Fails if the entry `name` is missing or is not a regular file, or if the system refuses.
     pub fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
         let mut options = OpenOptions::new();
         options.read(true).write(writes).custom_flags(FILE_FLAG_OPEN_REPARSE_POINT);
@@ -59,34 +59,34 @@ impl FolderHandle {
         }
     }
 
-    /// Creates the file `name`.
+    /// Creates the file `name` in this folder and opens it for reading and writing.
     ///
     /// # Errors
-    /// An entry has this name; the system refuses.
+    /// Fails if an entry named `name` exists or the system refuses.
     pub fn create_file(&self, name: &str) -> io::Result<File> {
         OpenOptions::new().read(true).write(true).create_new(true).open(self.entry_path(name)?)
     }
 
-    /// Returns whether the entry `name` is the open file `file`.
+    /// Returns whether the entry `name` of this folder is the file that is open as `file`.
     pub fn names_file(&self, name: &str, file: &File) -> bool {
         let named = self.open_file(name, false).and_then(|named| FileStatus::from_file(&named));
         let open = FileStatus::from_file(file);
         named.is_ok_and(|named| open.is_ok_and(|open| named.identity == open.identity))
     }
 
-    /// Returns the identity of this folder. Owner and permissions are not read.
+    /// Returns the identity of this folder. Owner and permissions are not read; their fields are false.
     ///
     /// # Errors
-    /// The folder no longer exists.
+    /// Fails if the folder no longer exists.
     pub fn status(&self) -> io::Result<FolderStatus> {
         self.check()?;
         Ok(FolderStatus { identity: self.identity, is_own: false, is_private: false })
     }
 
-    /// Returns the names of all entries, sorted.
+    /// Returns the names of all entries of this folder in sorted order.
     ///
     /// # Errors
-    /// The folder no longer exists; the system refuses.
+    /// Fails if the folder no longer exists or the system refuses.
     pub fn entries(&self) -> io::Result<Vec<OsString>> {
         self.check()?;
         let mut names =
@@ -95,50 +95,51 @@ impl FolderHandle {
         Ok(names)
     }
 
-    /// Returns whether an entry has this name, including a link whose target does not exist.
+    /// Returns whether this folder has an entry `name`, which may be a link whose target does not exist.
     pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         self.entry_path(name).and_then(fs::symlink_metadata).is_ok()
     }
 
-    /// Returns whether the entry is a folder and not a link to one.
+    /// Returns whether the entry `name` is a folder, and not a link to one.
     pub fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
         self.entry_path(name).and_then(fs::symlink_metadata).is_ok_and(|found| found.is_dir())
     }
 
-    /// Renames the entry `from` to `name` in the folder `to`.
+    /// Moves the entry `from` of this folder to the folder `to`, under the name `name`.
     ///
     /// # Errors
-    /// No entry has this name; the system refuses, for example while a program has a file in the entry open.
+    /// Fails if there is no entry `from` or the system refuses, for example while a program has the file, or a file in
+    /// the folder, open.
     pub fn rename(&self, from: impl AsRef<OsStr>, to: &FolderHandle, name: impl AsRef<OsStr>) -> io::Result<()> {
         fs::rename(self.entry_path(from)?, to.entry_path(name)?)
     }
 
-    /// Moves the entry at the relative path `from` to the path `to`.
+    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder.
     ///
     /// # Errors
-    /// As for [`FolderHandle::rename`].
+    /// Fails if there is no entry `from` or the system refuses.
     pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
         fs::rename(self.entry_path(from)?, to)
     }
 
-    /// Removes the entry `name`; a folder is removed with its content. A link is removed, its target is not.
+    /// Removes the entry `name`, a folder together with its content. If the entry is a link, its target stays.
     ///
     /// # Errors
-    /// No entry has this name; an entry cannot be removed.
+    /// Fails if there is no entry `name` or an entry cannot be removed.
     pub fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         let path = self.entry_path(name)?;
         match fs::symlink_metadata(&path)?.file_type() {
-            // The standard library removes the folder by handles and follows no link.
+            // The standard library removes a folder through open handles and follows no link.
             found if found.is_dir() => fs::remove_dir_all(path),
             found if found.is_symlink_dir() => fs::remove_dir(path),
             _ => fs::remove_file(path),
         }
     }
 
-    /// Removes the empty folder `name`. Any other entry stays and is an error.
+    /// Removes the entry `name` if it is an empty folder.
     ///
     /// # Errors
-    /// No empty folder has this name; the system refuses.
+    /// Fails, and removes nothing, if the entry `name` is missing or is not an empty folder, or if the system refuses.
     pub fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         let path = self.entry_path(name)?;
         folder_identity(&path)?;
@@ -148,18 +149,19 @@ impl FolderHandle {
     /// Does nothing: Windows cannot write the entries of a folder through to the disk.
     ///
     /// # Errors
-    /// None.
+    /// Never fails.
     pub fn sync(&self) -> io::Result<()> {
         Ok(())
     }
 
-    /// Returns the path of the entry `name`, after [`FolderHandle::check`] has confirmed the path of the folder.
+    /// Returns the path of the entry `name`. First checks that the path of this folder still leads to the folder that
+    /// was opened.
     fn entry_path(&self, name: impl AsRef<OsStr>) -> io::Result<PathBuf> {
         self.check()?;
         Ok(self.path.join(name.as_ref()))
     }
 
-    /// Checks that the path still leads to the folder that was opened.
+    /// Fails if the path of this folder no longer leads to the folder that was opened.
     fn check(&self) -> io::Result<()> {
         match folder_identity(&self.path)? == self.identity {
             true => Ok(()),
@@ -168,7 +170,7 @@ impl FolderHandle {
     }
 }
 
-/// Returns the identity of the folder at `path`. A link is an error.
+/// Returns the identity of the folder at `path`. Fails if `path` is a link or is not a folder.
 fn folder_identity(path: &Path) -> io::Result<FileIdentity> {
     let flags = FILE_FLAG_BACKUP_SEMANTICS | FILE_FLAG_OPEN_REPARSE_POINT;
     let folder = OpenOptions::new().read(true).custom_flags(flags).open(path)?;

@@ -1,4 +1,4 @@
-//! Memory limits and memory use of this process.
+//! Memory limits and memory use of this process on Windows.
 
 use std::mem::{size_of, zeroed};
 
@@ -12,14 +12,15 @@ use windows_sys::Win32::System::Threading::GetCurrentProcess;
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits};
 
-/// Returns the physical memory of the machine and the limits of the job object of this process.
+/// Returns the physical memory of the machine, and the limits of the job object (group of processes) to which this
+/// process belongs.
 pub fn memory_limits() -> MemoryLimits {
     let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
     let job = job_bytes().into_iter().map(|bytes| MemoryLimit { bytes, source: LimitSource::JobObject });
     MemoryLimits { around: machine.into_iter().chain(job).collect(), own: Vec::new() }
 }
 
-/// Returns the physical memory of the machine in bytes.
+/// Returns the physical memory of the machine in bytes, or `None` if the system gives no answer.
 fn machine_bytes() -> Option<u64> {
     // SAFETY: all fields are integers.
     let mut status: MEMORYSTATUSEX = unsafe { zeroed() };
@@ -28,7 +29,8 @@ fn machine_bytes() -> Option<u64> {
     (unsafe { GlobalMemoryStatusEx(&mut status) } != 0).then_some(status.ullTotalPhys)
 }
 
-/// Returns the limits of the job object of this process in bytes, per process and per job. Empty without a job object.
+/// Returns the memory limits of the job object of this process in bytes: the limit per process and that of the whole
+/// job, if they are set. Returns an empty list if the process belongs to no job object.
 fn job_bytes() -> Vec<u64> {
     // SAFETY: all fields are integers.
     let mut limits: JOBOBJECT_EXTENDED_LIMIT_INFORMATION = unsafe { zeroed() };
@@ -52,7 +54,8 @@ fn job_bytes() -> Vec<u64> {
     stated.into_iter().filter(|(flag, _)| flags & flag != 0).map(|(_, bytes)| bytes as u64).collect()
 }
 
-/// Returns the largest working set of this process so far in bytes, including mapped pages.
+/// Returns the largest working set (physical memory, mapped files included) that this process has had so far, in bytes.
+/// Returns `None` if the system gives no answer.
 pub fn peak_memory_bytes() -> Option<u64> {
     // SAFETY: all fields are integers.
     let mut counters: PROCESS_MEMORY_COUNTERS = unsafe { zeroed() };

@@ -1,4 +1,4 @@
-//! Windows: files, signals and memory. Type-checked only.
+//! Implementation for Windows: files, folders, signals, memory maps and memory limits. Type-checked only.
 
 mod folder;
 mod memory;
@@ -23,11 +23,11 @@ use crate::{FileIdentity, FileStatus, TruncatedMapMessage};
 pub use folder::FolderHandle;
 pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
 
-/// Reads `bytes.len()` bytes at byte `offset` of `file`. Several threads may read one file at the same time. Changes
-/// the position at which `Read` continues.
+/// Fills `bytes` with the bytes of `file` from byte `offset` on. Several threads may read one file at the same time.
+/// Changes the file position, from which a later `Read` continues.
 ///
 /// # Errors
-/// A read fails; the file ends before the last byte.
+/// Fails if a read fails or the file ends before `bytes` is full.
 pub fn read_exact_at(file: &File, mut bytes: &mut [u8], mut offset: u64) -> io::Result<()> {
     while !bytes.is_empty() {
         match file.seek_read(bytes, offset) {
@@ -44,10 +44,10 @@ pub fn read_exact_at(file: &File, mut bytes: &mut [u8], mut offset: u64) -> io::
 }
 
 impl FileStatus {
-    /// Returns the status of an open file.
+    /// Returns the identity and length of an open file.
     ///
     /// # Errors
-    /// The system refuses.
+    /// Fails if the system refuses.
     pub fn from_file(file: &File) -> io::Result<FileStatus> {
         let mut found = MaybeUninit::<BY_HANDLE_FILE_INFORMATION>::uninit();
         // SAFETY: the handle is open as long as `file`. `found` has the expected size and alignment and is read only if
@@ -64,40 +64,40 @@ impl FileStatus {
         Ok(FileStatus { identity, length: joined(found.nFileSizeHigh, found.nFileSizeLow) })
     }
 
-    /// Returns the status of the file at `path`, or of the file that a link at `path` leads to.
+    /// Returns the identity and length of the file at `path`. Follows links.
     ///
     /// # Errors
-    /// The path does not exist; the system refuses.
+    /// Fails if the path does not exist or the system refuses.
     pub fn from_path(path: &Path) -> io::Result<FileStatus> {
         FileStatus::from_file(&OpenOptions::new().read(true).custom_flags(FILE_FLAG_BACKUP_SEMANTICS).open(path)?)
     }
 }
 
-/// Opens `path` for reading.
+/// Opens the file at `path` for reading. On Windows this never waits.
 ///
 /// # Errors
-/// The path does not exist; the system refuses.
+/// Fails if the path does not exist or the system refuses.
 pub fn open_without_waiting(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Refuses: on Windows no path is recognized as a device or FIFO.
+/// Always fails: on Windows no path is recognized as a device or FIFO (named pipe).
 ///
 /// # Errors
-/// Always.
+/// Always fails, because the operation is not supported.
 pub fn open_stream(_path: &Path) -> io::Result<Option<File>> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// Returns false: Windows does not tell whether `file` is the file, device or pipe of standard output.
+/// Returns false: Windows gives no answer to whether `file` is the file, device or pipe of standard output.
 ///
 /// # Errors
-/// None.
+/// Never fails.
 pub fn is_standard_output(_file: &File) -> io::Result<bool> {
     Ok(false)
 }
 
-/// Returns false: Windows has no folder whose links belong to the system.
+/// Always returns false: Windows has no folder of the system whose links could be trusted, such as `/dev`.
 pub fn is_system_folder(_folder: &Path) -> bool {
     false
 }
@@ -105,20 +105,20 @@ pub fn is_system_folder(_folder: &Path) -> bool {
 /// Creates the folder `path` with the permissions of its parent.
 ///
 /// # Errors
-/// An entry has this name; the system refuses.
+/// Fails if an entry named `path` exists or the system refuses.
 pub fn create_private_folder(path: &Path) -> io::Result<()> {
     std::fs::create_dir(path)
 }
 
-/// Returns `None`: the parent decides about the permissions of a private folder.
+/// Always returns `None`: on Windows a folder has the permissions of its parent.
 pub fn private_permissions() -> Option<Permissions> {
     None
 }
 
-/// Writes the content of the file `path` through to the disk.
+/// Makes the system write the content of the file `path` to the disk, and waits for it.
 ///
 /// # Errors
-/// The path does not exist; the file cannot be opened for writing; a write fails.
+/// Fails if the path does not exist, the file cannot be opened for writing, or a write fails.
 pub fn sync_file(path: &Path) -> io::Result<()> {
     OpenOptions::new().write(true).open(path)?.sync_all()
 }
@@ -126,7 +126,7 @@ pub fn sync_file(path: &Path) -> io::Result<()> {
 /// Does nothing: Windows cannot write the entries of a folder through to the disk.
 ///
 /// # Errors
-/// None.
+/// Never fails.
 pub fn sync_folder(_path: &Path) -> io::Result<()> {
     Ok(())
 }
@@ -137,10 +137,10 @@ pub fn expect_pages(_map: &Mmap, _range: Range<usize>) {}
 /// Does nothing: Windows takes pages back when it needs them.
 ///
 /// # Safety
-/// As on the other systems: `map` is backed by a file and not by anonymous memory.
+/// `map` must be backed by a file and not by anonymous memory, as on the other systems.
 pub unsafe fn release_pages(_map: &Mmap, _range: Range<usize>) {}
 
-/// Returns `None`: Windows does not tell whether reading the byte at `offset` needs disk access.
+/// Returns `None`: Windows gives no answer to whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
     None
 }
@@ -148,16 +148,17 @@ pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
 /// Does nothing: on Windows a mapped file cannot be truncated.
 pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
 
-/// Function that ends the process because of the signal with this number.
+/// Function that cleans up and ends the process because of a signal, whose number is its argument.
 type End = Box<dyn FnOnce(u8) + Send>;
 
-/// Function to call at the next console event. `None` before [`end_on_signals`] and while an event is handled.
+/// Function to call at the next console event, such as Ctrl+C. `None` until [`end_on_signals`] sets it, and after an
+/// event has taken it.
 static END: Mutex<Option<End>> = Mutex::new(None);
 
 /// Installs a handler for Ctrl+C, Ctrl+Break and closing the console. The handler calls `clean_up` and ends the process
-/// with the code that `exit_code` returns for the signal number that Linux and macOS use: 2 for Ctrl+C and Ctrl+Break,
-/// 15 otherwise. The value that `clean_up` returns is kept until the process ends. A process that is terminated
-/// otherwise ends at once.
+/// with the code that `exit_code` returns for the number that the signal has on Linux and macOS: 2 for Ctrl+C and
+/// Ctrl+Break, 15 for a closed console. The value that `clean_up` returns is kept until the process ends. If the
+/// process is terminated in another way, it ends without `clean_up`.
 pub fn end_on_signals<T>(clean_up: impl FnOnce() -> T + Send + 'static, exit_code: fn(u8) -> u8) {
     let end = Box::new(move |signal| {
         let _kept = clean_up();
@@ -169,13 +170,14 @@ pub fn end_on_signals<T>(clean_up: impl FnOnce() -> T + Send + 'static, exit_cod
     unsafe { SetConsoleCtrlHandler(Some(handle_event), 1) };
 }
 
-/// Cleans up and ends the process. The system calls this function on a separate thread.
+/// Handles a console event: cleans up and ends the process. The system calls this function on a separate thread.
 unsafe extern "system" fn handle_event(event: u32) -> BOOL {
     let signal = if matches!(event, CTRL_C_EVENT | CTRL_BREAK_EVENT) { 2 } else { 15 };
     let end = END.lock().unwrap_or_else(PoisonError::into_inner).take();
     if let Some(end) = end {
         end(signal);
     }
-    // Reached if another event is already being handled; 1 tells the system that this event is handled, too.
+    // This line is reached if another event is already being handled; 1 tells the system that this event is handled,
+    // too.
     1
 }

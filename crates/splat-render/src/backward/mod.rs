@@ -1,14 +1,15 @@
-//! Gradients of renders: from ∂L/∂pixel to derivatives with respect to the stored attributes of Gaussians.
+//! Gradients of renders: computes the derivatives of a loss L with respect to the stored attributes of Gaussians from
+//! its derivatives ∂L/∂pixel with respect to the pixels.
 //!
-//! The modules form a pipeline: the render as in [`render`](super::render), a loss of the caller, `tile` (a backward
-//! pass over the same pairs), `splat` (the derivative of the projection). Input: [`Gaussians`] and a [`Camera`].
-//! Output: [`Gradients`]. Memory beside that of the render: 72 bytes per visible Gaussian
-//! ([`GRADIENT_BYTES_PER_VISIBLE`]) and 36 bytes per pair of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward
-//! model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et al., "gsplat", 2024. The gradients are derived in
-//! docs/method.md, section 8.1.
+//! The steps are: the render as in [`render`](super::render), a loss of the caller, a backward pass over the splats of
+//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a [`Camera`]. Output:
+//! [`Gradients`]. Memory in addition to that of the render: 72 bytes per visible Gaussian
+//! ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat, tile) pair of a part of a strip
+//! ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et
+//! al., "gsplat", 2024. The gradients are derived in docs/method.md, section 8.1.
 //!
-//! Discontinuities have no derivative: an alpha that crosses 1/255, an order that changes, a tile that is newly
-//! touched. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.
+//! Discontinuities of the render are ignored: an alpha that crosses 1/255, a changed depth order, a tile that a splat
+//! newly touches. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.
 
 mod splat;
 pub(super) mod sums;
@@ -25,29 +26,29 @@ use splat_core::{Attributes, Camera, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
 
-/// Number of Gaussians whose gradients one task adds: a multiple of the block size.
+/// Number of Gaussians whose gradients one parallel task computes: a multiple of the block size of the projection.
 const SPAN: usize = 32 * BLOCK;
 
-/// Bytes per visible Gaussian for the gradient of a render.
+/// Bytes of memory per visible Gaussian for a render and its gradient.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
-/// Maximum number of pairs of a splat and a tile whose sums are in memory. Small renders have fewer pairs; others are
-/// processed in parts of a strip.
+/// Maximum number of (splat, tile) pairs whose gradient sums are in memory. A strip of tiles with more pairs is
+/// processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
-/// Bytes for the pairs of a splat and a tile for the gradient of a render.
+/// Bytes of memory for the (splat, tile) pairs of a strip of tiles for a render and its gradient.
 pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {
-    /// Renders like [`Renderer::render`] and adds the derivatives of a loss with respect to the stored attributes of
-    /// `gaussians` to `out`.
+    /// Renders like [`Renderer::render`] and adds the derivatives of a loss of the image with respect to the stored
+    /// attributes of `gaussians` to `out`.
     ///
-    /// `loss` returns the loss of the render and its derivative with respect to each value, `[height, width, 3]`.
-    /// Returns the loss. Results have the same bits for any number of threads. A pixel gets gradient 0 if its color or
-    /// its derivative is not finite. Gaussians that are not visible get 0.
+    /// `loss` gets the image and returns the loss and its derivative with respect to each value of the image. Returns
+    /// the loss. Results have the same bits for any number of threads. A pixel whose color or derivative is not finite
+    /// has no effect on gradients. Gaussians that are not visible get gradient 0.
     ///
     /// # Panics
-    /// If `out` has another number of Gaussians or a higher SH degree, the attributes of `gaussians` have different
-    /// lengths, or `loss` returns a derivative of another size.
+    /// Panics if `out` has another number of Gaussians or a higher SH degree than `gaussians`, if the attributes of
+    /// `gaussians` have different lengths, or if `loss` returns a derivative of another size than the image.
     pub fn gradient(
         &mut self,
         gaussians: &Gaussians,
@@ -90,8 +91,9 @@ impl Renderer {
         value
     }
 
-    /// Computes the gradient sums of every splat. First tiles run in parallel, then splats; each splat adds its tiles
-    /// in their order.
+    /// Computes the gradient sums of every splat from the derivative `pixel_gradient` of the loss with respect to
+    /// `image`; without `SHAPE` only those of its color. Tiles run in parallel, then splats; each splat adds the sums
+    /// of its tiles in a fixed order.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();
@@ -114,7 +116,7 @@ impl Renderer {
                 });
                 let add = |(k, totals): (usize, &mut [SplatSums<f64>])| {
                     for (&splat, sums) in bins.pairs(tiles.clone()).iter().zip(&*pair_sums) {
-                        // The index of a splat of another part wraps around or lies beyond the end.
+                        // For a splat outside this part, the index wraps around or lies beyond the end.
                         if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {
                             total.add(sums);
                         }

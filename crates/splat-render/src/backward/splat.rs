@@ -1,10 +1,12 @@
-//! Derivative of the projection: from splat gradients to gradients of the stored attributes.
+//! Derivative of the projection: computes the gradients of the stored attributes of Gaussians from the gradient sums of
+//! their splats.
 //!
-//! Blocks are processed like in the projection, in f64 where the projection uses f64. A footprint enters only through
-//! its whitened axes, so very thin and very large Gaussians lose no digits that the projection kept (docs/method.md,
-//! section 8.1). Input: sums per splat. Output: sums per Gaussian. Memory: stack arrays of [`BLOCK`] entries. Source of
-//! the projection: Zwicker et al., "EWA Splatting", 2002. Names that begin with `by_` hold derivatives of the loss with
-//! respect to the rest of the name.
+//! Blocks are processed like in the projection, in f64 where the projection uses f64. Offsets in a footprint are
+//! expressed in its standard deviations instead of inverting its covariance, so that very thin and very large Gaussians
+//! lose no digits that the projection kept (docs/method.md, section 8.1). Input: gradient sums of splats. Output:
+//! gradients of Gaussians. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker et al., "EWA
+//! Splatting",
+//! 2002. Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
 
 use std::ops::Range;
 
@@ -14,8 +16,8 @@ use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat,
 use super::sums::SplatSums;
 use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
 
-/// Adds the gradients of the Gaussians of `splats` to `out`, which contains these Gaussians. `sums` holds the gradient
-/// sums of each splat.
+/// Adds the gradients of the Gaussians of `splats` to `out`, which must contain these Gaussians. `sums` holds the
+/// gradient sums of each splat over its pixels.
 pub(super) fn add(
     gaussians: &Gaussians,
     splats: &[Splat],
@@ -25,7 +27,7 @@ pub(super) fn add(
 ) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// Runs [`add_blocks`] compiled for AVX2. Arithmetic is not fused, so results have the same bits.
+        /// Calls [`add_blocks`], compiled for AVX2. Operations are not fused, so results have the same bits.
         #[target_feature(enable = "avx2")]
         fn add_avx2(
             gaussians: &Gaussians,
@@ -36,7 +38,7 @@ pub(super) fn add(
         ) {
             add_blocks(gaussians, splats, sums, view, out);
         }
-        /// Runs [`add_blocks`] compiled for AVX-512, with the same bits.
+        /// Calls [`add_blocks`], compiled for AVX-512. Results have the same bits.
         #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
         fn add_avx512(
             gaussians: &Gaussians,
@@ -62,7 +64,7 @@ pub(super) fn add(
     add_blocks(gaussians, splats, sums, view, out);
 }
 
-/// Adds the gradients block by block.
+/// Does the work of [`add`] in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn add_blocks(
     gaussians: &Gaussians,
@@ -98,16 +100,16 @@ fn add_blocks(
     }
 }
 
-/// View directions of the Gaussians of a block.
+/// Directions from the camera to the Gaussians of a block, on which their colors depend.
 struct Directions {
     /// Unit vectors from the camera center to the Gaussians.
     unit: [[f32; BLOCK]; 3],
-    /// One over the distances.
+    /// Reciprocals of the distances from the camera center to the Gaussians, 1 / scene unit.
     per_distance: [f32; BLOCK],
 }
 
 impl Directions {
-    /// Computes the directions of the Gaussians `ids`.
+    /// Computes the directions from the camera of `view` to the Gaussians `ids`.
     #[inline(always)]
     fn new(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms) -> Self {
         let n = ids.len().min(BLOCK);
@@ -122,19 +124,19 @@ impl Directions {
         directions
     }
 
-    /// Returns the unit vector of Gaussian `i` of the block.
+    /// Returns the unit vector from the camera center to Gaussian `i` of the block.
     #[inline(always)]
     fn at(&self, i: usize) -> [f32; 3] {
         [self.unit[0][i], self.unit[1][i], self.unit[2][i]]
     }
 }
 
-/// Gradient sums of the Gaussians of a block, as in [`SplatSums`]; 0 for Gaussians that are not visible.
+/// Gradient sums of the splats of a block of Gaussians, see [`SplatSums`]; 0 for Gaussians that are not visible.
 struct GradientBlock {
     p: [f64; BLOCK],
     first: [[f64; BLOCK]; 2],
     second: [[f64; BLOCK]; 3],
-    /// Color gradients, 0 for channels that were clamped at 0.
+    /// Derivatives of the loss with respect to the colors; 0 for channels that were clamped at 0.
     color: [[f32; BLOCK]; 3],
 }
 
@@ -146,7 +148,8 @@ impl Default for GradientBlock {
 }
 
 impl GradientBlock {
-    /// Copies the sums of the block's splats. `start` is the first Gaussian of the block.
+    /// Copies the gradient sums `sums` of the `splats` of this block. `start` is the index of the first Gaussian of the
+    /// block.
     fn fill(&mut self, splats: &[Splat], sums: &[SplatSums<f64>], start: usize) {
         *self = GradientBlock::default();
         for (splat, sums) in splats.iter().zip(sums) {
@@ -158,7 +161,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of SH coefficients: Y_k times the color gradient.
+    /// Adds the gradients of the SH coefficients to `out`: the value of the basis function Y_k times the gradient of
+    /// the color.
     #[inline(always)]
     fn add_harmonics(
         &self,
@@ -182,7 +186,7 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of positions through the view direction, on which the color depends.
+    /// Adds the part of the gradients of positions that comes from the view direction, on which the color depends.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -192,7 +196,7 @@ impl GradientBlock {
         out: &mut GradientSpan<'_>,
     ) {
         let n = ids.len().min(BLOCK);
-        // Gradient of each Y_k: color gradient times coefficients.
+        // Gradient of each SH basis function Y_k: the gradient of the color times the SH coefficients.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
@@ -221,7 +225,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of opacity, scale, rotation, and of position through the footprint.
+    /// Adds the gradients of opacity, scale and rotation, and the part of the gradients of positions that comes from
+    /// the footprint.
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
@@ -264,7 +269,7 @@ impl GradientBlock {
     }
 }
 
-/// Gradient of the geometry of one Gaussian.
+/// Derivatives of the loss with respect to position, quaternion and log scales of one Gaussian.
 struct GeometryGradient {
     position: [f64; 3],
     rotation: [f64; 4],
@@ -272,7 +277,8 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// Computes the gradient from the sums `first` = [x, y] and `second` = [xx, xy, yy] of [`SplatSums`].
+    /// Computes the gradient from the stored attributes and from the sums `first` = [x, y] and `second` = [xx, xy, yy]
+    /// of [`SplatSums`]. `q` is the quaternion (w, x, y, z).
     #[inline(always)]
     fn new(
         position: [f64; 3],
@@ -286,14 +292,14 @@ impl GeometryGradient {
         let covariance = shape.covariance();
         let [a, b] = shape.spread;
 
-        // Offsets in standard deviations: s = (x − shear·y)·per_s, t = y·per_t.
+        // Offsets of pixels in standard deviations of the footprint: s = (x − shear·y)·per_s, t = y·per_t.
         let (shear, per_s, per_t) =
             (covariance.xy / covariance.yy, (covariance.yy / covariance.det).sqrt(), (1.0 / covariance.yy).sqrt());
         let (s, t) = (per_s * x, per_t * y);
         let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
-        // For each axis of the Gaussian: ∂L/∂log scale, ∂L/∂a and ∂L/∂b.
+        // For each axis of the Gaussian, computes ∂L/∂log scale, ∂L/∂a and ∂L/∂b.
         let by_axis = |j: usize| {
-            // Components of the axis in s and t.
+            // Components of the axis along s and t.
             let (along_s, along_t) = (per_s * (a[j] - shear * b[j]), per_t * b[j]);
             let (by_s, by_t) = (ss * along_s + st * along_t, st * along_s + tt * along_t);
             let by_a = per_s * by_s;
@@ -302,7 +308,7 @@ impl GeometryGradient {
         };
         let [(scale_0, a_0, b_0), (scale_1, a_1, b_1), (scale_2, a_2, b_2)] = [by_axis(0), by_axis(1), by_axis(2)];
 
-        // a and b are `to_pixels` · axes · scale.
+        // `a` and `b` are `to_pixels` · axes · scale (see [`ProjectedShape::spread`]).
         let by_to = |by: [f64; 3]| {
             let by = [by[0] * shape.scale[0], by[1] * shape.scale[1], by[2] * shape.scale[2]];
             let along = |axis: usize| dot(by, [shape.axes[0][axis], shape.axes[1][axis], shape.axes[2][axis]]);
@@ -335,10 +341,11 @@ impl GeometryGradient {
     }
 }
 
-/// Returns ∂L/∂quaternion (wxyz, of any length), given ∂L/∂angle about each world axis: 2·(0, torque) ⊗ q / ‖q‖².
+/// Returns ∂L/∂quaternion for a quaternion (w, x, y, z) of any length. `torque` is ∂L/∂angle for rotations about the
+/// world axes. The formula is 2·(0, torque) ⊗ q / ‖q‖².
 ///
-/// A rotation changes a quaternion by half the angle times the quaternion. A change along the quaternion itself has no
-/// effect. The result is not finite for a zero quaternion.
+/// A rotation by a small angle changes a quaternion q by half the angle times q. A change of the length of q has no
+/// effect on the loss. The result is not finite for a zero quaternion.
 #[inline(always)]
 fn by_quaternion([w, x, y, z]: [f64; 4], torque: [f64; 3]) -> [f64; 4] {
     let twice = 2.0 / (w * w + x * x + y * y + z * z);

@@ -1,23 +1,24 @@
-//! Gradients of splats: sums over pixels, per pair of a splat and a tile, and per splat.
+//! Gradient sums of splats over pixels: per tile that a splat touches, and over all tiles.
 
-/// Gradient sums of one splat: f32 sums of a tile in a fixed order, or f64 sums of those.
+/// Sums over pixels from which the gradients of one splat are computed: f32 sums over a tile in a fixed order, or f64
+/// sums over tiles.
 ///
-/// p = alpha · ∂L/∂alpha, and (x, y) is the offset of a pixel: y along v from the center of the splat, x along u from
-/// the maximum of the row.
+/// In the fields, p = alpha · ∂L/∂alpha for a loss L, and (x, y) is the offset of a pixel: y from the center of the
+/// splat, x from the position of the largest alpha in the row of the pixel.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SplatSums<T> {
-    /// Σ p.
+    /// Σ p over the pixels.
     pub(super) p: T,
-    /// Σ p·x and Σ p·y.
+    /// Σ p·x and Σ p·y over the pixels.
     pub(super) first: [T; 2],
-    /// Σ p·x², Σ p·x·y and Σ p·y².
+    /// Σ p·x², Σ p·x·y and Σ p·y² over the pixels.
     pub(super) second: [T; 3],
-    /// Σ weight · ∂L/∂pixel, by channel.
+    /// Σ weight · ∂L/∂pixel for each color channel, where weight = alpha · transmittance.
     pub(super) color: [T; 3],
 }
 
 impl SplatSums<f64> {
-    /// Adds the sums of one tile.
+    /// Adds the sums over the pixels of one tile.
     #[inline(always)]
     pub(super) fn add(&mut self, tile: &SplatSums<f32>) {
         self.p += f64::from(tile.p);
@@ -30,8 +31,8 @@ impl SplatSums<f64> {
 /// Gradient sums of all splats of a render.
 #[derive(Debug, Default)]
 pub(in super::super) struct ImageGradientSums {
-    /// Sums of every splat.
+    /// Gradient sums of every splat over all tiles.
     pub(super) totals: Vec<SplatSums<f64>>,
-    /// Sums of every pair of a strip.
+    /// Gradient sums of every (splat, tile) pair of a strip of tiles, or of a part of it.
     pub(super) pairs: Vec<SplatSums<f32>>,
 }

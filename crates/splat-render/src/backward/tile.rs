@@ -1,9 +1,9 @@
-//! Backward pass over a tile: from pixel gradients to splat gradients.
+//! Backward pass over a tile: computes gradient sums of splats from the gradients of pixels.
 //!
-//! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its own
-//! contribution from the remaining color of a pixel; the remainder is the color behind the splat (docs/method.md,
-//! section 8.1). Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per pair of a splat and
-//! the tile. Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
+//! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its part
+//! from the color of a pixel; the rest is the color that comes from behind the splat (docs/method.md, section 8.1).
+//! Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per splat of the tile ([`SplatSums`]).
+//! Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
 
 use super::super::blend::{BlendSink, Fragment, GROUPS, TilePlane};
 use super::super::convention::{MAX_ALPHA, TILE};
@@ -12,21 +12,24 @@ use super::super::project::Splat;
 use super::super::renderer::Image;
 use super::sums::SplatSums;
 
-/// Largest alpha below the clamp value.
+/// Largest alpha below [`MAX_ALPHA`], to which larger alphas are clamped.
 const MAX_UNCLAMPED_ALPHA: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 
-/// Gradients of the pixels of a tile, and the remaining color during the pass.
+/// Gradients ∂L/∂pixel of the loss with respect to the pixels of a tile, and the color that comes from behind the
+/// splats processed so far.
 pub(super) struct PixelGradients {
-    /// ∂L/∂pixel, by channel.
+    /// ∂L/∂pixel, one plane per color channel.
     pixel: [TilePlane; 3],
-    /// Scalar product of ∂L/∂pixel with the remaining color of the pixel.
+    /// Scalar product of ∂L/∂pixel and the color that comes from behind the splats processed so far.
     rest: TilePlane,
 }
 
 impl PixelGradients {
-    /// Reads tile `tile` of `image` and its gradient. A pixel that is not finite in either of them gets gradient 0.
+    /// Copies the tile in column `tile[0]` and row `tile[1]` of `image` and of its `gradient`. A pixel whose color or
+    /// gradient is not finite gets gradient 0.
     pub(super) fn new(image: &Image, gradient: &Image, tile: [u32; 2]) -> Self {
-        // Copied first, because the copies wait for memory together. Read one by one, each pixel would wait alone.
+        // Copies whole tiles first: their reads wait for memory at the same time, whereas reads of single pixels would
+        // wait one by one.
         let (colors, gradients) = (image.tile(tile), gradient.tile(tile));
         let (mut pixel, mut rest) = ([TilePlane::default(); 3], TilePlane::default());
         for group in 0..GROUPS {
@@ -44,14 +47,14 @@ impl PixelGradients {
     }
 }
 
-/// Accumulates the gradients of splats; only of their colors unless `SHAPE`.
+/// Computes the gradient sums of the splats of a tile; without `SHAPE` only those of their colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
-    /// Gradient sums per pair of the tile.
+    /// Gradient sums of each splat of the tile.
     pub(super) pairs: &'a mut [SplatSums<f32>],
 }
 
-/// Partial gradient sums of the splat that is being processed.
+/// Color of the splat that is being processed, and its gradient sums so far, see [`SplatSums`].
 #[derive(Clone, Copy)]
 pub(super) struct SplatAccumulator<V: Lanes> {
     color: [V; 3],
@@ -93,8 +96,8 @@ impl<const SHAPE: bool> BlendSink for GradientSink<'_, SHAPE> {
         let own = red.mul(by_color[0]).add(green.mul(by_color[1])).add(blue.mul(by_color[2]));
         let rest = V::load(&self.gradients.rest, group).sub(own);
         rest.store(&mut self.gradients.rest, group);
-        // alpha · (transmittance · own − rest / (1 − alpha)). A clamped alpha has gradient 0. The division waits only
-        // for alpha.
+        // p = alpha · ∂L/∂alpha = own − rest · alpha / (1 − alpha). A clamped alpha has gradient 0. The division
+        // depends only on alpha, so it can start early.
         let odds = alpha.div(V::splat(1.0).sub(alpha));
         let unclamped = V::both(blended, V::splat(MAX_UNCLAMPED_ALPHA).at_least(alpha));
         let p = own.sub(odds.mul(rest)).keep(unclamped);

@@ -1,10 +1,11 @@
-//! Implementation with AVX2 registers.
+//! Vectors for blending pixels with AVX2 registers.
 
 use std::arch::x86_64::*;
 
 use super::{LANES, Lanes, Sums};
 
-/// Vector of one group. As a mask, all or no bits of each lane are set.
+/// Vector of one group: eight f32 lanes. Also serves as a mask, in which each lane has all bits set (true) or none
+/// (false).
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx2(pub(super) __m256);
 
@@ -137,7 +138,8 @@ impl Sums for Avx2 {
         self.store(&mut values, 0);
         values[0]
     }
-    /// Halves the number of registers with each addition, so that eight sums cost little more than two.
+    /// Computes the totals of eight sums together: each addition halves the number of registers, so eight totals cost
+    /// little more than two.
     #[inline(always)]
     fn totals(sums: [Self; LANES]) -> [f32; LANES] {
         let halves = |a: Self, b: Self| {
@@ -146,7 +148,7 @@ impl Sums for Avx2 {
         let quarters = |a, b| avx2!(_mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)));
         let [a, b, c, d, e, f, g, h] = sums;
         let (ab, cd) = (quarters(halves(a, e), halves(b, f)), quarters(halves(c, g), halves(d, h)));
-        // Pairs of lanes (a, b) and (c, d) of the first sums, then of the second ones.
+        // Adds lanes 0 and 1 of `ab` and `cd` to their lanes 2 and 3, in both halves of the registers.
         Avx2(avx2!(_mm256_add_ps(_mm256_shuffle_ps::<0x44>(ab, cd), _mm256_shuffle_ps::<0xee>(ab, cd)))).values()
     }
 }

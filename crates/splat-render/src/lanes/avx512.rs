@@ -1,11 +1,11 @@
-//! Implementation with AVX-512 registers.
+//! Vectors for blending pixels with AVX-512 registers.
 
 use std::arch::x86_64::*;
 
 use super::avx2::Avx2;
 use super::{EvenOddSums, LANES, Lanes};
 
-/// Vector of two groups.
+/// Vector of two groups: sixteen f32 lanes.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx512(__m512);
 
@@ -150,7 +150,7 @@ impl EvenOddSums for Avx512 {
 }
 
 impl Avx512 {
-    /// Returns the two groups.
+    /// Returns the two groups of the vector, eight lanes each.
     #[inline(always)]
     fn groups(self) -> [Avx2; 2] {
         avx512!([Avx2(_mm512_castps512_ps256(self.0)), Avx2(_mm512_extractf32x8_ps::<1>(self.0))])

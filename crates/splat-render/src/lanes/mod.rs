@@ -1,9 +1,10 @@
-//! Vectors of f32 in groups of eight: the arithmetic of the blend for AVX-512, AVX2 and all other machines.
+//! Vectors of f32 for blending pixels, with implementations for AVX-512, AVX2 and all other machines. A vector consists
+//! of groups of eight lanes, one pixel per lane.
 //!
-//! All implementations give the same bits. Every operation is a single IEEE operation. No multiply-add is fused: fused
-//! ones would make renders depend on the machine, and their software form is slow without hardware support. An AVX-512
-//! vector has two groups. Its groups are added to sums one after the other, like those of two narrower vectors.
-//! Alternatively each group is added to its own sums ([`EvenOddSums`]), like narrower vectors in two passes.
+//! All implementations give the same bits. Every operation is a single IEEE operation. Multiply-adds are not fused:
+//! fused ones would make renders depend on the machine, and are slow without hardware support. An AVX-512 vector has
+//! two groups, the others have one. To sum over groups with the same result, the two groups of an AVX-512 vector are
+//! added one after the other, or even and odd groups are summed separately on all machines ([`EvenOddSums`]).
 
 mod portable;
 
@@ -20,10 +21,10 @@ pub(super) use avx2::Avx2;
 pub(super) use avx512::Avx512;
 pub(super) use portable::Portable;
 
-/// Number of lanes of one group.
+/// Number of lanes (pixels) of one group.
 pub(super) const LANES: usize = 8;
 
-/// Values aligned to a cache line, so that no vector of them spans two lines.
+/// Wrapper that aligns values to a cache line, so that no vector of them spans two lines.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(align(64))]
 pub(super) struct Aligned<T>(pub(super) T);
@@ -43,85 +44,88 @@ impl<T> DerefMut for Aligned<T> {
     }
 }
 
-/// Rounding constant 1.5 · 2²³: a sum with it rounds an f32 of magnitude below 2²² to an integer in the low bits.
+/// Rounding constant 1.5 · 2²³. Adding it to an f32 of magnitude below 2²² rounds the number to an integer, which the
+/// low bits of the sum then hold.
 const ROUND: f32 = 12_582_912.0;
 
-/// Coefficients of 2^f = 1 + f·(c₁ + f·(c₂ + …)) on |f| ≤ ½: minimax approximation of the relative error, 4e-9 before
-/// rounding.
+/// Coefficients c₁, c₂, … of 2^f = 1 + f·(c₁ + f·(c₂ + …)) for |f| ≤ ½. Minimax approximation with a relative error of
+/// 4e-9 before rounding.
 const EXP2: [f32; 6] =
     [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_324, 0.009_618_437, 0.001_339_887_5, 0.000_153_533_62];
 
-/// Vector of one or more groups of eight f32 values.
+/// Vector of f32 values: one or more groups of eight lanes.
 ///
-/// A type of this trait may be used only if the machine has its instructions. Only `super::blend` chooses one, after
-/// detection.
+/// A type that implements this trait may be used only on a machine with its instructions. `super::blend` alone chooses
+/// the type, after it has detected them.
 pub(super) trait Lanes: Copy {
-    /// One truth value per lane.
+    /// Mask: one truth value per lane.
     type Mask: Copy;
-    /// Sums of one group.
+    /// Sums over groups, one for each of the eight lanes of a group.
     type Sums: Sums;
-    /// Sums of two groups: of the groups with even index, and of those with odd index.
+    /// Sums over the groups with even index, and separately over those with odd index.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
-    /// Number of groups in a vector; a power of two.
+    /// Number of groups of eight lanes in a vector; a power of two.
     const GROUPS: usize;
 
-    /// Tells the processor that the value will be read soon.
+    /// Tells the processor to load the given value into its cache, because it will be read soon.
     #[inline(always)]
     fn prefetch<T>(_: &T) {}
     /// Returns a vector with `value` in every lane.
     fn splat(value: f32) -> Self;
-    /// Returns a vector with these eight values in every group.
+    /// Returns a vector in which every group has the eight values of `group`.
     fn repeat(group: &[f32; LANES]) -> Self;
-    /// Returns a vector whose group k has value `first + k` in all of its lanes. `first` is a multiple of
-    /// [`Lanes::GROUPS`].
+    /// Returns a vector whose group k has entry `first + k` of `values` in all of its lanes, where `values` is read as
+    /// one list. `first` is a multiple of [`Lanes::GROUPS`].
     fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Loads the groups from `first` on. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Loads a vector from the groups of `from` that begin at index `first`, a multiple of [`Lanes::GROUPS`].
     fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Stores the groups from `first` on. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Stores the vector to the groups of `to` that begin at index `first`, a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
-    /// Returns the sum.
+    /// Returns the sum of each lane.
     fn add(self, other: Self) -> Self;
-    /// Returns the difference.
+    /// Returns the difference of each lane.
     fn sub(self, other: Self) -> Self;
-    /// Returns the product.
+    /// Returns the product of each lane.
     fn mul(self, other: Self) -> Self;
-    /// Returns the quotient.
+    /// Returns the quotient of each lane.
     fn div(self, other: Self) -> Self;
-    /// Returns the smaller value; `other` if either is NaN.
+    /// Returns the smaller value of each lane; that of `other` if either is NaN.
     fn min(self, other: Self) -> Self;
-    /// Returns the larger value; `other` if either is NaN.
+    /// Returns the larger value of each lane; that of `other` if either is NaN.
     fn max(self, other: Self) -> Self;
-    /// Returns the mask of `self ≥ other`; false for NaN.
+    /// Returns the mask of the lanes with `self ≥ other`, which is false for NaN.
     fn at_least(self, other: Self) -> Self::Mask;
-    /// Returns the intersection of two masks.
+    /// Returns the mask of the lanes that are set in both `a` and `b`.
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// Returns the mask as bits, one per lane.
+    /// Returns `mask` as an integer with one bit per lane.
     fn bits(mask: Self::Mask) -> u32;
-    /// Returns `self` where the mask is set, else 0.
+    /// Returns a vector with the lanes of `self` where `mask` is set, and 0 elsewhere.
     fn keep(self, mask: Self::Mask) -> Self;
-    /// Returns `self` where the mask is set, else `other`.
+    /// Returns a vector with the lanes of `self` where `mask` is set, and those of `other` elsewhere.
     fn or_else(self, mask: Self::Mask, other: Self) -> Self;
-    /// Returns `self` with the sign bit set where the mask is set.
+    /// Returns `self` with the sign bit set to 1 in the lanes where `mask` is set.
     fn negate_where(self, mask: Self::Mask) -> Self;
-    /// Returns whether the sign bit of every lane is set.
+    /// Returns whether the sign bit is set in every lane.
     fn all_negative(self) -> bool;
-    /// Returns the largest lane. No lane may be NaN.
+    /// Returns the largest value of all lanes. No lane may be NaN.
     fn largest(self) -> f32;
-    /// Adds each group in turn to `sums`.
+    /// Adds the groups of the vector, one after the other, to `sums` and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// Adds each group to its own sums. A vector of one group is added to the first sums.
+    /// Adds a group with even index to the even sums and one with odd index to the odd sums. A vector of one group is
+    /// added to the first sums.
     fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
-    /// Returns `self · 2ⁿ`, where the low bits of `rounded` hold n, as after adding [`ROUND`].
+    /// Returns `self · 2ⁿ` in each lane, where the low bits of `rounded` hold n, as after adding [`ROUND`].
     fn scale(self, rounded: Self) -> Self;
 
-    /// Computes 2^self for `self ≤ 0`. The relative error is below 1.6e-7 down to 2⁻¹²⁶; smaller results stay at or
+    /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; smaller results stay at or
     /// below 2⁻¹²⁶.
     #[inline(always)]
     fn exp2(self) -> Self {
         let power = self.max(Self::splat(-126.0));
         let rounded = power.add(Self::splat(ROUND));
         let f = power.sub(rounded.sub(Self::splat(ROUND)));
-        // Estrin's scheme has half the latency of Horner's, which is critical for the blend.
+        // The polynomial is evaluated by Estrin's scheme, which has half the latency of Horner's; blending waits for
+        // it.
         let pair = |k: usize| Self::splat(EXP2[k + 1]).mul(f).add(Self::splat(EXP2[k]));
         let square = f.mul(f);
         let low = pair(0).add(square.mul(pair(2)));
@@ -130,21 +134,22 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Sums of the groups with even index and of those with odd index.
+/// Sums over the groups with even index, and separately over those with odd index.
 ///
-/// Two separate sums halve the number of dependent additions: the two groups of a vector never wait for each other. A
-/// vector of one group is always added to the first sums. The two sums are swapped after all groups with even index.
+/// With separate sums, an addition waits for half as many earlier ones, because the two groups of a vector are added to
+/// different sums. A vector of one group is always added to the first sums; the caller swaps the two sums after all
+/// groups with even index.
 pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
-    /// Returns sums of 0.
+    /// Returns sums that are all 0.
     fn zero() -> Self;
-    /// Returns the sums in swapped order if vectors have one group, else unchanged.
+    /// Returns the even and odd sums in swapped order if vectors have one group, else unchanged.
     fn swapped(self) -> Self;
-    /// Returns the sum of both.
+    /// Returns the sum of the even and the odd sums.
     fn combined(self) -> Self::Sums;
 }
 
-/// Sums for vectors of one group. They are swapped after the even and after the odd groups.
+/// Even and odd sums for vectors of one group. The caller swaps them after the even and after the odd groups.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]
@@ -161,23 +166,23 @@ impl<V: Sums> EvenOddSums for [V; 2] {
     }
 }
 
-/// Sums in eight lanes.
+/// Eight sums, one per lane of a group.
 pub(super) trait Sums: Copy {
-    /// Returns sums of 0.
+    /// Returns sums that are all 0.
     fn zero() -> Self;
-    /// Returns the lane-wise sum.
+    /// Returns the sum of `self` and `other` in each lane.
     fn plus(self, other: Self) -> Self;
-    /// Returns the eight sums.
+    /// Returns the sums of the eight lanes.
     fn values(self) -> [f32; LANES];
 
-    /// Returns the sum of all lanes, added in a fixed order.
+    /// Returns the total of the eight lanes, added in a fixed order.
     #[inline(always)]
     fn total(self) -> f32 {
         let x = self.values();
         ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
     }
 
-    /// Returns [`Sums::total`] of eight sums.
+    /// Returns the [`Sums::total`] of each of eight `sums`.
     #[inline(always)]
     fn totals(sums: [Self; LANES]) -> [f32; LANES] {
         sums.map(Self::total)

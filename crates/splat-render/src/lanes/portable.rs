@@ -1,13 +1,13 @@
-//! Implementation for every machine, without intrinsics.
+//! Vectors for blending pixels on every machine, without intrinsics.
 
 use super::{LANES, Lanes, Sums};
 
-/// Vector of one group.
+/// Vector of one group: eight f32 lanes.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Portable([f32; LANES]);
 
 impl Portable {
-    /// Applies `f` to each pair of lanes.
+    /// Returns the vector of `f` applied to each lane of `self` and the same lane of `other`.
     #[inline(always)]
     fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
         Portable(std::array::from_fn(|l| f(self.0[l], other.0[l])))

@@ -1,11 +1,11 @@
-//! FLIP: the difference that a person perceives when alternating between two images.
+//! FLIP, a metric of the difference that a person perceives when alternating between two images.
 
 use nv_flip::{DEFAULT_PIXELS_PER_DEGREE, FlipImageRgb8};
 
 use super::{assert_same_size, clamped};
 use crate::Image;
 
-/// Computes the mean LDR-FLIP error over pixels of `a` against the reference `b`, in [0, 1]. Returns 0 for empty
+/// Computes the LDR-FLIP error of `a` against the reference `b`, averaged over pixels, in [0, 1]. Returns 0 for empty
 /// images.
 ///
 /// The viewing distance is the default of the method (67 pixels per degree). Images are converted to 8-bit sRGB values,
@@ -13,7 +13,7 @@ use crate::Image;
 /// 2020; computed by the authors' code.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the images differ.
 pub fn flip(a: &Image, b: &Image) -> f64 {
     assert_same_size(a, b);
     if a.data.is_empty() {

@@ -1,7 +1,8 @@
-//! Image metrics: PSNR, SSIM, FLIP, and the error of frame-to-frame differences.
+//! Image metrics: PSNR, SSIM, FLIP, and the temporal error (of the differences between successive frames).
 //!
 //! Input: pairs of [`Image`]s of equal size. Output: one f64 per pair. Values are clamped to [0, 1] first, as on a
-//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`]; FLIP takes the memory of its authors' code.
+//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`] per pixel; FLIP takes what the code of its authors
+//! needs.
 
 mod flip;
 mod ssim;
@@ -11,33 +12,34 @@ pub use ssim::{ssim, ssim_gradient};
 
 use crate::Image;
 
-/// Bytes per pixel to compare two images. SSIM needs the most.
+/// Bytes of memory per pixel for comparing two images. SSIM, which needs the most, takes this much.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
-/// Bytes per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and their derivatives twice.
+/// Bytes of memory per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and two copies of the
+/// derivatives, in f64 and f32.
 pub const SSIM_SLOPE_BYTES_PER_PIXEL: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
 
-/// Maximum PSNR in dB, returned for equal images. It keeps the mean over views finite.
+/// Maximum PSNR in dB, which equal images get instead of infinity. It keeps the mean over views finite.
 pub const PSNR_CAP_DB: f64 = 100.0;
 
 /// Computes the peak signal-to-noise ratio with peak 1 in dB: −10·log₁₀ of the mean squared difference over pixels and
-/// channels, at most [`PSNR_CAP_DB`]. For several views, average this value.
+/// channels, at most [`PSNR_CAP_DB`]. For several views, average the values in dB.
 ///
 /// Two empty images are equal. NaN in either image gives NaN.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the images differ.
 pub fn psnr(a: &Image, b: &Image) -> f64 {
     decibels(mean_square(channels(a, b).map(|(a, b)| a - b)))
 }
 
-/// Returns the PSNR in dB of a mean squared difference. NaN gives NaN.
+/// Returns the PSNR in dB that corresponds to a mean squared difference, at most [`PSNR_CAP_DB`]. NaN gives NaN.
 pub fn decibels(mean_square: f64) -> f64 {
     let db = -10.0 * mean_square.log10();
     if db > PSNR_CAP_DB { PSNR_CAP_DB } else { db }
 }
 
-/// Returns a PSNR as text with `digits` decimal places. NaN becomes an explanation.
+/// Returns `psnr` as text with its unit and `digits` decimal places. NaN is explained in words.
 pub fn decibels_text(psnr: f64, digits: usize) -> String {
     match psnr.is_nan() {
         true => "an unmeasurable PSNR (some pixels are NaN)".to_owned(),
@@ -45,20 +47,20 @@ pub fn decibels_text(psnr: f64, digits: usize) -> String {
     }
 }
 
-/// Computes the error of frame-to-frame differences: the root mean square of (a₁ − a₀) − (b₁ − b₀) over pixels and
-/// channels.
+/// Computes the temporal error (flicker) between two sequences `a` and `b`: the root mean square of (a₁ − a₀) − (b₁ −
+/// b₀) over pixels and channels.
 ///
-/// The arguments are the images of one view at two successive frames. The result is in [0, 2], and 0 if both sequences
-/// change equally. A constant error does not count; flicker does.
+/// Each argument holds the images 0 and 1 of one view at two successive frames. The result is in [0, 2], and 0 if both
+/// sequences change equally: an error that is constant over time does not count, flicker does.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the images differ.
 pub fn temporal_error(a: [&Image; 2], b: [&Image; 2]) -> f64 {
     let (before, after) = (channels(a[0], b[0]), channels(a[1], b[1]));
     mean_square(before.zip(after).map(|((a0, b0), (a1, b1))| (a1 - a0) - (b1 - b0))).sqrt()
 }
 
-/// Iterates over the clamped values of both images, in pairs.
+/// Iterates over the values of both images, clamped to [0, 1], in pairs. Panics if the sizes of the images differ.
 fn channels<'a>(a: &'a Image, b: &'a Image) -> impl ExactSizeIterator<Item = (f64, f64)> + 'a {
     assert_same_size(a, b);
     a.data.iter().zip(&b.data).map(|(&a, &b)| (clamped(a), clamped(b)))
@@ -70,12 +72,12 @@ fn assert_same_size(a: &Image, b: &Image) {
     assert_eq!(a.data.len(), b.data.len(), "images of different sizes");
 }
 
-/// Returns the value clamped to [0, 1], as on a screen.
+/// Returns `value` clamped to [0, 1], as a screen shows it.
 pub fn clamped(value: f32) -> f64 {
     f64::from(value.clamp(0.0, 1.0))
 }
 
-/// Returns the mean of squares, or 0 for no values.
+/// Returns the mean of the squares of `values`, or 0 if there are none.
 fn mean_square(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let count = values.len().max(1) as f64;
     values.map(|value| value * value).sum::<f64>() / count

@@ -1,4 +1,4 @@
-//! Structural similarity (SSIM), as the training and evaluation code of the field computes it.
+//! Structural similarity (SSIM) of images, computed as in the training and evaluation code of Gaussian splatting.
 //!
 //! Input: two images. Output: one number. Source: Wang et al., "Image Quality Assessment: From Error Visibility to
 //! Structural Similarity", 2004, with the window and the zero padding of the code of Kerbl et al. 2023.
@@ -8,23 +8,24 @@ use rayon::prelude::*;
 use super::{assert_same_size, clamped};
 use crate::Image;
 
-/// Radius of the window in pixels, without its center: the window has 11 taps.
+/// Radius of the Gaussian window in pixels, not counting its center. The window is 11 pixels wide.
 const RADIUS: usize = 5;
-/// Standard deviation of the window, pixels.
+/// Standard deviation of the Gaussian window, pixels.
 const SIGMA: f64 = 1.5;
-/// Stabilizing constant of the luminance term.
+/// Constant C₁ of SSIM, which keeps the luminance term stable for dark images.
 const C1: f64 = 0.01 * 0.01;
-/// Stabilizing constant of the contrast term.
+/// Constant C₂ of SSIM, which keeps the contrast term stable for uniform images.
 const C2: f64 = 0.03 * 0.03;
 
 /// Computes the SSIM of `a` and `b`: the mean over pixels and channels of (2 μₐ μ_b + C₁)(2 σ_ab + C₂) / ((μₐ² + μ_b² +
 /// C₁)(σₐ² + σ_b² + C₂)).
 ///
-/// The moments are taken under a normalized 11×11 Gaussian window with σ = 1.5 px; values outside the image are 0. The
-/// result is at most 1, for equal images, and 1 for two empty images. NaN in either image gives NaN.
+/// Means μ, variances σ² and covariance σ_ab are taken under a normalized 11×11 Gaussian window of σ = 1.5 pixels;
+/// pixels outside the image count as 0. Equal images, also empty ones, have the largest SSIM, 1. NaN in either image
+/// gives NaN.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the images differ.
 pub fn ssim(a: &Image, b: &Image) -> f64 {
     assert_same_size(a, b);
     if a.data.is_empty() {
@@ -40,14 +41,14 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     total / (3 * count) as f64
 }
 
-/// Computes the derivative of [`ssim`] of `a` and `b` with respect to each value of `a`, `[H, W, 3]`. The derivative is
+/// Computes the derivative of [`ssim`] of `a` and `b` with respect to each value of `a`, as an image. The derivative is
 /// 0 where clamping to [0, 1] changes the value.
 ///
-/// SSIM is S = (A₁A₂)/(B₁B₂) of windowed moments. The derivative follows by the chain rule; the windowing operator is
-/// its own adjoint.
+/// The SSIM of a pixel is S = (A₁A₂)/(B₁B₂), with factors computed from windowed sums. The derivative follows by the
+/// chain rule; applying the window is its own adjoint.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the images differ.
 pub fn ssim_gradient(a: &Image, b: &Image) -> Image {
     assert_same_size(a, b);
     let (width, count) = (a.width as usize, a.data.len() / 3);
@@ -78,21 +79,22 @@ pub fn ssim_gradient(a: &Image, b: &Image) -> Image {
     slope
 }
 
-/// Windowed sums of one channel of two images.
+/// Windowed sums (weighted by the Gaussian window around each pixel) of one channel of two images a and b.
 struct Moments {
-    /// Sums of a, b, a² + b² (only the sum of the two variances is needed), and a·b.
+    /// Windowed sums of a, b, a² + b² and a·b at every pixel. SSIM needs only the sum of the two variances, hence a² +
+    /// b².
     sums: [Vec<f64>; 4],
-    /// Buffer for the first of the two blur passes.
+    /// Buffer for the result of applying the window along rows, before it is applied along columns.
     scratch: Vec<f64>,
 }
 
 impl Moments {
-    /// Creates zero sums of `count` pixels.
+    /// Creates sums of 0 for `count` pixels.
     fn new(count: usize) -> Moments {
         Moments { sums: std::array::from_fn(|_| vec![0.0; count]), scratch: vec![0.0; count] }
     }
 
-    /// Computes the windowed sums of one channel.
+    /// Computes the windowed sums of channel `channel` of the images `a` and `b`.
     fn set_windowed(&mut self, a: &Image, b: &Image, channel: usize) {
         for (i, (a, b)) in a.data.iter().zip(&b.data).skip(channel).step_by(3).enumerate() {
             let (a, b) = (clamped(*a), clamped(*b));
@@ -105,24 +107,24 @@ impl Moments {
         }
     }
 
-    /// Returns the sums at pixel `i`.
+    /// Returns the windowed sums of a, b, a² + b² and a·b at pixel `i`.
     fn at(&self, i: usize) -> [f64; 4] {
         self.sums.each_ref().map(|sum| sum[i])
     }
 }
 
-/// Factors of S = (A₁A₂)/(B₁B₂) at one pixel, and the means.
+/// Factors of the SSIM S = (A₁A₂)/(B₁B₂) at one pixel, and the windowed means of both images.
 struct Terms {
-    /// Means of a and b.
+    /// Windowed means of the images a and b.
     means: [f64; 2],
-    /// Factors A₁ and A₂.
+    /// Factors A₁ and A₂ of the numerator of S.
     numerators: [f64; 2],
-    /// Factors B₁ and B₂.
+    /// Factors B₁ and B₂ of the denominator of S.
     denominators: [f64; 2],
 }
 
 impl Terms {
-    /// Computes the factors from the windowed sums of a pixel.
+    /// Computes the factors from the windowed sums of a, b, a² + b² and a·b at a pixel.
     fn new([a, b, squares, products]: [f64; 4]) -> Terms {
         let (squared_means, means_product) = (a * a + b * b, a * b);
         Terms {
@@ -132,13 +134,13 @@ impl Terms {
         }
     }
 
-    /// Returns S.
+    /// Returns the SSIM S of the pixel.
     fn similarity(&self) -> f64 {
         let Terms { numerators, denominators, .. } = self;
         numerators[0] * numerators[1] / (denominators[0] * denominators[1])
     }
 
-    /// Returns the derivatives of S with respect to the mean of a, to a² + b² and to a·b, and 0.
+    /// Returns the derivatives of S with respect to the windowed sums of a, a² + b² and a·b, and 0 as the fourth value.
     fn slopes(&self) -> [f64; 4] {
         let Terms { means: [a, b], numerators, denominators } = self;
         let (whole, s) = (denominators[0] * denominators[1], self.similarity());
@@ -148,14 +150,15 @@ impl Terms {
     }
 }
 
-/// Returns the taps of the window along one axis; their sum is 1.
+/// Returns the weights of the Gaussian window along one axis; their sum is 1.
 fn window() -> [f64; 2 * RADIUS + 1] {
     let tap = |i: usize| (-(i as f64 - RADIUS as f64).powi(2) / (2.0 * SIGMA * SIGMA)).exp();
     let sum: f64 = (0..=2 * RADIUS).map(tap).sum();
     std::array::from_fn(|i| tap(i) / sum)
 }
 
-/// Applies the window to `plane` `[height, width]` in place, along rows first.
+/// Applies the window to the image channel `plane` `[height, width]` in place, first along rows and then along columns.
+/// `scratch` is a buffer of the same size.
 fn blur(plane: &mut [f64], scratch: &mut [f64], width: usize, window: &[f64; 2 * RADIUS + 1]) {
     scratch.fill(0.0);
     for (from, to) in plane.chunks_exact(width).zip(scratch.chunks_exact_mut(width)) {

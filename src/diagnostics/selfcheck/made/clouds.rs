@@ -1,4 +1,4 @@
-//! Gaussians and cameras that are difficult for a rasterizer.
+//! Generated Gaussians and cameras that are difficult for a rasterizer.
 
 use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
@@ -18,7 +18,7 @@ pub fn camera(width: u32, height: u32) -> Camera {
     }
 }
 
-/// Returns a camera at the origin with the axes of the world.
+/// Returns a camera at the origin whose axes are those of the world, with square images of `size` pixels.
 pub fn plain_camera(size: u32) -> Camera {
     Camera {
         width: size,
@@ -33,11 +33,11 @@ pub fn plain_camera(size: u32) -> Camera {
     }
 }
 
-/// Pseudo-random numbers in [0, 1) (splitmix64).
+/// Generator of pseudo-random numbers in [0, 1) (splitmix64).
 pub struct Random(pub u64);
 
 impl Random {
-    /// Returns the next number.
+    /// Returns the next number in [0, 1).
     pub fn draw(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -46,14 +46,14 @@ impl Random {
         ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// Returns the next number, scaled to [`low`, `high`).
+    /// Returns the next number in [`low`, `high`).
     pub fn within(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.draw()
     }
 }
 
-/// Returns Gaussians with needles, flat, very large and very small ones, quaternions of any length and Gaussians
-/// off-screen.
+/// Returns `count` random Gaussians: among them needles, flat, very large and very small ones, some with quaternions
+/// that are not normalized, some off-screen.
 pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     let mut random = Random(seed);
     let mut scene = Gaussians::zeros(count, degree);
@@ -71,7 +71,7 @@ pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     scene
 }
 
-/// Returns one Gaussian on the axis of [`plain_camera`], `depth` away, of the color 1, ½, 0.
+/// Returns one Gaussian with the color (1, ½, 0), on the axis of [`plain_camera`] at the distance `depth`.
 pub fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);

@@ -1,3 +1,3 @@
-//! Generated inputs, the same on every run.
+//! Generated inputs of the self-check, the same on every run.
 
 pub mod clouds;

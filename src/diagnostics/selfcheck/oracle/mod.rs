@@ -1,4 +1,5 @@
-//! Slow oracles: the definitions written out in f64 over whole arrays, sharing no code with the code that they check.
+//! Oracles: slow reference computations that follow the definitions in f64 over whole arrays and share no code with the
+//! program that they check.
 
 pub mod picture;
 pub(crate) mod statistics;

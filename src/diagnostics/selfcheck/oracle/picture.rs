@@ -1,20 +1,21 @@
-//! Oracle of the rasterizer: f64 throughout, pixel by pixel, with full matrices. The extent of a Gaussian is limited
-//! only by the tiles of the original kernel.
+//! Oracle (slow reference) of the rasterizer: in f64 throughout, pixel by pixel, with full matrices. A Gaussian reaches
+//! all pixels of the tiles in which the original 3DGS kernel draws it, without any further limit.
 
 use crate::model::{Camera, Gaussians};
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
-/// Result of the oracle for one view.
+/// Render of one view by the oracle, the slow f64 reference.
 pub struct OracleRender {
     /// Colors of the pixels, `[height · width]`.
     pub rgb: Vec<[f64; 3]>,
-    /// Whether a decision at the pixel was within 1e-4 (relative) of its threshold, so that f32 may decide differently.
+    /// Whether a comparison at the pixel was within a fraction of 1e-4 of its threshold, so that f32 may decide
+    /// differently.
     pub doubtful: Vec<bool>,
-    /// Sum over the sampled pixels of alpha · transmittance, per Gaussian.
+    /// Σ alpha · transmittance of each Gaussian over the sampled pixels.
     pub sum: Vec<f64>,
-    /// Maximum over the sampled pixels of alpha · transmittance, per Gaussian.
+    /// Maximum alpha · transmittance of each Gaussian over the sampled pixels.
     pub max: Vec<f64>,
-    /// Number of (Gaussian, pixel) pairs blended.
+    /// Number of pairs of Gaussian and pixel that were blended.
     pub events: u64,
 }
 
@@ -26,7 +27,7 @@ struct Footprint {
     inverse: DMat2,
     opacity: f64,
     rgb: DVec3,
-    /// First and one-past-last tile, x then y.
+    /// Tiles that the Gaussian may cover: the first and one past the last, along x, then along y.
     tiles: [[i64; 2]; 2],
 }
 
@@ -37,7 +38,7 @@ impl Footprint {
     }
 }
 
-/// Returns the real spherical harmonics of degree up to 3 as products of x, y and z.
+/// Returns the real spherical harmonics up to degree 3 in the direction `d`, as products of x, y and z.
 fn basis(d: DVec3) -> [f64; 16] {
     let DVec3 { x, y, z } = d;
     let pi = std::f64::consts::PI;
@@ -62,7 +63,8 @@ fn basis(d: DVec3) -> [f64; 16] {
     ]
 }
 
-/// Returns the view depth in f32, summed in the order of the original kernel.
+/// Returns the depth of the position in the camera in f32, with the terms added in the same order as in the original
+/// 3DGS kernel.
 fn view_depth([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
     let row = camera.rotation.row(2).as_vec3();
     (row.x * x + row.y * y) + (row.z * z + camera.translation.z as f32)
@@ -114,19 +116,21 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     })
 }
 
-/// Renders a view; only the pixels of every `stride`-th column and row contribute to `sum` and `max`.
+/// Renders a view of `gaussians`. Only the pixels of every `stride`-th column and row count for `sum` and `max`.
 pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
     render_with(gaussians, camera, background, stride, |_, _| ())
 }
 
-/// Returns the ids that each pixel blends, nearest first. A small change of a Gaussian may change these lists.
+/// Returns for each pixel the indices of the Gaussians that are blended there, nearest first. A small change of a
+/// Gaussian may change these lists.
 pub fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
     let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
     render_with(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
     ids
 }
 
-/// Renders a view with the lists `blended` held fixed, which makes the image a smooth function of the parameters.
+/// Renders a view, blending in each pixel exactly the Gaussians listed in `blended`. With fixed lists, the image is a
+/// smooth function of the parameters.
 pub fn render_blended(
     gaussians: &Gaussians,
     camera: &Camera,

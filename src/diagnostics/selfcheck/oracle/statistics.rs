@@ -1,10 +1,10 @@
-//! Oracle of the statistics: whole sequences in memory, the definitions of method.md written out in f64, sharing no
-//! code with the streaming scan.
+//! Oracle (slow reference) of the statistics: the definitions of method.md written out in f64, over whole sequences in
+//! memory, without any code of the streaming scan.
 
 use crate::model::{Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
-/// Statistics of one Gaussian.
+/// Statistics of one Gaussian by the oracle, the slow f64 reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct OracleRow {
     pub(crate) d: f64,
@@ -15,7 +15,7 @@ pub(crate) struct OracleRow {
     pub(crate) vis: f64,
 }
 
-/// Returns the statistics of Gaussian `i`; frames are evenly spaced.
+/// Returns the statistics of Gaussian `i` over `frames`, which are evenly spaced in time.
 pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
@@ -54,7 +54,7 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan:
     OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 
-/// Returns the projected area in px², computed from the 3-D covariance and its projection.
+/// Returns the projected area of Gaussian `i` in px², computed by projecting its 3-D covariance.
 pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
@@ -66,7 +66,7 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     let q = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { q.map(|x| x / length) };
     let s = frame.log_scale.row::<3>(i).map(|log| f64::from(log).exp());
-    // Column k of R is the k-th unit vector rotated by q.
+    // Column k of the rotation matrix R is the k-th unit vector, rotated by the quaternion q.
     let axes: [[f64; 3]; 3] = std::array::from_fn(|k| rotated_unit_vector(q, k));
     let sigma: [[f64; 3]; 3] =
         std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| axes[k][r] * s[k] * s[k] * axes[k][c]).sum()));
@@ -84,7 +84,7 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
         (0..3).flat_map(|a| (0..3).map(move |b| (a, b))).map(|(a, b)| t[r][a] * sigma[a][b] * t[c][b]).sum()
     };
     let (xx, xy, yy) = (projected(0, 0) + 0.3, projected(0, 1), projected(1, 1) + 0.3);
-    // Pixel (i, j) is sampled at integer coordinates, so the image spans −½ to size − ½.
+    // The center of pixel (i, j) has the coordinates i and j, so the image extends from −½ to size − ½.
     let u = camera.fx * p[0] / p[2] + camera.cx - 0.5;
     let v = camera.fy * p[1] / p[2] + camera.cy - 0.5;
     let share = |center: f64, reach: f64, size: f64| {
@@ -95,7 +95,7 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     9.0 * std::f64::consts::PI * (xx * yy - xy * xy).sqrt() * fraction
 }
 
-/// Returns q e_k q*, multiplied out as quaternions.
+/// Returns the `k`-th unit vector e_k rotated by `q`: the quaternion product q e_k q*.
 fn rotated_unit_vector(q: [f64; 4], k: usize) -> [f64; 3] {
     let mut e = [0.0; 4];
     e[k + 1] = 1.0;

@@ -1,4 +1,4 @@
-//! Tests of COLMAP reconstructions.
+//! Tests of reading cameras from COLMAP reconstructions.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +8,8 @@ use glam::{DMat3, DVec3};
 use crate::files::cameras::{CameraOptions, Times, load};
 use crate::model::Split;
 
-/// Writes cameras and images as COLMAP does. `lens` is the text of a line of `cameras.txt` after the number.
+/// Writes cameras and images to `folder` as COLMAP does. `lens` is the rest of a line of `cameras.txt` after the camera
+/// number.
 fn write_colmap(folder: &Path, lens: &str, binary: bool) {
     let images: [(u32, [f64; 7], u32, &str); 3] = [
         (7, [0.5f64.sqrt(), 0.5f64.sqrt(), 0.0, 0.0, 1.0, 2.0, 3.0], 2, "cam1/frame_0003.png"),
@@ -62,7 +63,7 @@ fn colmap_text_and_binary_give_the_same_rig() {
     let [times, splits] =
         [&text, &binary].map(|rig| rig.shots.iter().map(|shot| (shot.time, shot.split)).collect::<Vec<_>>());
     assert_eq!(times, splits);
-    // Images are in natural order of their names, not in COLMAP's order.
+    // The images are in natural order of their names, not in the order of the COLMAP file.
     assert_eq!(times, [(Some(0.0), Split::Train), (Some(1.0), Split::Train), (Some(0.5), Split::Test)]);
     let first = &text.cameras[0];
     assert_eq!((first.width, first.height, first.fx, first.fy, first.cx, first.cy), (80, 60, 70.0, 71.0, 39.5, 31.0));
@@ -80,7 +81,7 @@ fn colmap_folders_per_frame_share_the_first_cameras() {
     write_colmap(&first, "PINHOLE 80 60 70 71 39.5 31", true);
     let load =
         |path: &Path, frames: Option<usize>| load(path, &CameraOptions { frames, ..CameraOptions::default() }).unwrap();
-    // A single folder gives no times; the camera numbers in image names must not be taken for times.
+    // A single folder has no times, and the camera numbers in image names must not be taken for times.
     assert!(load(&first, None).times().is_empty());
     for k in 4..6 {
         fs::create_dir(root.path().join(format!("colmap_{k}"))).unwrap();
@@ -93,7 +94,8 @@ fn colmap_folders_per_frame_share_the_first_cameras() {
     assert!(shot.image.as_ref().unwrap().ends_with("colmap_4/cam1/frame_0003.png"), "{shot:?}");
     let splits: Vec<Split> = rig.shots[3..6].iter().map(|shot| shot.split).collect();
     assert_eq!(splits, [Split::Test, Split::Train, Split::Test]);
-    // A model may have been trained on fewer frames, and its images may be elsewhere.
+    // The number of frames may be given, because a model may have been trained on fewer frames and its images may be
+    // elsewhere.
     assert_eq!(load(&first, Some(50)).times()[49], 0.98);
 }
 

@@ -41,7 +41,7 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// Returns `len` Gaussians whose values are all different and exact in an i16.
+/// Returns `len` Gaussians whose values are all different and exactly representable in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
     for (k, column) in Attributes::all().iter().enumerate() {
@@ -51,7 +51,7 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     out
 }
 
-/// Returns the bits of all values, because NaN is not equal to itself.
+/// Returns the bits of all values of an attribute, for comparisons in which NaN equals itself.
 fn bits(column: &AttributeValues) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }
@@ -79,7 +79,8 @@ fn trained_models_are_rewritten_byte_for_byte() {
         let ply = Ply::open(&path).unwrap();
         let written = temp.write(&ply, &kept(0..ply.count() as u32), &Gaussians::default());
         assert!(written == fs::read(&path).unwrap(), "{name}");
-        // These files have the INRIA layout, so the other writer gives the same bytes, except that normals are zero.
+        // `write_inria` must give the same bytes, because these files have the INRIA layout and only the normals may
+        // differ (zero).
         write_inria(&all(&ply), ply.comments(), &temp.path("inria.ply")).unwrap();
         assert!(fs::read(temp.path("inria.ply")).unwrap() == written, "{name}");
     }
@@ -186,7 +187,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
         write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
-    // Proxies and deltas have all SH coefficients; extra properties keep their place.
+    // Proxies and deltas contain all SH coefficients, and extra properties keep their place.
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&temp.open(&temp.write_changed(&ply, &rows, &proxies(1, 1), &change)));

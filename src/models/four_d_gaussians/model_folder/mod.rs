@@ -2,7 +2,8 @@
 //!
 //! Input: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, frame times. Output: states of any
 //! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d), the
-//! tensors of the field, and per open reader a copy of its canonical rows plus [`Field::bytes_per_gaussian`].
+//! tensors of the field, and for each open reader a copy of the canonical Gaussians that it reads and
+//! [`Field::bytes_per_gaussian`] for each of them.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -29,13 +30,13 @@ use crate::models::iterations::find_iteration;
 pub struct ModelPaths {
     /// Path of the model folder.
     pub root: PathBuf,
-    /// K of `iteration_K`.
+    /// Training iteration K of the folder `iteration_K`.
     pub iteration: u32,
     /// Path of `<root>/cfg_args`.
     pub cfg_args: PathBuf,
-    /// Path of the point cloud file with the canonical Gaussians.
+    /// Path of the point cloud file, which holds the canonical Gaussians.
     pub point_cloud: PathBuf,
-    /// Path of the state dict of the deformation field.
+    /// Path of the state dict (tensors by name) of the deformation field.
     pub deformation: PathBuf,
     /// Path of `deformation_table.pth`, if it exists.
     pub deformation_table: Option<PathBuf>,
@@ -44,7 +45,7 @@ pub struct ModelPaths {
 }
 
 impl ModelPaths {
-    /// Finds the files of the model at `root`, of `iteration` or of the largest one.
+    /// Finds the files of the model folder `root`, of the requested `iteration`, or of the largest one.
     ///
     /// # Errors
     /// Fails if a folder or a required file is missing.
@@ -70,12 +71,13 @@ impl ModelPaths {
         Ok(paths)
     }
 
-    /// Returns the required files, in the order in which the digest reads them.
+    /// Returns the paths of the required files, in the order in which [`ModelPaths::digest`] reads them.
     fn required(&self) -> [&Path; 3] {
         [&self.point_cloud, &self.deformation, &self.cfg_args]
     }
 
-    /// Returns the xxh3-128 hash of the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
+    /// Returns the xxh3-128 hash of the bytes of the point cloud file, the deformation file and `cfg_args`, as 32 hex
+    /// digits.
     ///
     /// # Errors
     /// Fails if a file cannot be read.
@@ -103,8 +105,8 @@ pub struct ModelFolder {
 }
 
 impl ModelFolder {
-    /// Reads the configuration and field of the model at `paths` within `memory`. `canonical` holds its Gaussians, with
-    /// SH degree `sh_degree`. The sequence has no frames yet.
+    /// Reads the configuration and the deformation field of the model at `paths`, using at most `memory`. `canonical`
+    /// holds its Gaussians, with SH degree `sh_degree`. The returned model has no frames yet.
     ///
     /// # Errors
     /// Fails if a file cannot be read, contradicts another, or needs more than `memory`.
@@ -125,12 +127,13 @@ impl ModelFolder {
         Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes, memory })
     }
 
-    /// Returns notes on contradictions between `cfg_args` and the weights.
+    /// Returns notes on contradictions between `cfg_args` and the weights of the deformation field.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Opens the model at `root`, of `iteration` or of the largest one. The sequence has no frames yet.
+    /// Opens the model folder `root` at the requested `iteration`, or at the largest one. The returned model has no
+    /// frames yet.
     ///
     /// # Errors
     /// Fails if a file is missing or damaged.
@@ -138,27 +141,27 @@ impl ModelFolder {
         Self::open_with(root, iteration, &PlyOptions::default())
     }
 
-    /// Opens a model like [`ModelFolder::open`], with the limits of `options`.
+    /// Opens a model like [`ModelFolder::open`], within the memory limit of `options`.
     pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open_with(&paths.point_cloud, options)?;
         Self::with_gaussians(paths, ply.whole()?, ply.sh_degree(), options.memory)
     }
 
-    /// Returns the memory limit for reading the files of the model again.
+    /// Returns the memory limit that holds for reading the files of the model again.
     pub(super) fn memory(&self) -> ReadLimit {
         self.memory
     }
 
-    /// Returns the same field and frames with other Gaussians. Their SH degree may differ only if no head deforms
-    /// color.
+    /// Returns a model with the same deformation field and frames, but with the Gaussians `canonical`. Their SH degree
+    /// may differ only if the field does not deform color.
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
         let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
         let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
         ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
     }
 
-    /// Returns the model with the field that it has after storage in half precision.
+    /// Returns the model with its deformation field rounded as storage in half precision rounds it.
     ///
     /// # Errors
     /// Fails if the field can no longer be read.
@@ -168,7 +171,7 @@ impl ModelFolder {
         Ok(ModelFolder { field: Arc::new(field), ..self })
     }
 
-    /// Returns the model with another field of the same configuration.
+    /// Returns the model with another deformation field of the same configuration.
     pub fn with_field(self, field: Field) -> Self {
         ModelFolder { field: Arc::new(field), ..self }
     }
@@ -192,7 +195,7 @@ impl ModelFolder {
         &self.config
     }
 
-    /// Returns the raw parameters of every Gaussian, before any deformation.
+    /// Returns the stored parameters of every Gaussian, before any deformation.
     pub fn canonical(&self) -> &Gaussians {
         &self.canonical.gaussians
     }
@@ -202,20 +205,21 @@ impl ModelFolder {
         &self.field
     }
 
-    /// Returns the bytes of the field's tensors in single precision.
+    /// Returns the bytes that the tensors of the deformation field take in single precision.
     pub(super) fn tensor_bytes(&self) -> u64 {
         self.tensor_bytes
     }
 
-    /// Returns the time of a frame; fails if the frame does not exist.
+    /// Returns the time of frame `frame`; fails if the frame does not exist.
     fn frame_time(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
         let missing = || Error::internal(format!("frame {frame} was asked for; the sequence has {}", times.len()));
         times.get(frame).copied().ok_or_else(missing)
     }
 
-    /// Returns the field's deltas at `time` for Gaussians at canonical `position` `[N, 3]`, which need not belong to
-    /// this model. [`Deltas::solve`] computes raw parameters from a desired state.
+    /// Returns the changes (deltas) that the deformation field makes at `time` to Gaussians at the canonical positions
+    /// `position` `[N, 3]`, which need not belong to this model. [`Deltas::solve`] computes stored parameters from a
+    /// desired state.
     ///
     /// # Errors
     /// Fails if the field cannot be evaluated.
@@ -254,7 +258,7 @@ impl FrameSource for ModelFolder {
         }))
     }
 
-    /// Reads blocks one by one: no frames are decoded together, so a reader of all Gaussians has nothing to keep.
+    /// Returns `None`: no frames are decoded together, so a reader of all Gaussians has nothing to keep in memory.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
@@ -268,14 +272,14 @@ impl FrameSource for ModelFolder {
     }
 }
 
-/// Evaluates blocks of Gaussians in parallel.
+/// Evaluation of blocks of Gaussians in parallel.
 impl Deformation for ModelFolder {
     fn stored(&self) -> &StoredParams {
         &self.canonical
     }
 
-    /// Excludes positions if the field has a mask. Derivatives treat the mask as constant, so a moved position would be
-    /// worse than an unchanged one.
+    /// Returns the attributes that the optimizer can change. Excludes positions if the field has a mask: derivatives
+    /// treat the mask as constant, so a moved position would be worse than an unchanged one.
     fn movable(&self) -> Attributes {
         if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
@@ -314,7 +318,7 @@ impl Deformation for ModelFolder {
     }
 }
 
-/// Reader of some Gaussians of the model.
+/// Reader of some Gaussians of the model, frame by frame.
 struct FieldReader<'a> {
     model: &'a ModelFolder,
     raw: Gaussians,

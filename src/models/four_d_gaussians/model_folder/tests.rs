@@ -5,7 +5,8 @@ use super::*;
 use crate::model::Gradients;
 use crate::passes::gather;
 
-/// Returns the folder of a trained model in `SPLATSIEVE_DATA`, else in `../shared/data`. The folder must exist.
+/// Returns the path of the trained model `name` in the folder `SPLATSIEVE_DATA`, else in `../shared/data`. The folder
+/// must exist.
 fn shared_model(name: &str) -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
@@ -14,7 +15,8 @@ fn shared_model(name: &str) -> PathBuf {
     folder
 }
 
-/// Reads a 3DGS PLY of float properties in the canonical order with SH degree 3, the layout of the test models.
+/// Reads a 3DGS PLY file of float properties in the canonical order with SH degree 3, which is the layout of the test
+/// models.
 fn read_cloud(path: &Path) -> Gaussians {
     let bytes = fs::read(path).unwrap();
     let mark = b"end_header\n";
@@ -207,7 +209,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     assert!(reader.read(1, Attributes::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
 }
 
-/// Creates a folder with the layout of a model and placeholder files.
+/// Creates a folder with the layout of a model, with `iterations` and placeholder files.
 fn folder(iterations: &[&str]) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     fs::write(root.path().join("cfg_args"), "Namespace()").unwrap();
@@ -307,7 +309,8 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
             through_field += usize::from((got - f64::from(weights.plane(axis)[i])).abs() > 1e-2);
         }
     }
-    // Within a step some positions cross the edge of a texel or a ReLU, where the derivative is not unique.
+    // Within a step some positions cross the edge of a texel, or an input of a ReLU changes its sign; there the
+    // derivative is not unique.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
     assert!(model.jacobian(3, model.stored(), Attributes::all()).is_err(), "there are three frames");
