@@ -1,13 +1,13 @@
 //! Measures the time of a frame state of the other model formats per Gaussian and frame, on one thread.
 //!
 //! - `network`: the network of Deformable-3D-Gaussians with a time network, for 1024 Gaussians that are prepared once;
-//! it makes 0.5 million multiplications. It is compared with a product of the same matrices by `matrixmultiply`,
-//! without biases, ReLUs and sines.
+//!   it makes 0.5 million multiplications. It is compared with a product of the same matrices by `matrixmultiply`,
+//!   without biases, ReLUs and sines.
 //! - `state`, if the trained models are available: complete frame states of Deformable-3D-Gaussians (which includes the
-//! decomposition of a covariance), with screws; of SC-GS, with each Gaussian 64 times, because all Gaussians share the
-//! network outputs for control nodes, which are computed for every time; of SpacetimeGaussians and FreeTimeGS, which
-//! are polynomials and a temporal window; of native 4D Gaussians, which are slices of covariances, without and with
-//! colors.
+//!   decomposition of a covariance), with screws; of SC-GS, with each Gaussian 64 times, because all Gaussians share the
+//!   network outputs for control nodes, which are computed for every time; of SpacetimeGaussians and FreeTimeGS, which
+//!   are polynomials and a temporal window; of native 4D Gaussians, which are slices of covariances, without and with
+//!   colors.
 //! - `open`: the time that a block of these takes once for all frames.
 //!
 //! `scripts/torch_speed.py` measures the same in PyTorch. Times are processor times, so other load on the machine does

@@ -1,13 +1,13 @@
 //! Measures the cost of merging on one thread.
 //!
 //! - `neighbors`: time per Gaussian of finding the nearest neighbors within ε. `voxels` is the index of the program,
-//! built and searched: in trained models with the ε of the presets, among evenly distributed Gaussians with few or many
-//! neighbors, in clusters, and in crowds (all in one voxel, and all at one point). It is compared with `tree`, one tree
-//! over all points searched in voxel order, which the program used earlier; with `all_pairs`, only for few Gaussians;
-//! and with `plain_hash`, whose voxels list their points and are looked up for each point.
+//!   built and searched: in trained models with the ε of the presets, among evenly distributed Gaussians with few or many
+//!   neighbors, in clusters, and in crowds (all in one voxel, and all at one point). It is compared with `tree`, one tree
+//!   over all points searched in voxel order, which the program used earlier; with `all_pairs`, only for few Gaussians;
+//!   and with `plain_hash`, whose voxels list their points and are looked up for each point.
 //! - `pairs`: time per pair and frame of measuring the motion of a pair, with positions in memory.
 //! - `measure`: the same from a packed container, at once and in eight partitions; the difference is the cost of
-//! gathering and reading again.
+//!   gathering and reading again.
 //! - `merge`: time per survivor of a complete pass without motion: neighbors, tests, clusters, proxies.
 //!
 //! Usage: `cargo bench --bench merge`

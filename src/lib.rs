@@ -6,11 +6,8 @@
 //!
 //! | folders | contents |
 //! |---|---|
-//! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | differences between operating
-//! systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics
-//! ([`render`], [`metrics`]); deformation fields ([`deform`]) |
-//! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, the
-//! compressed model, and the traits by which frames are read |
+//! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | differences between operating systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
+//! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, the compressed model, and the traits by which frames are read |
 //! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
 //! | [`progress`] | events by which the library reports its work |
 //! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; cached results of stages |
@@ -20,11 +17,11 @@
 //! | [`models`] | one folder per model format: recognize, open, evaluate, write back |
 //! | [`memory_plan`], [`statistics`], [`scene`], [`journal`] | the memory plan; statistics and scores; an input with its cameras; what stages record |
 //! | [`pruning`], [`refinement`], [`pipeline`] | stages, and the order in which they run |
-//! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | quality of a result, the other commands,
-//! HTML pages, the self-check and experiments |
+//! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | quality of a result, the other commands, HTML pages, the self-check and experiments |
 //!
 //! [`method`] derives the formulas that are implemented.
 
+#![allow(rustdoc::private_intra_doc_links, reason = "comments point to the code that implements them")]
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
 
 /// Name and version of the program, written into results.

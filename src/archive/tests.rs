@@ -9,23 +9,23 @@ use super::*;
 use crate::deform::{Tensor, tap};
 
 /// Generator of deterministic pseudo-random numbers.
-struct SeededNoise(u64);
+struct NoiseGenerator(u64);
 
-impl SeededNoise {
+impl NoiseGenerator {
     fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
     }
 }
 
-fn tensor(noise: &mut SeededNoise, shape: &[usize]) -> Tensor {
+fn tensor(noise: &mut NoiseGenerator, shape: &[usize]) -> Tensor {
     let data = (0..shape.iter().product()).map(|_| noise.next()).collect();
     Tensor { shape: shape.to_vec(), data }
 }
 
 /// Returns an archive content of `count` Gaussians with tensors of every role (plane, weights, exact, unread).
 fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
-    let mut noise = SeededNoise(seed);
+    let mut noise = NoiseGenerator(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
     for column in cloud.columns_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
@@ -265,7 +265,7 @@ fn malformed_tensors_are_refused_by_name() {
     let steps = some_steps(&whole, -4);
     for shape in [&[7][..], &[2, 1, 4, 4], &[1, 1, 0, 4]] {
         let mut odd = whole.clone();
-        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut SeededNoise(1), shape));
+        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut NoiseGenerator(1), shape));
         let message = encode(&odd, &steps).map(|_| ()).unwrap_err().to_string();
         assert!(message.contains("a.plane.xy") && message.contains(&format!("{shape:?}")), "{message}");
     }

@@ -142,7 +142,7 @@ pub(super) struct Compress {
     /// List the stages that --shard divides, in order, with their units, and do nothing else
     #[arg(long, conflicts_with = "shard", help_heading = CACHE, hide_short_help = true)]
     pub(super) list_stages: bool,
-    /// Also write a page that plays the result beside the original, as `view` does [default: OUTPUT.html]
+    /// Write a page, too, that plays the result beside the original, as `view` does [default: OUTPUT.html]
     #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
     #[arg(conflicts_with_all = ["dry_run", "shard"])]
     pub(super) view: Option<Option<PathBuf>>,
@@ -219,7 +219,7 @@ pub(super) enum OutputKindArg {
     Archive,
     /// Gaussians with cubic motion in time windows, for splaTV and WebGS
     Splatv,
-    /// Gaussians with piecewise linear motion, for readers of 4dgs
+    /// Gaussians with linear motion in pieces, for readers of 4dgs
     #[value(name = "4dgs")]
     FourDgs,
     /// One frame, for web viewers (.spz)
@@ -343,7 +343,7 @@ pub(super) struct CompareArgs {
     pub(super) max_views: Option<u32>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Also compute FLIP, a perceptual difference; takes several times longer
+    /// Compute FLIP too, a perceptual difference; takes several times longer
     #[arg(long)]
     pub(super) flip: bool,
 }

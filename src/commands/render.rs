@@ -36,7 +36,7 @@ pub enum RenderSelection {
         /// View number.
         view: u32,
     },
-    /// All views of the set, to a folder, as files named `tNNN_vNN` (frame, view).
+    /// Every view of the set, to a folder, as files named `tNNN_vNN` (frame, view).
     All(ImageFormat),
 }
 

@@ -31,7 +31,7 @@ pub enum Method {
 }
 
 impl Method {
-    /// All methods, those of this project first.
+    /// Every method, those of this project first.
     pub const ALL: [Method; 10] = [
         Method::Default,
         Method::NoRefine,

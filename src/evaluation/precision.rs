@@ -60,7 +60,7 @@ impl Source {
     /// Returns the name in tables and CSV files.
     pub fn name(self) -> &'static str {
         match self {
-            Source::Discretization => "discretisation",
+            Source::Discretization => "discretization",
             Source::Rounding => "rounding",
             Source::Model => "model",
         }
@@ -399,7 +399,7 @@ mod tests {
         };
         let csv = found.csv();
         let lines: Vec<&str> = csv.lines().collect();
-        assert_eq!(lines[1], "percentiles,discretisation,bits,2,0.25,0.5,C,,1,2,2,2,,,,7");
+        assert_eq!(lines[1], "percentiles,discretization,bits,2,0.25,0.5,C,,1,2,2,2,,,,7");
         assert_eq!(lines.len(), 3);
         assert_eq!(serde_json::from_str::<PrecisionDiagram>(&found.json()).unwrap(), found);
     }

@@ -16,7 +16,7 @@ fn uniform(i: usize, salt: u64) -> f64 {
 }
 
 /// Test scene of survivors (Gaussians to be merged), which owns the data that [`Survivors`] borrows.
-struct TestScene {
+struct MergeScene {
     states: Gaussians,
     ids: Vec<u32>,
     coverage: Vec<f64>,
@@ -25,7 +25,7 @@ struct TestScene {
     extent: f64,
 }
 
-impl TestScene {
+impl MergeScene {
     /// Creates a scene of `n` similar Gaussians, evenly distributed in the unit cube.
     fn uniform_cube(n: usize) -> Self {
         let mut states = Gaussians::zeros(n, 1);
@@ -38,7 +38,7 @@ impl TestScene {
             states.opacity_logit.set_row(i, [4.0 * value(9) - 2.0]);
             states.sh.set_row::<12>(i, std::array::from_fn(|k| 0.5 + 0.1 * value(10 + k as u64)));
         }
-        TestScene {
+        MergeScene {
             states,
             ids: (0..n as u32).collect(),
             coverage: (0..n).map(|i| uniform(i, 30)).collect(),
@@ -67,7 +67,7 @@ impl TestScene {
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
-    /// Merges only the Gaussians in `rows`, with frames as in [`TestScene::merge_moving`].
+    /// Merges only the Gaussians in `rows`, with frames as in [`MergeScene::merge_moving`].
     fn merge_rows(
         &self,
         rows: &[u32],
@@ -78,7 +78,7 @@ impl TestScene {
         self.merge_in_batches(rows, recipe, limit, frames, usize::MAX).0
     }
 
-    /// Merges like [`TestScene::merge_rows`] and measures the motion of at most `max_pairs` pairs in one call. Also
+    /// Merges like [`MergeScene::merge_rows`] and measures the motion of at most `max_pairs` pairs in one call. Also
     /// returns the number of pairs in each of these calls.
     fn merge_in_batches(
         &self,
@@ -88,7 +88,7 @@ impl TestScene {
         frames: &[AttributeValues],
         max_pairs: usize,
     ) -> (Merged, Vec<usize>) {
-        let TestScene { states, classes, extent, .. } = self;
+        let MergeScene { states, classes, extent, .. } = self;
         let survivors = Survivors { states, rows, importance: self.importance(), classes, extent: *extent };
         let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
         let mut batches = Vec::new();
@@ -135,7 +135,7 @@ fn group_of(groups: &MergeGroups, row: u32) -> usize {
 
 #[test]
 fn batched_measurement_merges_to_the_same_bits() {
-    let scene = TestScene::uniform_cube(3000);
+    let scene = MergeScene::uniform_cube(3000);
     let recipe = scene.recipe();
     let rows: Vec<u32> = (0..3000).collect();
     let frames = std::slice::from_ref(&scene.states.position);
@@ -154,7 +154,7 @@ fn batched_measurement_merges_to_the_same_bits() {
 
 #[test]
 fn static_neighbors_merge_diverging_ones_do_not() {
-    let scene = TestScene::uniform_cube(2000);
+    let scene = MergeScene::uniform_cube(2000);
     let still = scene.merge(&scene.recipe(), None);
     assert!(joins(&still) > 300, "{:?}", still.passes);
     assert_eq!(still.groups.len(), 2000 - joins(&still));
@@ -174,7 +174,7 @@ fn static_neighbors_merge_diverging_ones_do_not() {
 
 #[test]
 fn moving_and_scaling_the_scene_changes_no_group() {
-    let scene = TestScene::uniform_cube(1500);
+    let scene = MergeScene::uniform_cube(1500);
     let expected = scene.merge(&scene.recipe(), None).groups;
     let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
     for (rotation, scale, shift) in [
@@ -183,7 +183,7 @@ fn moving_and_scaling_the_scene_changes_no_group() {
         (DQuat::IDENTITY, 1024.0, DVec3::ZERO),
         (rotation, 1e-3, DVec3::new(0.002, 0.0, -0.001)),
     ] {
-        let transformed = TestScene::uniform_cube(1500).transformed(rotation, scale, shift);
+        let transformed = MergeScene::uniform_cube(1500).transformed(rotation, scale, shift);
         assert_eq!(
             transformed.merge(&scene.recipe(), None).groups,
             expected,
@@ -194,7 +194,7 @@ fn moving_and_scaling_the_scene_changes_no_group() {
 
 #[test]
 fn exact_duplicates_merge_to_one() {
-    let mut scene = TestScene::uniform_cube(60);
+    let mut scene = MergeScene::uniform_cube(60);
     for column in Attributes::all().iter() {
         for c in 0..scene.states.column(column).width() {
             let plane = scene.states.column_mut(column).plane_mut(c);
@@ -220,7 +220,7 @@ fn exact_duplicates_merge_to_one() {
 fn coincident_gaussians_merge_before_their_neighbors() {
     for count in [34, 100, 5000] {
         // Two sets of coincident Gaussians of different colors at one position, and one other Gaussian near them.
-        let mut scene = TestScene::uniform_cube(2 * count + 1);
+        let mut scene = MergeScene::uniform_cube(2 * count + 1);
         let places: Vec<u32> = (0..=2 * count as u32).map(|i| if i == 0 { 0 } else { 1 + i % 2 }).collect();
         scene.states = scene.states.pick(&places);
         for (i, &place) in places.iter().enumerate() {
@@ -244,7 +244,7 @@ fn coincident_gaussians_merge_before_their_neighbors() {
 
 #[test]
 fn a_giant_background_gaussian_stays_single() {
-    let mut scene = TestScene::uniform_cube(500);
+    let mut scene = MergeScene::uniform_cube(500);
     scene.states.position.set_row(7, [0.5; 3]);
     scene.states.log_scale.set_row(7, [100f32.ln(); 3]);
     scene.coverage[7] = 1e9;
@@ -254,7 +254,7 @@ fn a_giant_background_gaussian_stays_single() {
 
 #[test]
 fn non_finite_or_unmergeable_gaussians_stay_single() {
-    let mut scene = TestScene::uniform_cube(400);
+    let mut scene = MergeScene::uniform_cube(400);
     scene.classes[11] = None;
     scene.states.opacity_logit.set_row(12, [f32::NAN]);
     scene.states.sh.plane_mut(11)[13] = f32::INFINITY;
@@ -267,7 +267,7 @@ fn non_finite_or_unmergeable_gaussians_stay_single() {
 
 #[test]
 fn thread_count_changes_no_byte() {
-    let scene = TestScene::uniform_cube(5000);
+    let scene = MergeScene::uniform_cube(5000);
     let recipe = scene.recipe();
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -281,7 +281,7 @@ fn thread_count_changes_no_byte() {
 #[test]
 fn order_of_rows_changes_no_cluster() {
     let n = 1500;
-    let (scene, mut shuffled) = (TestScene::uniform_cube(n), TestScene::uniform_cube(n));
+    let (scene, mut shuffled) = (MergeScene::uniform_cube(n), MergeScene::uniform_cube(n));
     let new_row = |row: usize| (row * 7 + 3) % n;
     for row in 0..n {
         for column in Attributes::all().iter() {
@@ -302,7 +302,7 @@ fn order_of_rows_changes_no_cluster() {
 
 #[test]
 fn the_limit_counts_joins_over_all_passes_exactly() {
-    let scene = TestScene::uniform_cube(2000);
+    let scene = MergeScene::uniform_cube(2000);
     let mut recipe = scene.recipe();
     recipe.passes.push(recipe::MergePass { epsilon: 1.5 * recipe.passes[0].epsilon, ..recipe.passes[0] });
     let all = scene.merge(&recipe, None);
@@ -316,7 +316,7 @@ fn the_limit_counts_joins_over_all_passes_exactly() {
 
 #[test]
 fn two_pass_proxies_come_from_original_members() {
-    let scene = TestScene::uniform_cube(2000);
+    let scene = MergeScene::uniform_cube(2000);
     let mut recipe = scene.recipe();
     recipe.passes.push(recipe::MergePass { epsilon: 2.0 * recipe.passes[0].epsilon, d0: 3.0, ..recipe.passes[0] });
     let merged = scene.merge(&recipe, None);
@@ -327,7 +327,7 @@ fn two_pass_proxies_come_from_original_members() {
 #[test]
 fn no_survivors_and_one_survivor_pass_through() {
     for n in [0, 1] {
-        let scene = TestScene::uniform_cube(n);
+        let scene = MergeScene::uniform_cube(n);
         let merged = scene.merge(&Recipe::preset("default").unwrap().merge, None);
         assert_eq!((merged.groups.len(), merged.proxies.len()), (n, 0));
     }
@@ -335,10 +335,10 @@ fn no_survivors_and_one_survivor_pass_through() {
 
 #[test]
 fn unselected_rows_have_no_effect() {
-    let scene = TestScene::uniform_cube(1500);
+    let scene = MergeScene::uniform_cube(1500);
     let recipe = scene.recipe();
     let rows: Vec<u32> = (0..1500).filter(|row| row % 3 != 0).collect();
-    let part = TestScene {
+    let part = MergeScene {
         states: scene.states.pick(&rows),
         ids: rows.clone(),
         coverage: scene.coverage.clone(),

@@ -94,7 +94,7 @@ mod tests {
     fn invalid_bounds_are_refused() {
         for (text, expected) in [
             ("position", "COLUMN=BOUND"),
-            ("colour=1", "position, rotation, log_scale, opacity_logit, sh"),
+            ("color=1", "position, rotation, log_scale, opacity_logit, sh"),
             ("sh=1%", "only of positions"),
             ("sh=0", "above 0"),
             ("sh=-1", "above 0"),

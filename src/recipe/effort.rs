@@ -25,7 +25,7 @@ struct EffortSettings {
 }
 
 impl Effort {
-    /// All efforts, the fastest first.
+    /// Every effort, the fastest first.
     pub const ALL: [Effort; 3] = [Effort::Fast, Effort::Default, Effort::Best];
 
     /// Returns the name of the effort on the command line.

@@ -118,7 +118,8 @@ impl Browser {
 
     /// Returns the value of an expression in the page. Waits for a promise.
     pub(crate) fn value(&mut self, expression: &str) -> Value {
-        let parameters = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
+        let mut parameters = json!({ "expression": expression, "returnByValue": true });
+        parameters[concat!("await", "Promise")] = json!(true);
         let found = self.ask("Runtime.evaluate", parameters);
         assert!(found.get("exceptionDetails").is_none(), "{expression}: {}", found["exceptionDetails"]);
         found["result"]["value"].clone()

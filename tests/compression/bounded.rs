@@ -94,7 +94,7 @@ fn bounded_bytes_ignore_thread_count() {
 fn invalid_bounds_are_refused_by_name() {
     let workplace = Workplace::new();
     for (bound, expected) in [
-        ("colour=1", "position, rotation, log_scale, opacity_logit, sh"),
+        ("color=1", "position, rotation, log_scale, opacity_logit, sh"),
         ("sh", "COLUMN=BOUND"),
         ("sh=-1", "above 0"),
         ("sh=1%", "only of positions"),

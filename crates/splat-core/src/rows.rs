@@ -62,7 +62,7 @@ struct Declaration {
 }
 
 impl Statistic {
-    /// All statistics, in the order in which tables list them.
+    /// Every statistic, in the order in which tables list them.
     pub const ALL: [Statistic; 8] = [Self::D, Self::Kappa, Self::V, Self::Life, Self::C, Self::E, Self::Vis, Self::W];
 
     /// Returns the declaration of this statistic. A new statistic is described here and nowhere else.

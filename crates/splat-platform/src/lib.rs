@@ -16,7 +16,7 @@
 //! | [`create_private_folder`] | mode 0700 | as on Linux | permissions of the parent |
 //! | [`sync_file`], [`sync_folder`] | both | both | files only |
 //! | [`is_cached`] | `preadv2` | unknown | unknown |
-//! | [`expect_pages`], [`release_pages`] | `madvise` | `madvise` | no effect: the system decides |
+//! | [`expect_pages`], [`release_pages`] | advice on pages | advice on pages | no effect: the system decides |
 //! | [`end_on_signals`] | SIGINT, SIGTERM, SIGHUP | as on Linux | Ctrl+C, Ctrl+Break, closed console |
 //! | [`report_cut_short_maps`] | SIGBUS handler | no effect | no effect: a mapped file cannot be truncated |
 //! | [`memory_limits`] | machine, control groups, process | machine, process | machine, job object |
@@ -169,7 +169,7 @@ pub enum LimitSource {
     DataSize,
 }
 
-/// All memory limits that the system reports for this process.
+/// Every memory limit that the system reports for this process.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MemoryLimits {
     /// Limits that apply to more than this process: the physical memory of the machine first, then control groups or

@@ -176,6 +176,6 @@ pub(in crate::cli) enum SplitArg {
     Val,
     /// Test views
     Test,
-    /// All views
+    /// Every view
     All,
 }

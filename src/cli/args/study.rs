@@ -25,7 +25,7 @@ pub(in crate::cli) struct Sweep {
     /// Fractions of the Gaussians to keep, such as 0.5,20%,10x
     #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_value = "0.8,0.6,0.4,0.2,0.1", value_parser = parse_ratio)]
     pub(in crate::cli) fractions: Vec<f64>,
-    /// Also run `default` with these numbers of refinement steps, for error against run time; 0 leaves out refinement.
+    /// Run `default` also with these numbers of refinement steps, for error against run time; 0 leaves out refinement.
     /// The steps before prune steps change in proportion
     #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
     pub(in crate::cli) steps: Vec<u32>,

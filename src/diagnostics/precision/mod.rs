@@ -63,7 +63,7 @@ pub enum Knob {
 }
 
 impl Knob {
-    /// All knobs (groups of settings), in the order of the pipeline.
+    /// Every knob (group of settings), in the order of the pipeline.
     pub const ALL: [Knob; 7] =
         [Knob::Look, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
 

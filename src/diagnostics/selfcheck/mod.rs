@@ -29,7 +29,7 @@ use crate::error::{Error, Result};
 
 pub use case::Case;
 
-/// All cases, in the order of the pipeline.
+/// Every case, in the order of the pipeline.
 const CASES: [fn() -> Case; 28] = [
     statistics::motion,
     statistics::motion_far_away,
