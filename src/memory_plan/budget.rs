@@ -11,15 +11,15 @@ pub(super) const PROGRAM_BYTES: u64 = 18 << 20;
 /// Bytes of memory that each thread takes.
 pub(super) const PER_THREAD: u64 = 2 << 20;
 
-/// What a run tells about its memory and time before it starts.
+/// Amount of information about memory and time that a run sends as events before it starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Verbosity {
-    /// Nothing is told.
+    /// No information.
     #[default]
     Nothing,
-    /// Estimated time and maximum memory are told.
+    /// Estimated time and maximum memory.
     Time,
-    /// Memory of every stage, number of full reads of the input, and estimated time are told.
+    /// Memory of every stage, number of full reads of the input, and estimated time.
     Plan,
 }
 

@@ -31,8 +31,9 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// `Runs` only: number of successive frames after the first that repeat the opacities of the first, so that the
-    /// same Gaussians are alive. They are not included in `steps`, `turns` and `history` yet.
+    /// Used only if motion is counted within runs of visible frames (`MotionParams::Runs`): number of frames directly before the
+    /// current one that have the same opacities as the frame before them, so that the same Gaussians are alive. `steps`,
+    /// `turns` and `history` do not count these frames yet.
     steady: u32,
     /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,

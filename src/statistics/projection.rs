@@ -116,7 +116,8 @@ impl ScanView {
     }
 }
 
-/// Adds one view to the sums, in steps over [`BLOCK_LANES`] Gaussians. Inlined into the copy of each instruction set.
+/// Adds the coverage of one view to `sums`, [`BLOCK_LANES`] Gaussians at a time. Inlined into every function that is
+/// compiled for one instruction set.
 #[inline(always)]
 fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let n = planes.opacity.len();

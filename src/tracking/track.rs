@@ -102,7 +102,8 @@ impl OpenTrack {
         (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// Returns the Gaussians in `grid` that may continue the track in this round.
+    /// Returns the Gaussians in `grid` that may continue the track. `round` limits their distance and difference: matching starts
+    /// with narrow limits and repeats with wider ones.
     pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
         let mut candidates = Candidates::default();
         let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());

@@ -74,8 +74,8 @@ impl<'a> BilinearPatch<'a> {
     }
 }
 
-/// Two texels around a point on a line (a plane with time, interpolated at one time), with the data for linear
-/// interpolation between them.
+/// Two neighboring texels with the data for linear interpolation between them. They lie on the line that remains of a
+/// space-time plane when its time is fixed.
 struct TimeLineSegment<'a> {
     ends: [&'a [f32]; 2],
     fraction: f32,

@@ -58,7 +58,7 @@ impl SampledPixels {
         SampledPixels { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
     }
 
-    /// Returns the set of groups that contain a sampled pixel, one bit per group.
+    /// Returns which groups of [`LANES`] neighboring pixels in a row of the tile contain a sampled pixel, one bit per group.
     fn groups(&self) -> u32 {
         let rows = ((1u64 << self.down) - 1) as u32;
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()

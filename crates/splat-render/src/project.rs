@@ -46,8 +46,8 @@ pub(super) struct CameraTerms {
     pub(super) size: [u32; 2],
     /// Numbers of tiles across and down the image.
     pub(super) tiles: [u32; 2],
-    /// Largest depth, in scene units, at which Gaussians are not drawn; rounded to f32 as in the original CUDA
-    /// rasterizer.
+    /// Near limit in scene units: Gaussians at this depth or closer to the camera are not drawn. Rounded to f32 as in the
+    /// original CUDA rasterizer.
     near: f64,
 }
 

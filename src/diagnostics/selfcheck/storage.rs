@@ -121,7 +121,7 @@ fn model() -> (Content, Steps) {
     (content, Steps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
-/// Returns the number of components in use: those from position to opacity, and those of the SH degrees that exist.
+/// Returns how many entries of [`ATTRIBUTES`] the content has: position to opacity, and one per SH degree that exists.
 fn used_attributes(content: &Content) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }

@@ -47,9 +47,9 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
 /// Number of cameras around a still (model without motion); enough that every part of the surface is seen at more than
 /// a grazing angle from some camera.
 const SURROUNDING_CAMERAS: u32 = 24;
-/// Distance of the cameras around a still from its center, as a multiple of the radius of the surface.
+/// Distance of the cameras around a still from its center, as a multiple of the radius of its visible surface.
 const SURROUNDING_DISTANCE: f64 = 2.2;
-/// Field of view in degrees of the cameras around a still; the surface nearly fills the image.
+/// Field of view in degrees of the cameras around a still; the still nearly fills the image.
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
 /// Image width and height in pixels, for the cameras around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;

@@ -19,7 +19,7 @@ const FLOOR: f64 = 1e-7;
 pub(super) struct Nodes {
     /// Position and features of each node, `[M, 3 + h]`.
     values: Vec<f32>,
-    /// Number of values per node, 3 + h.
+    /// Number of values per node, 3 + h: position and h features.
     width: usize,
     /// For each node 1/(2r²) with its radius r, and σ(weight) with the logistic function σ.
     kernels: Vec<[f64; 2]>,

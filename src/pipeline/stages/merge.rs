@@ -261,7 +261,7 @@ struct Trial<'a> {
     work: &'a Cache,
     /// Maximum number of pairs whose motion is measured at the same time.
     pairs_together: usize,
-    /// Measured similarities of motion for pairs of the pool. They stay valid for every set of survivors.
+    /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is tried.
     known: KnownPairs,
     /// Progress of the stage: one unit per set of survivors on which merging was tried.
     progress: &'a Progress,
