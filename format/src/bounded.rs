@@ -293,8 +293,8 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the bits of the values of frame `frame` to `out`. `multiples` holds the multiples of all tracks in this
-    /// frame, `bytes` the decompressed bytes of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile. `multiples` holds
+    /// the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);

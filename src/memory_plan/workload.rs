@@ -205,8 +205,9 @@ impl Workload {
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns how often the whole input is read, at most, if `frames` evenly spread frames are read. Tiles are read as
-    /// a whole, and again if readers may keep only some of the frames of a tile.
+    /// Returns the maximum amount that is read for `frames` evenly spread frames, as a multiple (or fraction) of the whole
+    /// input. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only some of its
+    /// frames.
     pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {

@@ -39,7 +39,7 @@ pub struct PairMeter<'a> {
     /// Source from which the trajectories are read.
     pub source: &'a dyn FrameSource,
     /// Scan parameters. Used are `alpha_min`, the opacity from which a Gaussian is alive, and `motion`, which defines
-    /// the steps that count.
+    /// the steps between frames that count as motion.
     pub scan: &'a recipe::ScanParams,
     /// Thresholds of test 3 (motion).
     pub gate: MotionGate,

@@ -176,7 +176,7 @@ type Estimate = Box<dyn Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync
 struct LeftOutStage {
     what: &'static str,
     why: String,
-    /// Estimate of the memory, time and reads that are saved.
+    /// Estimate of the memory, time and reads that omitting the stage saves; `None` if it is not known.
     estimate: Option<Estimate>,
 }
 

@@ -150,7 +150,8 @@ pub fn encode(
     Ok(())
 }
 
-/// Compresses components, each with a start plane and one plane per frame.
+/// Compresses the scalar components of the attributes (such as x of the position). Each component has its quantized values of
+/// all Gaussians at the first frame, and the changes of these values for every frame.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));

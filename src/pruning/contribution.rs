@@ -40,12 +40,13 @@ impl VisibleContribution {
 }
 
 /// Renders the views `pictures` and sums the contribution of every Gaussian to every `pixel_stride`-th pixel in each
-/// direction. [`VisibleContribution::new`] converts the result to C and W.
+/// direction. [`VisibleContribution::new`] converts the result to C (mean contribution per view) and W (largest weight in a
+/// pixel).
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing in this frame, and a view without pixels adds nothing.
 /// Without views all results are zero.
 ///
-/// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with the number of frames or
+/// Memory per Gaussian: that of the reader of the frames, and that of [`RunningContribution`]. Nothing grows with the number of frames or
 /// views.
 pub fn visible_contribution(
     source: &dyn FrameSource,

@@ -64,7 +64,7 @@ pub struct Counts {
 
 /// Bytes of memory per Gaussian for a selection and one further ranking.
 pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
-/// Bytes of memory per Gaussian that are needed only while selecting: overrides, positions in two orders, the order
+/// Bytes of memory per Gaussian that are needed only while selecting: the results of stage 2, overrides, positions in two orders, the order
 /// being sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();

@@ -1,8 +1,9 @@
 //! Failure modes that the paper names, detected in renders.
 //!
 //! In: the kinds of every Gaussian ([`mod@super::traits`]) and the renders of both models. Out: for each kind the error
-//! where the kind is visible and elsewhere, the worst place, and a verdict. The original is rendered once more with
-//! colors that encode the kinds; the result is, for every pixel, the share w of each kind.
+//! where the kind is visible and elsewhere, the worst place, and a verdict. Where a kind is visible is
+//! known exactly: the original is rendered once more with colors that encode the kinds, which gives for every pixel the
+//! share w of each kind.
 //!
 //! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
 //! Memory: per thread one more render, and the original's state without its colors.

@@ -27,7 +27,7 @@ use motion::DemoGaussian;
 pub use bodies::DemoBody;
 pub use playground::Playground;
 
-/// SH degree of both scenes: enough to depend on the view, and few coefficients.
+/// SH degree of both scenes: enough view dependence to exercise the code, few enough coefficients to keep the scenes small.
 const SH_DEGREE: usize = 1;
 
 /// Number of cameras of [`Scene::rig`].

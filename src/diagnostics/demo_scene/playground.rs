@@ -206,7 +206,8 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
 }
 
 fn ground(k: usize, n: usize) -> SurfacePoint {
-    /// Power by which Gaussians get larger outwards; 0.5 spreads them evenly.
+    /// Exponent of the distance from the center as a function of a uniform number. 0.5 spreads the Gaussians evenly; more
+    /// places fewer, larger ones outside.
     const DENSITY: f64 = 0.8;
     let DVec2 { x: turn, y: part } = spread(k);
     let radius = HORIZON * part.powf(DENSITY);

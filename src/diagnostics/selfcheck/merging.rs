@@ -49,8 +49,8 @@ pub(super) fn needle() -> Case {
     })
 }
 
-/// Compares the mean and covariance of a proxy as [`mixture`] does, for stored Gaussians at a distance of 1000 units,
-/// where their offsets lose 1e-13. Its opacity must be 1 − Π(1 − α), α being the opacities of the members.
+/// Compares the mean and covariance of a proxy with those of its members, computed by a slow f64 reference as in [`mixture`].
+/// The Gaussians lie 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Its opacity must be 1 − Π(1 − α), α being the opacities of the members.
 pub(super) fn proxy() -> Case {
     Case::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = scene(4, 5, 1);

@@ -110,7 +110,7 @@ impl Tables {
         Ok(())
     }
 
-    /// Ends the current frame for key `KEYS[key]`.
+    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the next frame.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),

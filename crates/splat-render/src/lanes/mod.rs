@@ -149,7 +149,8 @@ pub(super) trait EvenOddSums: Copy {
     fn combined(self) -> Self::Sums;
 }
 
-/// Even and odd sums for vectors of one group. The caller swaps them after the even and after the odd groups.
+/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps the pair
+/// after all groups with even index, and again after all with odd index.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]
