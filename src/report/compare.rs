@@ -3,13 +3,13 @@
 use super::analysis::Analysis;
 use super::film::{KINDS, QUALITY};
 use super::html::{db, escape, figure};
-use super::shown::ShownImage;
+use super::shown::{MEDIAN, ShownImage, WORST};
 
 /// Returns the sliders of the median render and of the worst one.
 pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
-    let median = place_of(first, "median picture");
-    let worst = place_of(first, "worst picture").filter(|&place| Some(place) != median);
+    let median = place_of(first, MEDIAN);
+    let worst = place_of(first, WORST).filter(|&place| Some(place) != median);
     let titles = [(median, "A typical view"), (worst, "The worst view")];
     let mut out = String::from("<div class=\"sliders\">\n");
     for (place, title) in titles.into_iter().filter_map(|(place, title)| Some((place?, title))) {
@@ -22,7 +22,7 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
 /// Returns the sliders of the other chosen renders.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
-    let taken = ["median picture", "worst picture"].map(|why| place_of(first, why));
+    let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
     let others: Vec<usize> = (0..first.len()).filter(|&place| !taken.contains(&Some(place))).collect();
     if others.is_empty() {
         return String::new();
@@ -126,7 +126,7 @@ pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
     let mut out = String::from("<div id=\"reel\" class=\"bar\" hidden>");
     if films.len() > 1 {
         for (number, film) in films.iter().enumerate() {
-            let title = if film.why.iter().any(|why| why == "median picture") { "Typical view" } else { "Worst view" };
+            let title = if film.why.iter().any(|why| why == MEDIAN) { "Typical view" } else { "Worst view" };
             out += &format!(
                 "<button type=\"button\" data-play=\"{number}\" aria-pressed=\"{}\">{title}</button>\n",
                 number == 0

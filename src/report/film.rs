@@ -10,7 +10,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use super::shown::{ShownImage, brighter, difference, shrink, shrinkage};
+use super::shown::{MEDIAN, ShownImage, brighter, difference, shrink, shrinkage};
 use crate::error::{Error, Result};
 use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
@@ -34,7 +34,7 @@ pub const QUALITY: u8 = 80;
 /// An animation of the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FilmPanel {
-    /// Reasons for the choice of its view: "worst picture", ...
+    /// Reasons for the choice of its view: "worst render", ...
     pub why: Vec<String>,
     /// View number.
     pub view: u32,
@@ -77,7 +77,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
         let FrameView { view, camera, .. } = side.picture(choice.place);
-        let wanted = k == 0 || choice.why.iter().any(|why| why == "median render");
+        let wanted = k == 0 || choice.why.iter().any(|why| why == MEDIAN);
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
             continue;
         }

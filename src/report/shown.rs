@@ -15,6 +15,11 @@ use crate::evaluation::found::{Evaluation, ImageScore};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
+/// Reason of the render with the lowest PSNR.
+pub(super) const WORST: &str = "worst render";
+/// Reason of the render with the median PSNR.
+pub(super) const MEDIAN: &str = "median render";
+
 /// Maximum number of chosen renders: the worst one, the worst of the worst view, the worst of the worst frame, and the
 /// median one.
 pub const CHOSEN: usize = 4;
@@ -29,7 +34,7 @@ const MAX_FACTOR: u32 = 64;
 /// A render that the page shows.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Choice {
-    /// Reasons of the choice: "worst picture", "median picture", ...
+    /// Reasons of the choice: "worst render", "median render", ...
     pub why: Vec<String>,
     /// Index into the evaluation's renders.
     #[serde(skip)]
@@ -60,10 +65,10 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
     let of_view = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].view) == view));
     let of_frame = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].frame) == frame));
     let wanted = [
-        ("worst render", by_psnr.first().copied()),
+        (WORST, by_psnr.first().copied()),
         ("worst view", of_view),
         ("worst frame", of_frame),
-        ("median render", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
+        (MEDIAN, by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
     ];
     let mut chosen: Vec<Choice> = Vec::new();
     for (why, place) in wanted {
