@@ -243,7 +243,7 @@ impl CurveDistances {
 /// State that is carried from one plane (scalar component of all Gaussians) to the next while coding.
 #[derive(Clone)]
 struct PlaneCoder {
-    /// For each Gaussian its value less the mean of the plane: in the previous plane, and in the plane before that.
+    /// Values of the two planes coded before, the last one first: one value per Gaussian, less the mean of its plane.
     known: [Vec<f32>; 2],
     /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
     sizes: Vec<f32>,

@@ -50,8 +50,8 @@ pub(super) struct TensorEntry {
     pub(super) role: Role,
     /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
     pub(super) step: i32,
-    /// Offsets added to `step`, in eighths of an octave: one per channel of a plane; for a matrix one per row, followed
-    /// by one per column; one per element of any other tensor of weights. Empty if there are none.
+    /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
+    /// column; any other tensor of weights has one per element. Empty if there are no corrections.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
     /// Mean of the values, in quantization steps.
@@ -69,8 +69,8 @@ pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 pub struct TensorSteps {
     /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
     pub step: i32,
-    /// Offsets added to `step`, in eighths of an octave: one per channel of a plane; for a matrix one per row, followed
-    /// by one per column; one per element of any other tensor of weights. Empty if there are none.
+    /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
+    /// column; any other tensor of weights has one per element. Empty if there are no corrections.
     pub channels: Vec<i8>,
 }
 

@@ -125,8 +125,8 @@ pub struct ObservedOrder {
 
 /// Error name: root mean square error of the judged renders against renders of the whole model, colors in [0, 1].
 pub const PICTURES: &str = "pictures";
-/// Error name: error that a setting adds to [`PICTURES`], relative to the error of the finest setting, which is the
-/// model's own (see [`added`]).
+/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting counts as
+/// the error of the compressed model itself (see [`added`]).
 pub const ADDED: &str = "added";
 /// Error name: difference of the kept sets.
 pub const KEPT: &str = "kept";

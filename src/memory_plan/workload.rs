@@ -41,7 +41,7 @@ pub struct Workload {
     pub sh_degree: usize,
     /// Attributes that vary in time.
     pub varying: Attributes,
-    /// Memory that the input and its readers take, and how it is divided into tiles.
+    /// Memory that the input and its readers take, and how the input is divided into tiles.
     pub input: MemoryProfile,
     /// Number of different view numbers that the cameras use.
     pub viewpoints: u64,

@@ -45,7 +45,8 @@ pub struct ResultData {
     /// Time of a render before and after, where it was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
-    /// Failure modes, in the order of [`super::traits::GaussianKind::ALL`].
+    /// For each kind of Gaussian (fast, thin, …), in the order of [`super::traits::GaussianKind::ALL`], whether the loss shows
+    /// where Gaussians of this kind are visible.
     pub failure_modes: Vec<FailureMode>,
     /// Histograms of the scores by fate; `None` without an index map.
     pub histograms: Option<Vec<Histogram>>,

@@ -1,7 +1,7 @@
-//! Files that `compress` writes beside its result: the summary, the recipe, the index map.
+//! Reads the files that `compress` writes beside its result: the summary, the recipe, the index map.
 //!
-//! In: the path of the result. Out: the files that exist and fit the models; for each other file the reason, which the
-//! page tells. Memory: 8 bytes per Gaussian.
+//! In: the path of the result. Out: the files that exist and belong to the two compared models; for every other file the
+//! reason why it is not used, which the report page shows. Memory: 8 bytes per Gaussian.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;

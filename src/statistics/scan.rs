@@ -196,7 +196,7 @@ impl<'a> BlockScan<'a> {
     /// sequence.
     ///
     /// # Panics
-    /// If frames are missing, or `plan` does not finish the plan with which this scan began.
+    /// If frames are missing, or if `plan` differs from the plan with which this scan began in more than the frames that were not known then.
     pub fn finish_by(mut self, plan: &ScanPlan) -> BlockStatistics {
         self.life.count_repeats();
         self.motion.count_steady_frames();

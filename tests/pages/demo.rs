@@ -4,7 +4,7 @@ use std::fs;
 
 use crate::scene::{Workplace, files};
 
-const SMALL: &str = "demo --gaussians 1000 --frames 4 --set refine_steps=8";
+const SMALL: &str = "demo --gaussians 1000 --frames 4 --refine-steps 8";
 
 #[test]
 fn the_demo_writes_pages_and_a_film_and_says_how_to_open_them() {

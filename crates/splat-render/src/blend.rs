@@ -110,8 +110,8 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the initial accumulator for the next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Adds the values of the splat at the pixels of group `group` (and of the following groups, if a vector has
-    /// several groups) to the accumulator.
+    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a group
+    /// covers the groups after it as well.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,

@@ -32,7 +32,7 @@ pub(in crate::cli) struct Sweep {
     /// Fraction of the Gaussians to keep with --steps
     #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
     pub(in crate::cli) steps_at: f64,
-    /// Number of runs per point; the median time is given
+    /// Number of runs per setting; the median time is given
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(in crate::cli) repeat: u32,
     /// Maximum number of frames to compare, spread evenly

@@ -139,9 +139,9 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// Returns for each proxy the largest distance from its expected position over sampled frames, in scene units. A proxy
-/// placed at the mean is expected at the weighted mean of its members. A proxy placed at its leader is expected at the
-/// same offset from that mean as at the reference frame.
+/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in scene
+/// units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at the leader of
+/// the cluster (its most important member), the offset that the leader has from the mean at the reference frame is added.
 fn deviations(
     model: &ModelFolder,
     reference: Reference,

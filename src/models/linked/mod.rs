@@ -54,7 +54,7 @@ pub struct LinkedFrames {
     origin: Option<Origin>,
 }
 
-/// Origin of frames that were not read from PLY files of the user.
+/// Where frames came from that were first unpacked to temporary PLY files, such as those of a container or a stream.
 struct Origin {
     /// Owner of the temporary PLY files of the frames; deletes them when it is dropped.
     _folder: ScratchFolder,
