@@ -53,7 +53,7 @@ pub(super) enum CommandArgs {
     Score(ScoreArgs),
     /// Render views to PNG or NPY files, or a video
     Render(Render),
-    /// Compare a compressed model with its original on test views: PSNR, SSIM, FLIP, temporal error
+    /// Compare a compressed model with its original on test views
     Evaluate(Evaluate),
     /// Measure quality, size, time and memory of several methods at several fractions
     Sweep(Sweep),
@@ -63,13 +63,13 @@ pub(super) enum CommandArgs {
     Report(ReportArgs),
     /// Write an HTML page that plays a model in any browser, or two models side by side
     View(ViewArgs),
-    /// Write an input in another format, with all its Gaussians: for a viewer, a player, another program
+    /// Write an input in another format, with all its Gaussians
     Convert(Convert),
     /// Print what an input holds; check or repair a .gseq container
     Info(InfoArgs),
     /// List what a cache folder holds, or remove it
     Cache(CacheFolder),
-    /// Make a scene with moving objects, compress it to a tenth and a twentieth, and write pages to look at
+    /// Make a scene, compress it, and write pages to look at
     Demo(Demo),
     /// Make the scene that tests use, and compress it
     #[command(hide = true)]
