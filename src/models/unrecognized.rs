@@ -131,6 +131,8 @@ mod tests {
     fn the_closest_layout_and_its_missing_file_are_named() {
         let text = message(&["cfg_args", "point_cloud/iteration_7/point_cloud.ply"]);
         assert!(text.contains("3D Gaussian Splatting model"), "{text}");
+        let text = message(&["cfg_args"]);
+        assert!(text.contains("4DGaussians model") && text.contains("deformation.pth is missing"), "{text}");
         let text = message(&["cfg_args", "point_cloud/iteration_7/deformation.pth"]);
         assert!(text.contains("4DGaussians model") && text.contains("point_cloud.ply is missing"), "{text}");
     }

@@ -36,9 +36,7 @@ pub use model_folder::ModelFolder;
 
 /// Model folder of 4DGaussians.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    recognizes: |found| {
-        found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
-    },
+    recognizes: |found| found.is_folder && found.path.join("point_cloud").is_dir(),
     open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
 };
 
