@@ -27,6 +27,7 @@ use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
 use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::quality;
 use crate::pipeline::throughput::forecast;
 use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
@@ -115,7 +116,7 @@ fn receive_measured(
     let header = *stream.header();
     let counting = |frames| Workload::from_stream_header(&header, block, &assumed_rig, frames);
     let work = counting(0);
-    let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: DEFAULT_OUTPUT }, &work)?;
+    let mut stages = plan(InputMeta { gaussians: count, has_cameras, own_output: DEFAULT_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = &stages.measure;
     let visible = visible.as_ref().filter(|visible| visible.can_render_on_arrival());
     let held = (block + PREFETCH_FRAMES) as u64;
@@ -133,7 +134,7 @@ fn receive_measured(
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
     };
     let mut quota = FrameQuota::new(options.memory, |budget, frames| {
-        let later = Plan::closest(counting(frames), budget, |work, limits| stages.estimates(work, limits));
+        let later = Plan::closest(counting(frames), budget, |work, limits| stages.required_estimates(work, limits));
         later.peak().max(receive(budget, None, frames))
     });
     let to_measure =
@@ -163,14 +164,19 @@ fn receive_measured(
         };
         measuring.add(held)
     })?;
+    let frames_arrived = quota.arrived();
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
     let opened = OpenedInput { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = from_input(opened, options)?;
     // The number of frames is known now.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
+    if !Plan::fits(scene.workload(), counted, |work, limits| stages.estimates(work, limits)) {
+        stages.stages.remove_optional();
+        quality::leave_out(&mut stages.stages);
+    }
     let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
-    if measures && measuring.is_none() && quota.arrived() > 0 {
+    if measures && measuring.is_none() && frames_arrived > 0 {
         let note = format!(
             "statistics were taken from the packed frames, not as they arrived: memory suffices \
              for measuring {to_measure} of them on arrival"

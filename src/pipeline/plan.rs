@@ -182,6 +182,12 @@ impl RunPlan {
         self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
+    /// Returns the resource estimates (memory, time, reads) of all stages except the optional ones.
+    pub fn required_estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
+        let input = self.estimate_input(work, limits, MeasuredOnArrival::default());
+        self.estimates_where(input, |stage| !stage.is_optional())
+    }
+
     /// Returns the resource estimates of the stages that certainly have to run. Leaves out stages that may find nothing
     /// to do, because renders hardly change when the fraction `hardly_seen` of the Gaussians is removed.
     pub fn shortest_estimates(

@@ -74,6 +74,11 @@ pub trait Stage: Debug + Send + Sync {
         false
     }
 
+    /// Returns whether the stage only reports something and is omitted where memory does not suffice for it.
+    fn is_optional(&self) -> bool {
+        false
+    }
+
     /// Returns the work that several processes can divide among themselves, one line per kind of unit: "NAME: 12 blocks
     /// of Gaussians".
     fn shardable_units(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
@@ -211,6 +216,11 @@ impl StageList {
         estimate: impl Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync + 'static,
     ) {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
+    }
+
+    /// Removes the optional stages.
+    pub fn remove_optional(&mut self) {
+        self.stages.retain(|(_, stage)| !stage.is_optional());
     }
 
     /// Notes that the amount of work depends on results of stages.

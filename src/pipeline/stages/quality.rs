@@ -36,6 +36,14 @@ const MOST_VIEWS: usize = 60;
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take.
 const SHARE: f64 = 0.02;
+/// Maximum reads of the input, relative to reading the measured views once: for the original, for the result, whose
+/// frames are computed from the same input, and for the timed views.
+const READS: f64 = 2.5;
+/// The same maximum for a result with proxies, whose members lie in other blocks of the input than their leaders.
+const MERGED_READS: f64 = 6.0;
+/// Bytes that must be left within the memory limit besides the estimate: this optional stage runs only if memory is
+/// plentiful.
+const MARGIN: u64 = 8 << 20;
 /// Number of views whose rendering is timed, on one thread.
 const TIMED_VIEWS: usize = 3;
 
@@ -43,19 +51,33 @@ const TIMED_VIEWS: usize = 3;
 #[derive(Debug, Clone)]
 pub(crate) struct QualityStage {
     input: InputOptions,
+    /// Whether the result may have proxies, each of which is computed from several Gaussians of the input.
+    merges: bool,
 }
 
 /// Adds the stage to `stages`, unless it does not fit within the memory limit or is not wanted.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
-        true => stages.add(Phase::Write, QualityStage { input: planning.request.input.clone() }),
-        false => stages.leave_out("quality on test views", "memory: it does not fit within the limit (--memory)"),
+        true => {
+            let input = planning.request.input.clone();
+            stages.add(Phase::Write, QualityStage { input, merges: planning.merges });
+        }
+        false => leave_out(stages),
     }
+}
+
+/// Notes that the quality is not measured, because memory does not suffice.
+pub(in crate::pipeline) fn leave_out(stages: &mut StageList) {
+    stages.leave_out("quality on test views", "memory: it does not fit within the limit (--memory)");
 }
 
 impl Stage for QualityStage {
     fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
         vec![self.need(work, limits, left)]
+    }
+
+    fn is_optional(&self) -> bool {
+        true
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -83,10 +105,9 @@ impl QualityStage {
         ResourceEstimate {
             // The number of views is derived from the estimated time of all other stages; see `view_count`.
             seconds: 0.0,
-            // Views of the original and of the result, which may be computed from the same input, and the timed views.
-            reads: 2.5 * work.reads(views, limits),
+            reads: if self.merges { MERGED_READS } else { READS } * work.reads(views, limits),
             per_gaussian: [scored_memory(limits), of_views.per_gaussian, result].concat(),
-            fixed: [of_views.fixed, vec![("field", work.input.fixed)]].concat(),
+            fixed: [of_views.fixed, vec![("field", work.input.fixed), ("margin", MARGIN)]].concat(),
             ..of_views
         }
     }
