@@ -535,7 +535,7 @@ fn stages_print_once_and_undone_merging_is_left_out() {
         assert_eq!(run.code, 0, "{}", run.stderr);
         let told: Vec<&str> = run.stderr.lines().filter_map(|line| line.strip_prefix('[')?.split(']').next()).collect();
         assert!(told.len() > 5 && told.is_sorted_by(|a, b| a < b), "{}", run.stderr);
-        run.stderr.lines().any(|line| line.starts_with("merging  left out: at the same "))
+        run.stderr.lines().any(|line| line.starts_with("merging  left out: PSNR on scored views at the same "))
     };
     let undone =
         ["0.2 --no-refine", "0.6 --no-refine", "0.4 --set refine_steps=20 --set refine_cut_steps=5"].map(compress);

@@ -179,7 +179,7 @@ fn full_disk_error_names_the_file_being_written() {
         let mut shell = crate::unshare(&["-m"]);
         let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
         let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.contains(named) && told.contains("make room"), "{run}: {told}");
+        assert!(told.contains(named) && told.contains("free disk space"), "{run}: {told}");
         for part in ["Os {", "splatsieve-tmp", "content", "ZipWriter", "Some("] {
             assert!(!told.contains(part), "{run}: {part:?} is in {told}");
         }

@@ -93,13 +93,15 @@ fn minimum_memory(workplace: &Workplace, arguments: &str) -> u64 {
     after.split_once("MiB").unwrap().0.parse().unwrap()
 }
 
-/// Returns the largest resident memory of any stage in the summary of `result`, in MiB; `None` if the system does not
-/// report it.
-fn peak_memory(result: &Path) -> Option<u64> {
+/// Returns the largest resident memory of any stage in the summary of `result`, in MiB, and the name of that stage;
+/// `None` if the system does not report it.
+fn peak_memory(result: &Path) -> Option<(u64, String)> {
     let text = std::fs::read_to_string(format!("{}.summary.json", result.display())).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
-    let stages = summary["stages"].as_array().unwrap();
-    said(stages.iter().map(|stage| stage["peak_memory_bytes"].as_u64().map(|bytes| bytes >> 20)).max().flatten())
+    let of_stage = |stage: &serde_json::Value| {
+        Some((stage["peak_memory_bytes"].as_u64()? >> 20, stage["name"].as_str().unwrap_or_default().to_string()))
+    };
+    said(summary["stages"].as_array().unwrap().iter().filter_map(of_stage).max())
 }
 
 #[test]
@@ -122,8 +124,8 @@ fn named_minimum_memory_works_and_changes_no_byte() {
         let least = minimum_memory(&workplace, &request("tight"));
         workplace.done(&format!("{} --memory {least}MiB", request("tight")));
         let [free, tight] = ["free", "tight"].map(|name| workplace.path(name));
-        if let Some(peak_memory) = peak_memory(&tight.join("small.gseq")) {
-            assert!(peak_memory <= least, "{input} {rest}: {peak_memory} MiB resident, {least} promised");
+        if let Some((peak_memory, stage)) = peak_memory(&tight.join("small.gseq")) {
+            assert!(peak_memory <= least, "{input} {rest}: {peak_memory} MiB resident in {stage}, {least} promised");
             assert!(least < 63 || rest != "--no-refine", "{input} {rest}: {least} MiB would hold the scene");
         }
         assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {least} MiB");

@@ -310,7 +310,7 @@ fn pairs_measured_in_shards_merge_as_in_one_run() {
     let workplace = Workplace::new();
     workplace.done("--quiet test-scene -o test-scene --gaussians 40000 --frames 6 --no-refine");
     for name in ["scene.gseq", "cameras.json"] {
-        fs::rename(workplace.path("demo").join(name), workplace.path(name)).unwrap();
+        fs::rename(workplace.path("test-scene").join(name), workplace.path(name)).unwrap();
     }
     let stages = assert_compresses_the_same(&workplace, "--preset paper --ratio 0.6", &[2, 7]);
     assert_eq!(stages.iter().collect::<Vec<_>>(), ["pairs", "scan"]);

@@ -170,3 +170,21 @@ fn default_run_reads_a_container_at_most_2_5_times() {
     let read = reads_as_planned(&workplace, &format!("packed.gseq --cameras {model} -o small.gseq"));
     assert!(read <= 2.5, "{read}");
 }
+
+#[test]
+fn reported_quality_equals_evaluate_on_the_same_views() {
+    let workplace = Workplace::new();
+    for output in ["out", "out.gsz"] {
+        let summary =
+            workplace.summary(&format!("{{tiny}} --cameras {{tiny}} --ratio 0.4 --set refine_steps=40 -o {output}"));
+        let quality = &summary["quality"];
+        assert_eq!(quality["kind"], "test", "{quality}");
+        let views = quality["views"].as_u64().unwrap();
+        let line = format!("evaluate {{tiny}} {output} --cameras {{tiny}} --max-views {views} --json");
+        let found: Value = serde_json::from_str(&workplace.done(&line)).unwrap();
+        for score in ["psnr", "ssim"] {
+            let [reported, evaluated] = [quality, &found].map(|scores| scores[score].as_f64().unwrap());
+            assert!((reported - evaluated).abs() < 0.01, "{output}: {score} {reported}, evaluate says {evaluated}");
+        }
+    }
+}
