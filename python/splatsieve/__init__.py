@@ -2,7 +2,7 @@
 
     import splatsieve
 
-    summary = splatsieve.compress("model", "small", cameras="data", target_ratio=0.3)
+    summary = splatsieve.compress("model", "small", cameras="data", ratio=0.3)
     with splatsieve.stream("small.gseq", count=1000, sh_degree=0) as out: ...
     scene = splatsieve.read_gseq("small.gseq")
 

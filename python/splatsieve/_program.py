@@ -20,7 +20,8 @@ Log = Callable[[str], object]
 
 # Options that take no value; the other boolean options take `=true` and `=false`.
 SWITCHES = frozenset(
-    "all check clean dry_run explain flip json list_stages merge_only no_refine overwrite prune_only quiet raw".split()
+    "all allow_gaps check clean dry_run explain flip json list_stages merge_only no_refine overwrite prune_only quiet raw "
+    "render_time verbose".split()
 )
 
 

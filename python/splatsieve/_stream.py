@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._program import Error, Log, Option, Running, flags, parsed
+from ._program import Error, Log, Option, RunningProgram, flags, parsed
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -95,7 +95,7 @@ class Stream:
         self.reads = command == "compress"
 
     def __enter__(self) -> Stream:
-        self.running = Running(self.words, self.log, stdin=subprocess.PIPE)
+        self.running = RunningProgram(self.words, self.log, stdin=subprocess.PIPE)
         assert self.running.process.stdin is not None
         self.pipe = self.running.process.stdin
         try:

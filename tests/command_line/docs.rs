@@ -2,6 +2,7 @@
 //!
 //! `SPLATSIEVE_WRITE_DOCS=1` writes the generated pages, `docs/cli.md` and `docs/parameters.md`, instead of comparing them.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use crate::scene::{Workplace, program};
 use splatsieve::recipe::{PRESETS, parameters};
 
 /// Commands of the program in the order of `splatsieve --help`.
-const COMMANDS: [&str; 16] = [
+pub(crate) const COMMANDS: [&str; 16] = [
     "compress",
     "evaluate",
     "report",
@@ -311,4 +312,29 @@ fn command_page_is_generated_from_the_help() {
         let _ = write!(page, "\n## {command}\n\n```text\n{}```\n", help(&[command]));
     }
     check_generated("cli.md", &page);
+}
+
+#[test]
+fn python_knows_the_options_that_take_no_value() {
+    let workplace = Workplace::new();
+    let mut taken = BTreeSet::new();
+    for verb in COMMANDS {
+        let help = workplace.done(&format!("{verb} --help"));
+        // A line of an option without a value is `--name` or `-n, --name`, and two spaces before a description.
+        let options = help.lines().filter_map(|line| {
+            let line = line.trim_start();
+            let line = if line.get(2..4) == Some(", ") { &line[4..] } else { line };
+            line.strip_prefix("--")?.split("  ").next()
+        });
+        let is_name = |text: &&str| text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
+        taken.extend(options.filter(is_name).map(|name| name.replace('-', "_")));
+    }
+    for general in ["help", "version"] {
+        taken.remove(general);
+    }
+    let module = fs::read_to_string(root().join("python/splatsieve/_program.py")).unwrap();
+    let (_, switches) = module.split_once("SWITCHES = frozenset(").unwrap();
+    let (switches, _) = switches.split_once(".split()").unwrap();
+    let listed: BTreeSet<String> = switches.replace('"', " ").split_whitespace().map(str::to_owned).collect();
+    assert_eq!(listed, taken, "options without a value: the program of Python, the help of the program");
 }
