@@ -29,7 +29,6 @@ pub(super) fn details(
         results.iter().enumerate().map(of).collect()
     };
     let numbers = each(&|result, name| numbers(&result.data, name)) + &quality::other_charts(results, names);
-    let run = |result: &Analysis| result.run.summary.as_ref().map(|(summary, _)| summary.clone());
     let sections = [
         ("numbers", "All figures", "Every measure: on average, and in the worst frame and view.", numbers),
         (
@@ -66,7 +65,7 @@ pub(super) fn details(
             "sweep",
             "Other sizes",
             "Quality against size, time and memory, measured by a sweep.",
-            each(&|result, _| run(result).map_or(String::new(), |summary| searched(&summary)))
+            each(&|result, _| result.run.summary.as_ref().map_or(String::new(), |(summary, _)| searched(summary)))
                 + &swept(&results[0], sweep),
         ),
         (
@@ -214,7 +213,7 @@ fn score_histograms(result: &ResultData) -> String {
         "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then dropped \
          ones, then those merged into others. Values go by powers of ten, but shares of the frames from none to all; 0 has \
          no place among powers of ten, and Gaussians at 0 are counted in the legend. Where kept and dropped ones lie apart, \
-         the value decides; where they overlap, something else render_blended. S is the whole score, C the coverage, W the visible \
+         the value decides; where they overlap, something else decides. S is the whole score, C the coverage, W the visible \
          coverage, D the motion, κ the rigidity, V the variation, in the symbols of the paper.</p>\n<div class=\"charts\">\n",
     );
     let mut alike = Vec::new();
