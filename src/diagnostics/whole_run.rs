@@ -8,7 +8,7 @@ use crate::evaluation::baseline::prune_by;
 use crate::evaluation::cost::{Cost, Repeats};
 use crate::evaluation::found::Evaluation;
 use crate::evaluation::method::MethodKind;
-use crate::evaluation::{EvaluateOptions, evaluate_whole};
+use crate::evaluation::{self, EvaluateOptions, ModelPair};
 use crate::files::atomic::Replace;
 use crate::model::Split;
 use crate::pipeline::{Request, Target, compress};
@@ -67,7 +67,7 @@ impl WholeRun<'_> {
     /// # Errors
     /// Returns the errors of `evaluate`.
     pub(crate) fn compare(&self, result: &Path) -> Result<Evaluation> {
-        evaluate_whole(&EvaluateOptions {
+        let options = EvaluateOptions {
             original: with_training_views(self.input),
             compressed: result.to_owned(),
             ground_truth: None,
@@ -78,7 +78,10 @@ impl WholeRun<'_> {
             flip: false,
             csv: None,
             overwrite: Replace::Never,
-        })
+        };
+        let mut pair = ModelPair::open(&options)?;
+        pair.keep_to(options.original.memory, evaluation::needs)?;
+        pair.evaluate()
     }
 }
 

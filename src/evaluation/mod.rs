@@ -77,10 +77,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
 }
 
 /// Runs [`evaluate`]; the end of a shard is an error value.
-///
-/// # Errors
-/// Fails as [`evaluate`].
-pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
+fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }

@@ -106,11 +106,7 @@ impl FrameSource for Scene {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        if let Some(beyond) = ids.iter().find(|&id| id >= self.info.count) {
-            return Err(Error::internal(format!("demo scene: no Gaussian {beyond}, it has {}", self.info.count)));
-        }
-        let parts = ids.iter().map(|id| self.layout.part(id)).collect();
-        Ok(Box::new(Reader { times: &self.info.times, parts }))
+        Reader::open(&self.info, ids, |id| self.layout.part(id))
     }
 }
 
@@ -118,6 +114,23 @@ impl FrameSource for Scene {
 struct Reader<'a> {
     times: &'a [f64],
     parts: Vec<DemoGaussian>,
+}
+
+impl<'a> Reader<'a> {
+    /// Opens the Gaussians `ids` of a scene with the description `info`. `part`: returns the Gaussian with an id.
+    ///
+    /// # Errors
+    /// Fails if an id is too large.
+    fn open(
+        info: &'a SequenceInfo,
+        ids: Ids<'_>,
+        part: impl Fn(usize) -> DemoGaussian,
+    ) -> Result<Box<dyn BlockReader + 'a>> {
+        if let Some(beyond) = ids.iter().find(|&id| id >= info.count) {
+            return Err(Error::internal(format!("demo scene: no Gaussian {beyond}, it has {}", info.count)));
+        }
+        Ok(Box::new(Reader { times: &info.times, parts: ids.iter().map(part).collect() }))
+    }
 }
 
 impl BlockReader for Reader<'_> {

@@ -11,7 +11,7 @@ use super::motion::{
     BALL_RADIUS, CLOTH_WIDTH, DemoGaussian, DemoMotion, GaussianRandom, color, facing_y, spread, still,
 };
 use super::{Reader, SH_DEGREE};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::model::{Attributes, Camera, Rig, SequenceInfo, Shot, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
 
@@ -141,11 +141,7 @@ impl FrameSource for Playground {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        if let Some(beyond) = ids.iter().find(|&id| id >= self.info.count) {
-            return Err(Error::internal(format!("demo scene: no Gaussian {beyond}, it has {}", self.info.count)));
-        }
-        let parts = ids.iter().map(|id| self.part(id)).collect();
-        Ok(Box::new(Reader { times: &self.info.times, parts }))
+        Reader::open(&self.info, ids, |id| self.part(id))
     }
 }
 
