@@ -341,14 +341,19 @@ pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
     }
 }
 
-/// Returns the set of views that the argument names.
-fn view_set(split: SplitArg) -> ViewSet {
-    match split {
-        SplitArg::Train => ViewSet::Split(Split::Train),
-        SplitArg::Val => ViewSet::Split(Split::Val),
-        SplitArg::Test => ViewSet::Split(Split::Test),
-        SplitArg::All => ViewSet::All,
+/// Returns the split that the argument names; `None` for all views.
+fn split(named: SplitArg) -> Option<Split> {
+    match named {
+        SplitArg::Train => Some(Split::Train),
+        SplitArg::Val => Some(Split::Val),
+        SplitArg::Test => Some(Split::Test),
+        SplitArg::All => None,
     }
+}
+
+/// Returns the set of views that the argument names.
+fn view_set(named: SplitArg) -> ViewSet {
+    split(named).map_or(ViewSet::All, ViewSet::Split)
 }
 
 /// Returns the cache folder and the shard of a run; `None` without `--cache`.
@@ -389,12 +394,7 @@ pub(super) fn input_options(
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         cameras.file.apply_to(&mut options);
-        options.split = match cameras.split {
-            Some(SplitArg::Train) | None => Some(Split::Train),
-            Some(SplitArg::Val) => Some(Split::Val),
-            Some(SplitArg::Test) => Some(Split::Test),
-            Some(SplitArg::All) => None,
-        };
+        options.split = cameras.split.map_or(Some(Split::Train), split);
     }
     options
 }

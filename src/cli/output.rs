@@ -24,12 +24,12 @@ pub(super) fn print(text: &str) -> Result<()> {
     write(printable(text).as_bytes())
 }
 
-/// Writes `text`. If it is JSON, control characters are replaced by JSON escapes, otherwise as by [`print`].
+/// Writes the result of `json`, with control characters as JSON escapes, if `is_json`; else prints that of `text`.
 ///
 /// # Errors
 /// Fails as [`print`].
-pub(super) fn print_as(is_json: bool, text: &str) -> Result<()> {
-    if is_json { write(json_escaped(text).as_bytes()) } else { print(text) }
+pub(super) fn print_as(is_json: bool, json: impl FnOnce() -> String, text: impl FnOnce() -> String) -> Result<()> {
+    if is_json { write(json_escaped(&json()).as_bytes()) } else { print(&text()) }
 }
 
 /// Writes `bytes` unchanged. If a result was written to standard output, writes them to standard error instead.

@@ -73,11 +73,11 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     }
     if dry_run {
         let foreseen = foresee(&request)?;
-        return print_as(json, &if json { foreseen.json() } else { foreseen.text() });
+        return print_as(json, || foreseen.json(), || foreseen.text());
     }
     let page = page_output.map(|output| result_page_options(&request, output)).transpose()?;
     let Some(summary) = completed(compress(&request)?)? else { return Ok(()) };
-    let printed = print_as(json, &if json { summary.json() } else { summary.text(detail) });
+    let printed = print_as(json, || summary.json(), || summary.text(detail));
     // The page is written even if the summary cannot be printed, for example because its reader has ended.
     if let Some(page) = page {
         let written = write_page(&page);
@@ -131,21 +131,21 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     options.original.work = cache_request(args.kept);
     let Some(found) = completed(evaluation::evaluate(&options)?)? else { return Ok(()) };
     tell_notes(&found.work_notes);
-    print_as(as_json, &if as_json { json_text(&found) } else { found.text() })
+    print_as(as_json, || json_text(&found), || found.text())
 }
 
 /// Runs `sweep`.
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
     let found = sweep::sweep(&sweep_options(args, events))?;
-    print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
+    print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs `precision`.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
     let found = precision::precision(&precision_options(args, events)?)?;
-    print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
+    print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs `report`.
@@ -221,11 +221,10 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     } else {
         convert::convert(&input, &path, kind, args.earlier.replace())?
     };
-    if args.json {
-        return print_as(true, &json_text(&converted));
+    if !args.json {
+        tell_notes(&converted.notes);
     }
-    tell_notes(&converted.notes);
-    print(&converted.text())
+    print_as(args.json, || json_text(&converted), || converted.text())
 }
 
 /// Runs `info`: prints what an input holds, or checks or repairs a container.
@@ -244,7 +243,7 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
             report.frames_seen,
             report.tiles_saved
         );
-        return print_as(args.json, &if args.json { json_text(&value) } else { text });
+        return print_as(args.json, || json_text(&value), || text);
     }
     if args.check {
         let report = container::verify(&path)?;
@@ -257,10 +256,10 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
         let path = path.shown();
         let text =
             format!("{path}: no damage; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n");
-        return print_as(args.json, &if args.json { json_text(&value) } else { text });
+        return print_as(args.json, || json_text(&value), || text);
     }
     let info = container::info(&input_options(args.input, None, None, events))?;
-    print_as(args.json, &if args.json { json_text(&info) } else { info.text() })
+    print_as(args.json, || json_text(&info), || info.text())
 }
 
 /// Runs `cache`: lists or removes the entries of a cache folder.
@@ -270,7 +269,7 @@ fn run_cache(args: &CacheFolder) -> Result<()> {
         return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
     }
     let listed = cache::list(&args.folder)?;
-    print_as(args.json, &if args.json { json_text(&listed) } else { cache::text(&listed) })
+    print_as(args.json, || json_text(&listed), || cache::text(&listed))
 }
 
 /// Runs `demo`.
@@ -292,7 +291,7 @@ fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
 /// Runs `selfcheck`. Fails if a case fails; the table is printed before.
 fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     let found = selfcheck::run();
-    let printed = print_as(args.json, &if args.json { json_text(&found) } else { found.text() });
+    let printed = print_as(args.json, || json_text(&found), || found.text());
     found.verdict()?;
     printed
 }
