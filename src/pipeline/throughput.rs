@@ -18,6 +18,7 @@ use crate::passes::{BLOCK, gather_all};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::time_estimate::core_seconds;
+use crate::refinement::MAX_USEFUL_PSNR;
 use crate::render::{Contribution, RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Ids, ReadPlan};
@@ -30,9 +31,6 @@ const MAX_SECONDS: f64 = 1.0;
 const FRAMES_PER_BLOCK: u64 = 16;
 /// Number of views that each thread renders for each of three purposes: contribution, removal error and image.
 const VIEWS_PER_THREAD: usize = 2;
-/// PSNR against the original, dB, above which pruning alone is so close that refinement may have nothing to do
-/// ([`crate::refinement::MAX_USEFUL_PSNR`]).
-const CLOSE_PSNR: f64 = 60.0;
 
 /// Minimum expected duration, seconds, of a run that is preceded by a calibration.
 const MIN_RUN_SECONDS: f64 = 2.0;
@@ -153,11 +151,11 @@ impl Calibration {
 }
 
 /// Returns which fraction of the Gaussians can be removed, beginning with the smallest removal errors, before the PSNR
-/// of renders falls below [`CLOSE_PSNR`]. `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of
+/// of renders falls below [`MAX_USEFUL_PSNR`]. `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of
 /// color values that were rendered.
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
-    let most = values * 10f64.powf(-CLOSE_PSNR / 10.0) / RemovalError::UNIT;
+    let most = values * 10f64.powf(-MAX_USEFUL_PSNR / 10.0) / RemovalError::UNIT;
     let mut sum = 0.0;
     let few = errors.iter().take_while(|&&error| {
         sum += error as f64;
