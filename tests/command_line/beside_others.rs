@@ -7,10 +7,10 @@ use std::fs;
 use std::io::Write;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::scene::{Workplace, files, lasting_files, program, tiny};
+use crate::scene::{Workplace, files, lasting_files, program, stderr_text, tiny};
 
 /// Returns the tiny model as a frame stream.
 fn tiny_stream(workplace: &Workplace) -> Vec<u8> {
@@ -40,10 +40,6 @@ fn start_program(workplace: &Workplace, arguments: &str) -> Child {
     // SAFETY: `signal` is async-signal-safe, so it may be called between fork and exec; the closure calls nothing else.
     unsafe { command.pre_exec(reset) };
     start_piped(workplace, command)
-}
-
-fn stderr_text(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Waits until `folder` holds a file. Panics if the run ends before that or after 60 s.

@@ -54,20 +54,7 @@ fn help_describes_the_tool_and_shows_examples() {
     let help = workplace.done("--help");
     assert!(help.starts_with("Shrinks trained dynamic Gaussian-splatting models"), "{help}");
     assert!(help.contains("\n\nExamples:\n  splatsieve demo"), "{help}");
-    for verb in [
-        "compress",
-        "evaluate",
-        "report",
-        "view",
-        "render",
-        "convert",
-        "info",
-        "score",
-        "cache",
-        "demo",
-        "recipe",
-        "completions",
-    ] {
+    for verb in crate::docs::COMMANDS {
         assert!(help.contains(verb), "{verb} is not in the help");
         workplace.done(&format!("{verb} --help"));
     }

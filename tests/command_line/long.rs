@@ -8,7 +8,7 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 use std::process::Output;
 
-use crate::scene::Workplace;
+use crate::scene::{Workplace, stderr_text};
 use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
@@ -63,10 +63,6 @@ fn piped(workplace: &Workplace, arguments: &str, sequence: LongSequence) -> Outp
 /// Runs the program without an input.
 fn run_without_input(workplace: &Workplace, arguments: &str) -> Output {
     piped(workplace, arguments, LongSequence { gaussians: 0, frames: 0 })
-}
-
-fn stderr_text(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Returns the number between `before` and `after` in `text`.

@@ -11,7 +11,7 @@ use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::scene::{Workplace, program};
+use crate::scene::{Workplace, program, stderr_text};
 
 /// Run with many Gaussians for the file size of its scene, in which every stage can be cached.
 const RUN: &str = "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
@@ -25,10 +25,6 @@ fn command(workplace: &Workplace, arguments: &str) -> Command {
 
 fn run_program(workplace: &Workplace, arguments: &str) -> Output {
     command(workplace, arguments).output().unwrap()
-}
-
-fn stderr_text(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn workplace_with_scene(gaussians: usize) -> Workplace {

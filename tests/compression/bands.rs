@@ -4,21 +4,14 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::scene::{PlyRows, Workplace, check_model_folder, index_map, lasting_files, tiny, without_sh_head};
+use crate::scene::{
+    PlyRows, Workplace, check_model_folder, field_file, index_map, lasting_files, point_cloud, reason_left_out, tiny,
+    without_sh_head,
+};
 use serde_json::Value;
 
 /// Entry of the summary if the stage runs and removes nothing.
 const LOWER_DEGREE: &str = "lower SH degree";
-
-fn point_cloud(model: &Path) -> PathBuf {
-    let folders = fs::read_dir(model.join("point_cloud")).unwrap();
-    folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
-}
-
-fn reason_left_out(summary: &Value) -> Option<String> {
-    let left = summary["left_out"].as_array().unwrap();
-    left.iter().find(|left| left["what"] == LOWER_DEGREE).map(|left| left["why"].as_str().unwrap().to_owned())
-}
 
 /// Writes the tiny model without its SH head, and with coefficients above `degree` scaled by 1e-6, to `model` in the
 /// workplace.
@@ -52,14 +45,18 @@ fn invisible_sh_coefficients_and_their_degree_go() {
         let model = write_faint_above(&workplace, degree);
         let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
         let bands = &summary["bands"];
-        assert_eq!((&bands["sh_degree"], reason_left_out(&summary)), (&Value::from(degree), None), "{bands}");
+        assert_eq!(
+            (&bands["sh_degree"], reason_left_out(&summary, LOWER_DEGREE)),
+            (&Value::from(degree), None),
+            "{bands}"
+        );
         let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
         assert!(bands["tried"].as_array().unwrap().iter().any(of_degree), "{bands}");
 
         let small = workplace.path("small");
         let [before, after] = [&model, &small].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
         assert_eq!(after, before.replace("sh_degree=3", &format!("sh_degree={degree}")));
-        let field = |model: &Path| fs::read(point_cloud(model).with_file_name("deformation.pth")).unwrap();
+        let field = |model: &Path| fs::read(field_file(model)).unwrap();
         assert!(field(&small) == field(&model), "the field changed");
 
         // The remaining coefficients of a row are unchanged, coefficient by coefficient of every channel.
@@ -86,7 +83,7 @@ fn visible_sh_coefficients_stay_and_are_reported() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 3);
     let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
-    let why = reason_left_out(&summary).unwrap();
+    let why = reason_left_out(&summary, LOWER_DEGREE).unwrap();
     assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB against all degrees required"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
     let configs = [&model, &workplace.path("small")].map(|model| fs::read(model.join("cfg_args")).unwrap());
@@ -96,7 +93,7 @@ fn visible_sh_coefficients_stay_and_are_reported() {
 
     // Without the request nothing is searched and nothing reported.
     let all = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands=all -o small"));
-    assert!(all["bands"].is_null() && reason_left_out(&all).is_none());
+    assert!(all["bands"].is_null() && reason_left_out(&all, LOWER_DEGREE).is_none());
 }
 
 #[test]
@@ -104,14 +101,14 @@ fn sh_coefficients_stay_with_an_sh_head_or_at_degree_0() {
     let workplace = Workplace::new();
     let quickly = QUICKLY.replacen("model", "{tiny}", 1);
     let summary = workplace.summary(&format!("{quickly} --ratio 0.5 --set bands_margin=0 -o small"));
-    assert!(reason_left_out(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
+    assert!(reason_left_out(&summary, LOWER_DEGREE).unwrap().contains("SH head") && summary["bands"].is_null());
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
 
     write_faint_above(&workplace, 0);
     workplace.done(&format!("compress {QUICKLY} -o plain"));
     let again = QUICKLY.replacen("model", "plain", 1);
     let summary = workplace.summary(&format!("{again} --ratio 0.5 -o small"));
-    assert!(reason_left_out(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
+    assert!(reason_left_out(&summary, LOWER_DEGREE).unwrap().contains("degree 0") && summary["bands"].is_null());
 }
 
 #[test]
@@ -202,7 +199,7 @@ fn asked_degree_is_refined_to_its_best() {
             .iter()
             .any(|note| note == "SH coefficients above degree 0 of 3 are dropped, as requested")
     );
-    assert!(summary["bands"].is_null() && reason_left_out(&summary).is_none());
+    assert!(summary["bands"].is_null() && reason_left_out(&summary, LOWER_DEGREE).is_none());
     let configs = [&model, &workplace.path("small")].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
     assert_eq!(configs[1], configs[0].replace("sh_degree=3", "sh_degree=0"));
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 17);
@@ -250,7 +247,7 @@ fn asked_degree_holds_in_every_output_and_search() {
 fn impossible_degree_is_refused_by_name() {
     let workplace = Workplace::new();
     let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --ratio 0.5 --set bands=1 -o small");
-    assert!(reason_left_out(&summary).unwrap().contains("SH head"));
+    assert!(reason_left_out(&summary, LOWER_DEGREE).unwrap().contains("SH head"));
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
     for wrong in ["4", "-1", "some"] {
         let arguments = format!("compress {{tiny}} --set bands={wrong} -o none");

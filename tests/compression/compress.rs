@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-use crate::scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, shared, state, tiny};
+use crate::scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, point_cloud, shared, state, tiny};
 use splatsieve::files::container::Container;
 use splatsieve::files::ply_sequence::PlySequence;
 use splatsieve::models::ModelFolder;
@@ -20,11 +20,6 @@ fn members(map: &[i64]) -> Vec<Vec<usize>> {
         members[place as usize].push(id);
     }
     members
-}
-
-fn point_cloud(model: &Path) -> std::path::PathBuf {
-    let folders = fs::read_dir(model.join("point_cloud")).unwrap();
-    folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
 }
 
 /// Checks that the output folder is the input with fewer rows: every Gaussian that was not merged keeps its bytes in

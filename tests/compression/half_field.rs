@@ -2,25 +2,17 @@
 //! quality, and open in every program that opens the original.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use crate::scene::{Workplace, check_model_folder, lasting_files, shared, tiny};
+use crate::scene::{Workplace, check_model_folder, field_file, lasting_files, reason_left_out, shared, tiny};
 use serde_json::Value;
-
-fn field_file(model: &Path) -> PathBuf {
-    let folders = fs::read_dir(model.join("point_cloud")).unwrap();
-    folders.map(|entry| entry.unwrap().path().join("deformation.pth")).next().unwrap()
-}
 
 fn len(path: &Path) -> u64 {
     fs::metadata(path).unwrap().len()
 }
 
-fn reason_left_out(summary: &Value) -> Option<String> {
-    let left = summary["left_out"].as_array().unwrap();
-    let is_half_precision = |left: &&Value| left["what"] == "half precision of the field";
-    left.iter().find(is_half_precision).map(|left| left["why"].as_str().unwrap().to_owned())
-}
+/// Entry of the summary if the field stays as it is.
+const HALF_PRECISION: &str = "half precision of the field";
 
 const QUICKLY: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwrite";
 
@@ -30,12 +22,12 @@ fn half_precision_is_used_only_within_its_bound() {
     let own = field_file(&tiny());
     let exact = workplace.summary(&format!("{QUICKLY} -o exact --set field=exact"));
     assert_eq!(fs::read(field_file(&workplace.path("exact"))).unwrap(), fs::read(&own).unwrap());
-    assert!(exact["field"].is_null() && reason_left_out(&exact).is_none());
+    assert!(exact["field"].is_null() && reason_left_out(&exact, HALF_PRECISION).is_none());
 
     // A margin of 0 dB accepts any rounding error that is smaller than the error of pruning.
     let half = workplace.summary(&format!("{QUICKLY} -o half --ratio 0.3 --set field_margin=0"));
     let found = &half["field"];
-    assert_eq!((&found["half"], reason_left_out(&half)), (&Value::Bool(true), None));
+    assert_eq!((&found["half"], reason_left_out(&half, HALF_PRECISION)), (&Value::Bool(true), None));
     assert!(found["rounding"].as_f64().unwrap() >= found["least"].as_f64().unwrap(), "{found}");
     assert!(len(&field_file(&workplace.path("half"))) < len(&own) * 9 / 10);
 
@@ -47,7 +39,7 @@ fn half_precision_is_used_only_within_its_bound() {
         false => {
             let rounding =
                 format!("{:.1} dB from those with the exact", refused["field"]["rounding"].as_f64().unwrap());
-            assert!(reason_left_out(&refused).unwrap().contains(&rounding), "{refused}");
+            assert!(reason_left_out(&refused, HALF_PRECISION).unwrap().contains(&rounding), "{refused}");
             assert_eq!(fs::read(field_file(&workplace.path("refused"))).unwrap(), fs::read(&own).unwrap());
         }
     }

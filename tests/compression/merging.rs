@@ -276,10 +276,11 @@ fn assert_is_mixture(
     }
 }
 
-/// Checks that the raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
-/// its leader there, and that its quaternion has the length of the leader's quaternion in that frame. If the proxy is
-/// placed at its leader, its state at the reference frame must be the merged one, and its path that of the leader, to
-/// the bit.
+/// Checks the proxies that a run wrote to `output`, at the reference frame (the frame in which a group is merged):
+/// - The stored parameters of a proxy are its merged state minus what the field adds to its leader.
+/// - The quaternion of a proxy has the length of the leader's quaternion.
+/// - If proxies are placed at their leaders, the state of a proxy is its merged state up to rounding, and its position is
+///   exactly that of the leader at every frame.
 fn assert_solved_at_leaders(
     output: &Path,
     scene: &Scene,

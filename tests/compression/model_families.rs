@@ -299,7 +299,7 @@ fn splatv_of_the_lite_model_equals_its_converter_rounded() {
 #[ignore = "needs the trained models"]
 fn every_command_accepts_spacetime_gaussians() {
     let workplace = Workplace::new();
-    // The untrained decoder of `stg_full` gives colors that are far from smooth.
+    // The color decoder of `stg_full` is untrained: neighboring Gaussians have very different colors.
     for (name, least) in [("stg_lite", 32.0), ("stg_full", 23.0)] {
         let model = model_path(name).display().to_string();
         for ratio in [0.4, 0.2] {

@@ -12,6 +12,7 @@ use std::process::{self, ChildStdin, Output, Stdio};
 use std::thread;
 
 use assert_cmd::Command;
+use serde_json::Value;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::passes::gather;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
@@ -47,6 +48,28 @@ pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, S
     let output = process::Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
     let [complaints, text] = [&output.stderr, &output.stdout].map(|bytes| String::from_utf8_lossy(bytes));
     (output.status.success(), format!("{complaints}{text}"))
+}
+
+/// Returns the path of the point cloud in the only iteration of the model folder `model`.
+pub(crate) fn point_cloud(model: &Path) -> PathBuf {
+    let folders = fs::read_dir(model.join("point_cloud")).unwrap();
+    folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
+}
+
+/// Returns the path of the deformation field in the only iteration of the model folder `model`.
+pub(crate) fn field_file(model: &Path) -> PathBuf {
+    point_cloud(model).with_file_name("deformation.pth")
+}
+
+/// Returns why a run left out the stage `what`, according to its summary; `None` if it ran.
+pub(crate) fn reason_left_out(summary: &Value, what: &str) -> Option<String> {
+    let left = summary["left_out"].as_array().unwrap();
+    left.iter().find(|left| left["what"] == what).map(|left| left["why"].as_str().unwrap().to_owned())
+}
+
+/// Returns what a program wrote to standard error.
+pub(crate) fn stderr_text(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Returns the path of a trained model in `SPLATSIEVE_DATA`, or else in `../shared/data`. Panics if it is missing.
