@@ -98,8 +98,8 @@ impl Journal {
     /// cache. The result is stored under `key` in the work folder of the scene.
     ///
     /// # Errors
-    /// Fails if `compute` fails or the cache cannot be used. A run that computes only one shard (part of a divided
-    /// stage) ends here with an error.
+    /// Fails if `compute` fails, or if the cache cannot be read or written. A run that computes only one shard (part
+    /// of a divided stage) ends here with an error.
     pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,

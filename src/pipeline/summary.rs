@@ -141,7 +141,7 @@ pub struct CameraSummary {
 }
 
 impl CameraSummary {
-    /// Returns the description of the cameras by whose views the Gaussians of `scene` are scored.
+    /// Returns the description of the cameras of `scene` whose views are used for scoring.
     pub fn from_scene(scene: &Scene) -> CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),

@@ -7,8 +7,8 @@ use gseq::{
     ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, TouchedPages, Writer, encode_tile,
 };
 
-/// Creates a temporary folder, in memory if the system has one there: these tests sync thousands of files, which costs
-/// milliseconds each on a disk.
+/// Creates a temporary folder. It lies in memory (`/dev/shm`) if the system allows, because these tests flush thousands
+/// of files to storage, which takes milliseconds per file on a disk.
 pub(crate) fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     if memory.is_dir() { tempfile::tempdir_in(memory).unwrap() } else { tempfile::tempdir().unwrap() }

@@ -14,8 +14,8 @@ use crate::source::{BlockReader, Ids, ReadPlan};
 /// longer needs.
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
-/// Gaussians that are adjacent both in a tile and in the reader's list: `len` of them, from index `from` in the tile
-/// and from index `to` in the list.
+/// `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. The first has index `from` in
+/// the tile and index `to` in the list.
 struct TileRun {
     gaussian_block: u32,
     from: usize,

@@ -69,7 +69,7 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Takes the error for which the reader refused the file, if there is one.
+    /// Removes and returns the error that stopped reading, if there was one.
     pub(super) fn refusal(&mut self) -> Option<Error> {
         self.refusal.take()
     }

@@ -11,8 +11,8 @@ use half::vec::HalfFloatVecExt;
 use crate::deform::{Tensor, Tensors, unread_rows};
 use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
-/// Number of values below which a tensor stays in single precision. Biases, the last layers of heads and the box of
-/// space that the field covers take few bytes, and every value of the field depends on them.
+/// Minimum number of values of a tensor that is stored in half precision. Smaller tensors (biases, the last layers of
+/// heads, the bounding box of the field) take few bytes, and every value of the field depends on them.
 const MIN_HALF_VALUES: usize = 1024;
 /// Maximum root mean square error of a tensor in half precision, as a fraction of the root mean square of the tensor.
 /// Rounding of values within range stays below it; values too large or too small for half precision exceed it.
