@@ -4,7 +4,7 @@
 //! Input: the limits that the system reports, and environment variables. Output: the smallest limit.
 
 use splat_platform::{LimitSource, MemoryLimit, MemoryLimits, UNLIMITED_BYTES, memory_limits};
-pub use splat_platform::{peak_memory_bytes, reset_peak_memory};
+pub use splat_platform::{peak_memory_bytes, reset_peak_memory, return_freed_memory};
 
 use crate::error::ShowPath;
 

@@ -22,6 +22,7 @@ use splatsieve::evaluation::method::Method;
 use splatsieve::files::atomic::Replace;
 use splatsieve::files::cameras::Times;
 use splatsieve::files::image::write::ImageFormat;
+use splatsieve::machine::return_freed_memory;
 use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
 use splatsieve::models::{Conventions, Link, ZeroRotation};
@@ -361,8 +362,12 @@ pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }
 
-/// Returns the memory limit, and whether the memory plan is printed.
+/// Returns the memory limit, and whether the memory plan is printed. If a limit is given, freed memory is returned to the
+/// system from now on.
 fn memory_budget(memory: Memory) -> Budget {
+    if memory.memory.is_some() {
+        return_freed_memory();
+    }
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 

@@ -74,7 +74,10 @@ impl<'a> QualityMeter<'a> {
                     QualityReference::Original(targets, numbers) => {
                         // Must be rendered in the same way as the targets.
                         let picture = render(view.states[0], view.camera, background);
-                        Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
+                        Ok(decibels(mean_square(
+                            &picture,
+                            &targets.values(numbers[places[first + place]], targets.stride())?,
+                        )))
                     }
                 }
             };

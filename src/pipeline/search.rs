@@ -7,6 +7,8 @@
 //! Gaussians) are kept, so that a smaller size continues from one of them. A quarter of the views is never used by the
 //! search and gives the reported quality (method.md, section 6.3).
 
+use std::num::NonZeroU32;
+
 use super::planning::Planning;
 use super::quality_meter::{QualityMeter, QualityReference};
 use super::request::{Goal, Quality};
@@ -152,8 +154,10 @@ impl SearchStage {
         let (request, stages, template) = (run.request, run.stages, &run.template);
         let found = run.journal.run_cached_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
-            let targets = Targets::new(scene, self.pictures)?;
-            let parts = targets.parted(photographs.is_none());
+            let (pixels, count) = (scene.workload().pixels, scored.count());
+            let stride = self.refine.as_ref().map_or(NonZeroU32::MIN, |refine| refine.stride(pixels, count));
+            let targets = Targets::new(scene, self.pictures, stride, photographs.is_none())?;
+            let parts = targets.split();
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
             (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));

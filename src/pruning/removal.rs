@@ -1,15 +1,30 @@
 //! Removal error: the squared error of the scored views that removing one Gaussian would cause, for each Gaussian of a
 //! subset of the input.
 
+use std::num::NonZeroU32;
+
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
 use crate::passes::pictures::{RenderedSource, Workers};
-use crate::render::{RemovalError, Renderer};
+use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
+/// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. Other views change
+/// the ranking more than other pixels do.
+const PIXELS_PER_GAUSSIAN: f64 = 0.9;
+/// Maximum stride of the pixels of views by which Gaussians are ranked.
+const MAX_STRIDE: u32 = 4;
+
+/// Returns the stride of the pixels of views of `pixels` pixels by which `count` Gaussians are ranked.
+pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
+    let stride = (pixels as f64 / (PIXELS_PER_GAUSSIAN * count.max(1) as f64)).sqrt();
+    NonZeroU32::new((stride as u32).min(MAX_STRIDE)).unwrap_or(NonZeroU32::MIN)
+}
+
 /// Renders the Gaussians `ids` alone and returns for each of them the [`RemovalError`], the squared error that removing
-/// it would cause, summed over the views `pictures`. The thread count does not change a bit.
+/// it would cause, summed over every `stride`-th pixel in each direction of the views `pictures`. The thread count does
+/// not change a bit.
 ///
 /// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes, where d is the SH degree, for its state in each
 /// frame of a batch (frames with 4 × threads views between them, within `limits`) and once more for the state of a
@@ -20,7 +35,7 @@ pub fn removal_error(
     ids: &[u32],
     (cameras, pictures): (&[Camera], &[FrameView]),
     background: [f32; 3],
-    contrast_floor: f32,
+    (contrast_floor, stride): (f32, NonZeroU32),
     limits: Limits,
     advance: impl Fn() + Sync,
 ) -> Result<RemovalError> {
@@ -31,7 +46,7 @@ pub fn removal_error(
         pictures,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
-            renderer.removal_error(state, camera, background, errors);
+            renderer.removal_error(state, PixelGrid::centered(stride).of(camera), background, errors);
             advance();
         },
     )?;
@@ -67,7 +82,17 @@ mod tests {
         for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let found = pool
-                .install(|| removal_error(&scene, &ids, (&schedule.cameras, &sample), background, 0.1, limits, || ()))
+                .install(|| {
+                    removal_error(
+                        &scene,
+                        &ids,
+                        (&schedule.cameras, &sample),
+                        background,
+                        (0.1, NonZeroU32::MIN),
+                        limits,
+                        || (),
+                    )
+                })
                 .unwrap();
             assert!(found == plain, "{threads} threads");
         }

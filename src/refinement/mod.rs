@@ -18,9 +18,12 @@ pub mod optimizer;
 pub(crate) mod optimizer_state;
 pub(crate) mod prune_steps;
 mod run;
+mod survivors;
 pub(crate) mod targets;
 
 pub(crate) use run::RefineRun;
+
+use std::num::NonZeroU32;
 
 use crate::cache::CacheKey;
 use crate::limits::Limits;
@@ -50,6 +53,9 @@ const MIN_START_FRACTION: f64 = 0.4;
 pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
 /// Number of views by which the Gaussians are ranked for one prune step. Every prune step uses other views.
 const RANKING_VIEWS: usize = 48;
+/// Bytes of memory per Gaussian for its removal error, its position, a k-d tree and marks while a prune step chooses the
+/// Gaussians that stay.
+const NEIGHBOR_BYTES: u64 = 64;
 /// Maximum number of validation views by whose error the learning rates before a prune step are set.
 const RATE_VIEWS: usize = 16;
 
@@ -131,6 +137,19 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
+    /// Returns the stride at which the pixels of training views of `pixels` pixels are stored if refinement begins with
+    /// `first` Gaussians. It may be larger than [`RefineStage::stride`] allows for so many, because most of them will be
+    /// removed by prune steps.
+    pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
+        let fewer = if self.cuts { first / 2 } else { first };
+        self.stride(pixels, fewer)
+    }
+
+    /// Returns the stride of the pixels of training views, see [`Loss::stride`].
+    pub(crate) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
+        self.loss.stride(pixels, survivors)
+    }
+
     /// Returns the number of optimization steps after the last prune step if a fraction `kept` of all Gaussians stays.
     /// The number grows in proportion to the fraction pruned, up to `steps`.
     fn last_steps(&self, kept: f64) -> usize {
@@ -177,6 +196,8 @@ impl RefineStage {
         let left = [
             ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
+            ("mean", 2 * work.state(self.columns)),
+            ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
             ("result", work.input.reduced),
             ("views", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
@@ -202,7 +223,8 @@ impl RefineStage {
         let wanted = self.target.unwrap_or(0.5);
         let prune_counts = prune_counts(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
-        let validation_renders = pictures / targets::VALIDATION_EVERY as f64 * 4.0;
+        let validation_renders = pictures / targets::validation_every(own + between) as f64 * 4.0;
+        let on_grid = |stride: NonZeroU32| Workload { pixels: work.pixels / u64::from(stride.get()).pow(2), ..*work };
         let seconds = |(k, &size): (usize, &usize)| {
             let (count, left) = (size as f64 / 1e6 * work.count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {
@@ -212,15 +234,19 @@ impl RefineStage {
             // Evaluating states and their Jacobians under a deformation field takes three times as long as evaluating
             // states.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
+            let strided = on_grid(self.stride(work.pixels, count as usize));
             work.reading(count, frames as f64 * found)
-                + work.render_seconds(renders + STEP_RENDERS * steps as f64, count, RENDER)
-                + work.render_seconds(ranked, count, REMOVE)
+                + work.render_seconds(renders, count, RENDER)
+                + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER)
+                + strided.render_seconds(ranked, count, REMOVE)
         };
+        let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.count());
+        let stored = on_grid(self.stored_stride(work.pixels, first as usize));
         ResourceEstimate {
             stage: NAME,
             reads: 2.0 * work.scattered_reads(frames, limits),
             seconds: 2.0 * work.reading(work.count(), frames as f64)
-                + work.render_seconds(pictures, work.count(), RENDER)
+                + stored.render_seconds(pictures, work.count(), RENDER)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![

@@ -1,6 +1,8 @@
 //! Optimizer with the frame states that it needs: the attributes of the survivors (Gaussians left by pruning) at the
 //! frames of the target views.
 
+use std::num::NonZeroU32;
+
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -74,6 +76,8 @@ pub(super) struct OptimizerState<'a> {
     /// Buffer for the frame state of the view being rendered.
     now: LinearizedState,
     renderer: Renderer,
+    /// Stride of the pixels of training views, for optimization steps and ranking.
+    stride: NonZeroU32,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
     /// Whether the frame states were evaluated again since the last prune step (or since the beginning, before the
@@ -126,6 +130,7 @@ impl<'a> OptimizerState<'a> {
             gradients: Gradients::new(0, columns, sh_degree),
             now: LinearizedState::none(state_degree),
             renderer: Renderer::on_all_threads(),
+            stride: targets.stride(),
             steps: 0,
             reevaluated: false,
             frames,
@@ -164,9 +169,14 @@ impl<'a> OptimizerState<'a> {
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
-        let StepParams { columns, sh_degree, .. } = self.step_params;
+        let StepParams { columns, sh_degree, loss } = self.step_params;
         self.descent = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
+        // A multiple of the stride of the stored values.
+        let (pixels, stored) = (self.scene.workload().pixels, self.targets.stride());
+        let wanted = loss.stride(pixels, state.len());
+        let multiple = NonZeroU32::new(wanted.get() / stored).unwrap_or(NonZeroU32::MIN);
+        self.stride = stored.saturating_mul(multiple);
     }
 
     /// Adds a time-varying delta with `keyframe_count` keyframes, which starts at 0. It changes only attributes that
@@ -249,6 +259,18 @@ impl<'a> OptimizerState<'a> {
             self.course.iter_mut().zip(course).for_each(|(knot, checkpoint)| knot.resume(checkpoint));
         }
         Ok(())
+    }
+
+    /// Returns the positions of all Gaussians at the first frame of the target views, deltas included.
+    pub(super) fn positions(&self) -> Vec<[f32; 3]> {
+        let Some(LinearizedState { state, .. }) = self.linearized.first() else { return Vec::new() };
+        let change = &self.descent.change().0.position;
+        let moved = |i: usize| {
+            let [mut at, by] = [state.position.row::<3>(i), if change.is_empty() { [0.0; 3] } else { change.row(i) }];
+            at.iter_mut().zip(by).for_each(|(at, by)| *at += by);
+            at
+        };
+        (0..state.len()).map(moved).collect()
     }
 
     /// Restarts the optimizer from the total delta `change`, an earlier result of [`OptimizerState::change`] with the
@@ -360,7 +382,7 @@ impl<'a> OptimizerState<'a> {
 
     /// Renders target view `k` and computes the derivatives of its loss into `gradients`.
     fn differentiate(&mut self, k: usize) -> Result<()> {
-        let target = self.targets.values(k)?;
+        let (target, view) = (self.targets.values(k, self.stride)?, self.targets.view(k, self.stride));
         let mut now = std::mem::take(&mut self.now);
         self.show(self.frame_index(k), &mut now)?;
         self.gradients.clear();
@@ -368,7 +390,7 @@ impl<'a> OptimizerState<'a> {
         let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
         let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
         let pull = |picture: &_| (0.0, loss.slope(picture, &target));
-        self.renderer.gradient(&now.state, self.targets.camera(k), self.scene.background, pull, gradients);
+        self.renderer.gradient(&now.state, view, self.scene.background, pull, gradients);
         now.jacobian.pull_back(gradients);
         if let Some((present, gradients)) = now.present.as_ref().zip(sparse) {
             self.gradients.set_rows(present, &gradients);
@@ -377,15 +399,16 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Renders the target views with the indices `views` and returns their mean quality.
+    /// Renders the validation or test views with the indices `views` and returns their mean quality.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
     pub(super) fn quality(&self, views: &[usize]) -> Result<RenderQuality> {
         let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
             self.show(self.frame_index(k), now)?;
-            let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
-            Ok(self.step_params.loss.errors(&picture, &self.targets.values(k)?))
+            let (view, values) = (self.targets.view(k, self.stride), self.targets.values(k, self.stride)?);
+            let picture = renderer.render(&now.state, view, self.scene.background);
+            Ok(self.step_params.loss.errors(&picture, &values))
         };
         let losses: Vec<[f64; 2]> = views.par_iter().map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
         Ok(RenderQuality::from_errors(&losses))
@@ -403,7 +426,7 @@ impl<'a> OptimizerState<'a> {
             self.show(self.frame_index(k), &mut now)?;
             let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
             let found = sparse.as_mut().unwrap_or(&mut errors);
-            renderer.removal_error(&now.state, self.targets.camera(k), self.scene.background, found);
+            renderer.removal_error(&now.state, self.targets.view(k, self.stride), self.scene.background, found);
             if let Some((present, found)) = now.present.as_ref().zip(sparse) {
                 errors.merge_rows(present, &found);
             }

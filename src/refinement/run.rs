@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::loss::RenderQuality;
 use super::optimizer::RateSchedule;
 use super::optimizer_state::{KeptCheckpoint, OptimizerState, keyframe_count};
+use super::survivors::survivors;
 use super::targets::{Targets, ViewSplit};
 use super::{MAX_USEFUL_PSNR, NAME, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
 use crate::cache::CacheKey;
@@ -34,7 +35,12 @@ const MIN_KEYFRAME_GAIN: f64 = 0.01;
 const RATE_REDUCTION: f32 = 0.3;
 /// Learning rates of the last step as a fraction of those of the first step: before a prune step, and in the final
 /// steps.
-const LAST_RATES: [f32; 2] = [1.0, 0.05];
+const LAST_RATES: [f32; 2] = [1.0, 0.5];
+/// Fraction of the final steps at the end, over which the parameters are averaged. The mean is closer to the optimum than
+/// the parameters after a single step, which scatter around it.
+const AVERAGED_FRACTION: f64 = 0.4;
+/// Number of optimization steps between two parameter deltas that are averaged.
+const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
     /// Prunes the model `reduction` down to `wanted` Gaussians and refines it. Returns the parameters with the best
@@ -63,9 +69,10 @@ impl RefineStage {
         let key = scene.work.key(&(self.key(), &reduction, wanted, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, count, scene.source(), |journal| {
-                let targets = Targets::new(scene, self.pictures)?;
+                let targets =
+                    Targets::new(scene, self.pictures, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_before(NAME)?;
-                let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.parted(false));
+                let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
             })
         };
@@ -87,7 +94,7 @@ impl RefineStage {
         wanted: usize,
     ) -> Result<f64> {
         let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
-        let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.parted(false));
+        let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.split());
         let key = run.key(reduction, wanted, wanted).and(&steps);
         let all = || Ok(run.run_all(reduction, wanted, steps, &mut Journal::default())?.1);
         scene.work.known(&format!("{stage}-size"), key, all)
@@ -179,6 +186,26 @@ struct BestState<Delta, Trajectory> {
     rate_factor: f32,
     /// Time-varying part of the best delta.
     trajectory: Trajectory,
+    mean: MeanDelta<Delta>,
+}
+
+/// Mean of the parameter deltas after some of the last optimization steps.
+#[derive(Clone, Default, Serialize, Deserialize)]
+struct MeanDelta<Delta> {
+    delta: Delta,
+    /// Number of deltas that were averaged.
+    count: u32,
+}
+
+impl MeanDelta<ParamDelta> {
+    /// Includes `next` in the mean.
+    fn add(&mut self, mut next: ParamDelta) {
+        self.count += 1;
+        let part = 1.0 / self.count as f32;
+        self.delta.scale(1.0 - part);
+        next.scale(part);
+        self.delta = std::mem::take(&mut self.delta).and(next);
+    }
 }
 
 /// Progress of a resumed phase: number of optimization steps done, learning rates and, in the last phase, the best
@@ -380,8 +407,8 @@ impl<'a> RefineRun<'a> {
                     Some((done, schedule, _)) => (done, schedule),
                     None => {
                         let some = self.validation.iter().step_by(self.validation.len().div_ceil(RATE_VIEWS).max(1));
-                        let error = optimizer.quality(&some.copied().collect::<Vec<_>>())?.error;
-                        (0, RateSchedule::new(steps, LAST_RATES[0], error))
+                        let start = optimizer.quality(&some.copied().collect::<Vec<_>>())?;
+                        (0, RateSchedule::new(steps, LAST_RATES[0], start.typical_error()))
                     }
                 };
                 for step in done..steps {
@@ -390,7 +417,7 @@ impl<'a> RefineRun<'a> {
                 }
                 let views: Vec<usize> = (0..RANKING_VIEWS).map(|_| self.sampler.next()).collect();
                 let errors = optimizer.removal_error(&views, self.refine.contrast_floor as f32)?;
-                let left = errors.top_by_error(size, |place| optimizer.fixed()[place]);
+                let left = survivors(&errors.sum, size, optimizer.fixed(), &optimizer.positions());
                 work.keep(&name, key, &(optimizer.checkpoint(), &left, self.sampler.taken))?;
                 left
             }
@@ -425,21 +452,33 @@ impl<'a> RefineRun<'a> {
                     journal.leave_out("refinement", why);
                     return Ok(BestState::new(before, optimizer.change()));
                 }
-                (0, RateSchedule::new(steps, LAST_RATES[1], before.error), BestState::new(before, optimizer.change()))
+                (
+                    0,
+                    RateSchedule::new(steps, LAST_RATES[1], before.typical_error()),
+                    BestState::new(before, optimizer.change()),
+                )
             }
         };
         let validate_every = steps.div_ceil(3).clamp(VALIDATE_EVERY[0], VALIDATE_EVERY[1]);
+        let averaged_after = steps - (steps as f64 * AVERAGED_FRACTION) as usize;
         for step in done + 1..=steps {
             self.step(optimizer, &schedule)?;
+            if step > averaged_after && (step - averaged_after).is_multiple_of(AVERAGE_EVERY) {
+                best_state.mean.add(optimizer.change());
+            }
             if step % validate_every == 0 || step == steps {
-                optimizer.reevaluate_states()?;
+                match step == steps && best_state.mean.count > 0 {
+                    true => optimizer.restart_from(&best_state.mean.delta)?,
+                    false => optimizer.reevaluate_states()?,
+                }
                 let now = optimizer.quality(&self.validation)?;
                 if self.refine.loss.is_closer(&now, &best_state.best) {
                     (best_state.best, best_state.delta) = (now, optimizer.change());
                 } else if step < steps {
+                    best_state.mean = MeanDelta::default();
                     best_state.rate_factor *= RATE_REDUCTION;
                     optimizer.restart_from(&best_state.delta)?;
-                    schedule = RateSchedule::new(steps - step, LAST_RATES[1], best_state.best.error)
+                    schedule = RateSchedule::new(steps - step, LAST_RATES[1], best_state.best.typical_error())
                         .times(best_state.rate_factor);
                 }
             }
@@ -516,12 +555,14 @@ impl BestState<ParamDelta, TrajectoryDelta> {
             delta,
             rate_factor: 1.0,
             trajectory: TrajectoryDelta::default(),
+            mean: MeanDelta::default(),
         }
     }
 
     /// Returns a copy for a checkpoint, which borrows the deltas.
     fn checkpoint(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
-        let BestState { before, best, constant, ref delta, rate_factor, ref trajectory } = *self;
-        BestState { before, best, constant, delta, rate_factor, trajectory }
+        let BestState { before, best, constant, ref delta, rate_factor, ref trajectory, ref mean } = *self;
+        let mean = MeanDelta { delta: &mean.delta, count: mean.count };
+        BestState { before, best, constant, delta, rate_factor, trajectory, mean }
     }
 }

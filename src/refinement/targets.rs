@@ -1,14 +1,15 @@
 //! Target views: renders of the original model that refinement fits Gaussians to.
 
+use std::num::NonZeroU32;
 use std::ops::Range;
 
 use rayon::prelude::*;
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Camera, FrameView};
+use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
-use crate::render::{Image, render};
+use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::between::{SplitMix64, between};
 
@@ -21,8 +22,10 @@ const VIEW_SHARES: [usize; 2] = [3, 23];
 const MAX_BYTES: u64 = 1 << 30;
 /// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// One in this many views is a validation view.
-pub(super) const VALIDATION_EVERY: usize = 8;
+/// One in this many views is a validation view, if there are at least [`MANY_VIEWS`] views and if there are fewer.
+const VALIDATION_EVERY: [usize; 2] = [16, 8];
+/// Number of views from which a sixteenth of them is enough for validation.
+const MANY_VIEWS: usize = 400;
 
 /// One in this many views is a test view, used only for the reported quality. Applies to runs with a quality target.
 const TEST_EVERY: usize = 4;
@@ -46,44 +49,90 @@ pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
 }
 
 /// Renders of the original model, in a scratch file. Their cameras are those by which Gaussians are scored, and cameras
-/// between these.
+/// between these. Of a training view only the pixels of a grid are rendered; validation and test views are whole.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
     pub(crate) pictures: Vec<FrameView>,
+    /// Stride of the grid of pixels of the training views.
+    stride: NonZeroU32,
+    /// Whether every fourth view is a test view, used only for the reported quality.
+    has_test_views: bool,
     /// Scratch files, each with a range of consecutive views. A file has the color values of one view after the other,
     /// from 0 to 1 as 16-bit integers.
     values: Vec<(Range<usize>, Spill)>,
 }
 
+/// Purpose of a target view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Purpose {
+    Training,
+    Validation,
+    Test,
+}
+
 impl Targets {
-    /// Renders `max_views` views of the original; fewer if they would need too many bytes.
+    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Of training views only every
+    /// `stride`-th pixel in each direction is rendered. If `has_test_views`, every fourth view is a test view; otherwise
+    /// there are none.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
-    pub(crate) fn new(scene: &Scene, max_views: usize) -> Result<Targets> {
+    pub(crate) fn new(scene: &Scene, max_views: usize, stride: NonZeroU32, has_test_views: bool) -> Result<Targets> {
         let (cameras, pictures) = choose_views(scene, max_views);
+        let mut targets = Targets { cameras, pictures, stride, has_test_views, values: Vec::new() };
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all(scene.source())];
-            show(subject, &cameras, &pictures[some], Batch::one_frame(&scene.limits), |views| {
-                let picture = |view: &ViewStates<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
-                let made: Vec<Vec<u16>> = views.par_iter().map(picture).collect();
+            let mut next = some.start;
+            show(subject, &targets.cameras, &targets.pictures[some], Batch::one_frame(&scene.limits), |views| {
+                let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
+                    let view_on_grid = targets.grid(next + k, stride).of(view.camera);
+                    narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
+                };
+                let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
+                next += views.len();
                 made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
             })
         };
-        let key = scene.work.key(&(&cameras, &pictures));
-        let values = scene.work.sharded_spill(NAME, key, pictures.len(), &scene.scratch, make)?;
-        Ok(Targets { cameras, pictures, values })
+        let key = scene.work.key(&(&targets.cameras, &targets.pictures, stride, has_test_views));
+        targets.values = scene.work.sharded_spill(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
+        Ok(targets)
     }
 
-    /// Divides the views into training, validation and test views. If `held`, every fourth view is a test view;
-    /// otherwise there are none.
-    pub(crate) fn parted(&self, held: bool) -> ViewSplit {
-        let (held, rest): (Vec<usize>, Vec<usize>) =
-            (0..self.pictures.len()).partition(|k| held && k % TEST_EVERY == TEST_EVERY - 1);
-        // Validation views are chosen from the views that are not test views.
-        let (apart, stepped) = rest.into_iter().partition(|k| k % VALIDATION_EVERY == 1);
-        ViewSplit { stepped, apart, held }
+    /// Returns the stride of the grid of pixels of the training views.
+    pub(crate) fn stride(&self) -> NonZeroU32 {
+        self.stride
+    }
+
+    /// Returns the indices of the training, validation and test views.
+    pub(crate) fn split(&self) -> ViewSplit {
+        let of = |purpose| (0..self.pictures.len()).filter(|&k| self.purpose(k) == purpose).collect();
+        ViewSplit { stepped: of(Purpose::Training), apart: of(Purpose::Validation), held: of(Purpose::Test) }
+    }
+
+    fn purpose(&self, k: usize) -> Purpose {
+        match () {
+            () if self.has_test_views && k % TEST_EVERY == TEST_EVERY - 1 => Purpose::Test,
+            () if k % validation_every(self.pictures.len()) == 1 => Purpose::Validation,
+            () => Purpose::Training,
+        }
+    }
+
+    /// Returns the grid with `stride` of the pixels of view `k` that are used: all pixels unless it is a training view.
+    /// Its phase is fixed for each view and differs between views. `stride` must be a multiple of [`Targets::stride`].
+    fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
+        match self.purpose(k) {
+            Purpose::Training => {
+                let hash = hash_id(k as u64);
+                PixelGrid::new(stride, [hash as u32, (hash >> 32) as u32])
+            }
+            Purpose::Validation | Purpose::Test => PixelGrid::ALL,
+        }
+    }
+
+    /// Returns the pixels of target view `k` that are compared with its values at `stride`, see [`Targets::values`].
+    pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
+        self.grid(k, stride).of(self.camera(k))
     }
 
     /// Returns the camera of target view `k`.
@@ -91,24 +140,40 @@ impl Targets {
         &self.cameras[self.pictures[k].camera as usize]
     }
 
-    /// Returns the number of color values of view `k`: three per pixel.
-    fn len(&self, k: usize) -> usize {
+    /// Returns the numbers of columns and rows of view `k` on its grid with `stride`.
+    fn size(&self, k: usize, stride: NonZeroU32) -> [usize; 2] {
         let camera = self.camera(k);
-        3 * camera.width as usize * camera.height as usize
+        self.grid(k, stride).size([camera.width, camera.height]).map(|pixels| pixels as usize)
     }
 
-    /// Reads the color values of view `k`, from 0 to 1 as 16-bit integers.
+    /// Reads the color values of view `k` at the pixels of [`Targets::view`], from 0 to 1 as 16-bit integers. `stride`
+    /// must be a multiple of [`Targets::stride`].
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
-    pub(crate) fn values(&self, k: usize) -> Result<Vec<u16>> {
-        let mut values = vec![0u16; self.len(k)];
+    pub(crate) fn values(&self, k: usize, stride: NonZeroU32) -> Result<Vec<u16>> {
+        let len = |k: usize| 3 * self.size(k, self.stride).iter().product::<usize>();
+        let mut values = vec![0u16; len(k)];
         for (some, spill) in self.values.iter().filter(|(some, _)| some.contains(&k)) {
-            let before: usize = (some.start..k).map(|k| self.len(k)).sum();
+            let before: usize = (some.start..k).map(len).sum();
             spill.read(2 * before as u64, bytemuck::cast_slice_mut(&mut values))?;
         }
-        Ok(values)
+        let [stored, wanted] = [self.stride, stride].map(|stride| self.grid(k, stride));
+        if stored == wanted {
+            return Ok(values);
+        }
+        // Position on the stored grid of the first column and row of the wanted grid.
+        let first = [0, 1].map(|axis| ((wanted.pixel(axis, 0) - stored.pixel(axis, 0)) / stored.stride()) as usize);
+        let step = (wanted.stride() / stored.stride()) as usize;
+        let row_len = self.size(k, self.stride)[0];
+        let rows = values.as_chunks::<3>().0.chunks_exact(row_len.max(1)).skip(first[1]).step_by(step);
+        Ok(rows.flat_map(|row| row.iter().skip(first[0]).step_by(step)).flatten().copied().collect())
     }
+}
+
+/// Returns the distance between the indices of two validation views, if there are `views` target views.
+pub(super) fn validation_every(views: usize) -> usize {
+    VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
 /// Chooses the cameras, and the views sorted by frame: views by which Gaussians are scored, and views from cameras in

@@ -313,7 +313,7 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
     let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
     for scene in [explicit, open_scene(&options).unwrap()] {
-        let targets = Targets::new(&scene, 520).unwrap();
+        let targets = Targets::new(&scene, 520, NonZeroU32::MIN, false).unwrap();
         let count = scene.source().info().count;
         let kept = (0..count as u32).step_by(2).collect();
         let reduction = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
@@ -350,4 +350,40 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
         let expected = fresh.quality(&views).unwrap().psnr;
         assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
     }
+}
+
+#[test]
+fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let stride = |s: u32| NonZeroU32::new(s).unwrap();
+    let all = Targets::new(&scene, 60, stride(1), true).unwrap();
+    for stored in [2, 3] {
+        let targets = Targets::new(&scene, 60, stride(stored), true).unwrap();
+        let split = targets.split();
+        assert!(!split.stepped.is_empty() && !split.apart.is_empty() && !split.held.is_empty());
+        for k in 0..targets.pictures.len() {
+            for wanted in [stride(stored), stride(2 * stored)] {
+                let [expected, got] = [&all, &targets].map(|targets| targets.values(k, wanted).unwrap());
+                let size = targets.view(k, wanted).grid.size([targets.camera(k).width, targets.camera(k).height]);
+                assert_eq!((got.len(), expected.len()), (3 * (size[0] * size[1]) as usize, got.len()), "view {k}");
+                // A pixel has the same value in both renders up to rounding.
+                let largest = got.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
+                assert!(largest <= 2, "view {k} at stride {wanted}: values differ by {largest} of 65535");
+            }
+        }
+        for k in split.apart.into_iter().chain(split.held) {
+            assert_eq!(targets.view(k, stride(stored)).grid, crate::render::PixelGrid::ALL, "view {k}");
+        }
+    }
+}
+
+#[test]
+fn strides_leave_enough_pixels_per_gaussian() {
+    let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, true).unwrap();
+    let stride = |pixels, survivors| refine.stride(pixels, survivors).get();
+    assert_eq!([stride(82_944, 8354), stride(82_944, 4177), stride(82_944, 2088)], [1, 2, 3]);
+    assert_eq!([stride(1_370_928, 60_000), stride(1_370_928, 20_000)], [3, 4]);
+    assert_eq!([stride(0, 10), stride(100, 0), stride(u64::MAX, 1)], [1, 4, 4]);
+    assert_eq!(refine.stored_stride(82_944, 8354).get(), 2);
 }

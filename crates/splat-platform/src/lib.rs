@@ -22,6 +22,7 @@
 //! | [`memory_limits`] | machine, control groups, process | machine, process | machine, job object |
 //! | [`peak_memory_bytes`] | `VmHWM` | `ru_maxrss` | peak working set |
 //! | [`reset_peak_memory`] | `clear_refs` | not possible | not possible |
+//! | [`return_freed_memory`] | `mallopt` of glibc | no effect | no effect |
 //!
 //! File locks are those of [`std::fs::File`]: `flock` on Linux and macOS, `LockFileEx` on Windows.
 //!
@@ -62,9 +63,13 @@ mod windows;
 compile_error!("this system is not supported: expected Linux, macOS or Windows");
 
 #[cfg(target_os = "linux")]
-pub use linux::{is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory};
+pub use linux::{
+    is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory, return_freed_memory,
+};
 #[cfg(target_os = "macos")]
-pub use macos::{is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory};
+pub use macos::{
+    is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory, return_freed_memory,
+};
 #[cfg(unix)]
 pub use unix::{
     FolderHandle, create_private_folder, end_on_signals, expect_pages, is_standard_output, is_system_folder,
@@ -74,7 +79,7 @@ pub use unix::{
 pub use windows::{
     FolderHandle, create_private_folder, end_on_signals, expect_pages, is_cached, is_standard_output, is_system_folder,
     memory_limits, open_stream, open_without_waiting, peak_memory_bytes, private_permissions, read_exact_at,
-    release_pages, report_cut_short_maps, reset_peak_memory, sync_file, sync_folder,
+    release_pages, report_cut_short_maps, reset_peak_memory, return_freed_memory, sync_file, sync_folder,
 };
 
 /// Identity of a file or folder. Two paths have the same identity if and only if both lead to the same file or folder.

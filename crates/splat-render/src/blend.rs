@@ -6,6 +6,7 @@
 //! with that of the arithmetic alone.
 
 use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
+use super::grid::PixelGrid;
 use super::lanes::{Aligned, LANES, Lanes, Portable, Sums};
 use super::project::Splat;
 
@@ -23,68 +24,62 @@ pub(super) type TilePlane = Aligned<[[f32; LANES]; GROUPS]>;
 /// One f32 for each sampled row, or each sampled column, of a tile.
 type TileLine = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
-/// Sampled pixels of a tile: every `stride`-th pixel of the image in both directions. With stride 1, all pixels.
-///
-/// The samples are stored next to each other, so that a larger stride leaves fewer groups of eight pixels instead of
-/// partly filled ones.
+/// Pixels of a tile of a render. In a render of a grid of pixels, a tile has 16×16 pixels of the grid.
 pub(super) struct SampledPixels {
-    /// Left edge of the tile in the image, pixels.
+    /// Column in the image of the first pixel of the tile.
     x0: f64,
-    /// Upper edge of the tile in the image, pixels.
+    /// Row in the image of the first pixel of the tile.
     y0: f64,
-    /// Offset of each sampled column from the left edge of the tile, pixels.
+    /// Offset of each column from the first one, pixels of the image.
     xs: TileLine,
-    /// Offset of each sampled row from the upper edge of the tile, pixels.
+    /// Offset of each row from the first one, pixels of the image.
     ys: TileLine,
     /// First and last offset in each half (eight columns) of `xs`.
     spans: [[f32; 2]; SIDE / LANES],
-    /// Number of sampled columns.
+    /// Number of columns.
     across: usize,
-    /// Number of sampled rows.
+    /// Number of rows.
     down: usize,
+    /// Whether the pixels are those of a grid with a stride above 1.
+    is_strided: bool,
 }
 
 impl SampledPixels {
-    /// Computes the sampled pixels of the tile in column `tile[0]` and row `tile[1]` of an image of `size` = (width,
-    /// height) pixels.
-    pub(super) fn new(tile: [u32; 2], size: [u32; 2], stride: u32) -> Self {
-        let (xs, across) = samples(tile[0] * TILE, size[0], stride);
-        let (ys, down) = samples(tile[1] * TILE, size[1], stride);
+    /// Computes the pixels of the tile in column `tile[0]` and row `tile[1]` of a render of the pixels `grid` with `size` =
+    /// (columns, rows) of the grid.
+    pub(super) fn new(tile: [u32; 2], size: [u32; 2], grid: PixelGrid) -> Self {
+        let line = |axis: usize| {
+            let first = tile[axis] * TILE;
+            let count = TILE.min(size[axis] - first) as usize;
+            let mut offsets = TileLine::default();
+            for (k, offset) in offsets.as_flattened_mut()[..count].iter_mut().enumerate() {
+                *offset = (grid.stride() * k as u32) as f32;
+            }
+            (f64::from(grid.pixel(axis, first)), offsets, count)
+        };
+        let (x0, xs, across) = line(0);
+        let (y0, ys, down) = line(1);
         let spans = std::array::from_fn(|half| {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
             [xs[half][0], xs.as_flattened()[last]]
         });
-        let corner = [f64::from(tile[0] * TILE), f64::from(tile[1] * TILE)];
-        SampledPixels { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
+        SampledPixels { x0, y0, xs, ys, spans, across, down, is_strided: grid.stride() > 1 }
     }
 
-    /// Returns which groups of [`LANES`] neighboring pixels in a row of the tile contain a sampled pixel, one bit per group.
+    /// Returns which groups of [`LANES`] neighboring pixels in a row of the tile contain a pixel of the render, one bit
+    /// per group.
     fn groups(&self) -> u32 {
         let rows = ((1u64 << self.down) - 1) as u32;
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat: 1 for sampled pixels, negative (which means ended) for
-    /// others.
+    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means ended)
+    /// for others.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
         Aligned(std::array::from_fn(lanes))
     }
-}
-
-/// Returns the offsets of the sampled pixels along one axis of a tile that begins at pixel `start`, and their number.
-/// `size` is the image size along this axis.
-fn samples(start: u32, size: u32, stride: u32) -> (TileLine, usize) {
-    let mut offsets = TileLine::default();
-    let mut count = 0;
-    for offset in 0..TILE.min(size - start) {
-        if (start + offset) % stride == stride / 2 {
-            offsets.as_flattened_mut()[count] = offset as f32;
-            count += 1;
-        }
-    }
-    (offsets, count)
 }
 
 /// Values of one splat at the pixels of one vector.
@@ -290,6 +285,8 @@ struct TileFootprint {
     middles: TileLine,
     /// Exponent (of 2) of the largest alpha in each row.
     levels: TileLine,
+    /// First and last offset of the columns in which the splat is drawn, if some columns of the tile are excluded.
+    drawn_columns: Option<[f32; 2]>,
 }
 
 impl TileFootprint {
@@ -316,9 +313,37 @@ impl TileFootprint {
                 footprint.groups |= V::bits(nearest.at_least(floor)) << (column * SIDE + first * LANES);
             }
         }
+        if sampled.is_strided && splat.drawn_tiles != Splat::UNBOUNDED && footprint.groups != 0 {
+            footprint.exclude_tiles(splat, sampled);
+        }
         footprint
     }
+
+    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is drawn.
+    #[cold]
+    fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
+        let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
+        for (row, y) in sampled.ys.as_flattened().iter().enumerate().take(sampled.down) {
+            if !(y0..y1).contains(&(sampled.y0 + f64::from(*y))) {
+                self.levels.as_flattened_mut()[row] = EXCLUDED_LEVEL;
+                self.groups &= !((1 | 1 << SIDE) << row);
+            }
+        }
+        let drawn = |x: &&f32| (x0..x1).contains(&(sampled.x0 + f64::from(**x)));
+        let xs = &sampled.xs.as_flattened()[..sampled.across];
+        let drawn_columns = xs.iter().find(drawn).copied().zip(xs.iter().rfind(drawn).copied());
+        match drawn_columns {
+            None => self.groups = 0,
+            Some((first, last)) if xs.first() != Some(&first) || xs.last() != Some(&last) => {
+                self.drawn_columns = Some([first, last]);
+            }
+            Some(_) => {}
+        }
+    }
 }
+
+/// Exponent (of 2) of the alpha in a row in which a splat is not drawn: it makes alpha 0.
+const EXCLUDED_LEVEL: f32 = -1e9;
 
 /// Does the work of [`BlendKernel::tile`] with vectors of type `V`.
 #[inline(always)]
@@ -355,7 +380,12 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
                 let row = group % SIDE;
                 let dx = xs[group / SIDE].sub(V::splat_each(&footprint.middles, row));
                 let power = V::splat_each(&footprint.levels, row).sub(falloff_x.mul(dx.mul(dx)));
-                opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA)).store(&mut alphas, group);
+                let mut alpha = opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA));
+                if let Some([first, last]) = footprint.drawn_columns {
+                    let x = xs[group / SIDE];
+                    alpha = alpha.keep(V::both(x.at_least(V::splat(first)), V::splat(last).at_least(x)));
+                }
+                alpha.store(&mut alphas, group);
             }
             let mut ended = 0;
             let parts = if I::SPLITS_EVEN_ODD && V::GROUPS == 1 {

@@ -53,6 +53,7 @@ mod color;
 mod contribution;
 mod convention;
 mod features;
+mod grid;
 mod lanes;
 pub mod metrics;
 mod project;
@@ -62,6 +63,7 @@ mod renderer;
 pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use contribution::Contribution;
 pub use features::blend_features;
+pub use grid::{PixelGrid, SampledView};
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 

@@ -11,8 +11,9 @@ use std::ops::Range;
 
 use super::color::{self, Colors};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
+use super::grid::{PixelGrid, SampledView};
+use splat_core::Gaussians;
 use splat_core::functions::exp;
-use splat_core::{Camera, Gaussians};
 
 /// Dilation: variance in pixels² that is added to the diagonal of every 2-D covariance, as in the original rasterizer.
 const DILATION: f64 = 0.3;
@@ -42,9 +43,13 @@ pub(super) struct CameraTerms {
     pub(super) slope_limit: [f64; 2],
     /// Position of the camera in world coordinates, scene units.
     pub(super) center: [f64; 3],
-    /// Image width and height, pixels.
+    /// Width and height of the full image, pixels.
+    image_size: [u32; 2],
+    /// Pixels of the image that are rendered.
+    pub(super) grid: PixelGrid,
+    /// Numbers of columns and rows of `grid`: the size of the render.
     pub(super) size: [u32; 2],
-    /// Numbers of tiles across and down the image.
+    /// Numbers of tiles (16×16 pixels of `grid`) across and down the render.
     pub(super) tiles: [u32; 2],
     /// Near limit in scene units: Gaussians at this depth or closer to the camera are not drawn. Rounded to f32 as in the
     /// original CUDA rasterizer.
@@ -52,8 +57,11 @@ pub(super) struct CameraTerms {
 }
 
 impl CameraTerms {
-    /// Computes the parameters of the projection from a camera.
-    pub(super) fn new(camera: &Camera) -> Self {
+    /// Computes the parameters of the projection from a camera and the pixels that are rendered.
+    pub(super) fn new(view: SampledView<'_>) -> Self {
+        let SampledView { camera, grid } = view;
+        let image_size = [camera.width, camera.height];
+        let size = grid.size(image_size);
         let rows = camera.rotation.transpose();
         CameraTerms {
             rotation: [rows.x_axis.to_array(), rows.y_axis.to_array(), rows.z_axis.to_array()],
@@ -65,8 +73,10 @@ impl CameraTerms {
                 FOV_MARGIN * f64::from(camera.height) / (2.0 * camera.fy),
             ],
             center: camera.center().to_array(),
-            size: [camera.width, camera.height],
-            tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
+            image_size,
+            grid,
+            size,
+            tiles: size.map(|pixels| pixels.div_ceil(TILE)),
             near: f64::from(camera.near as f32),
         }
     }
@@ -104,6 +114,15 @@ pub(super) struct Splat {
     pub(super) color: [f32; 3],
     /// Index of the Gaussian in the frame.
     pub(super) id: u32,
+    /// Range of columns, then of rows, of tiles of the full image outside which the splat is not drawn, although its
+    /// alpha may exceed 1/255 there. [`Splat::UNBOUNDED`] if there are no such pixels. Used only in renders of a grid of
+    /// pixels, whose tiles are larger than those of the image.
+    pub(super) drawn_tiles: [u16; 4],
+}
+
+impl Splat {
+    /// Value of [`Splat::drawn_tiles`] of a splat without limits.
+    pub(super) const UNBOUNDED: [u16; 4] = [0, u16::MAX, 0, u16::MAX];
 }
 
 /// Rectangle of tiles [x0, x1) × [y0, y1) in which a splat can change a pixel.
@@ -113,6 +132,13 @@ pub(super) struct TileRect {
     pub(super) x1: u32,
     pub(super) y0: u32,
     pub(super) y1: u32,
+}
+
+impl TileRect {
+    /// Returns the range of columns and then that of rows as 16-bit integers. An end beyond them becomes their maximum.
+    fn narrow(self) -> [u16; 4] {
+        [self.x0, self.x1, self.y0, self.y1].map(|tile| tile.try_into().unwrap_or(u16::MAX))
+    }
 }
 
 /// Footprints (splats) of the visible Gaussians of a range, by increasing index. Entry i of both lists belongs to the
@@ -275,11 +301,25 @@ impl ProjectedSplats {
         // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255 can
         // touch.
         let root = cutoff.sqrt();
-        let (x0, x1) = tile_range(u, self.radius[i], root * self.half_u[i], view.tiles[0]);
-        let (y0, y1) = tile_range(v, self.radius[i], root * self.half_v[i], view.tiles[1]);
+        let (radius, half) = (self.radius[i], [root * self.half_u[i], root * self.half_v[i]]);
+        let image_tiles = view.image_size.map(|pixels| pixels.div_ceil(TILE));
+        let (x0, x1) = tile_range(u, radius, half[0], image_tiles[0]);
+        let (y0, y1) = tile_range(v, radius, half[1], image_tiles[1]);
         if x0 >= x1 || y0 >= y1 {
             return None;
         }
+        let image_rect = TileRect { x0, x1, y0, y1 };
+        let rect = view.grid.tiles(image_rect, [u, v], half, view.image_size);
+        if rect.x0 >= rect.x1 || rect.y0 >= rect.y1 {
+            return None;
+        }
+        // Only a splat whose ellipse alpha ≥ 1/255 has a pixel beyond its tiles, inside the image, is cut off.
+        let is_cut = |at: f64, half: f64, (start, end): (u32, u32), tiles: u32| {
+            let [start_pixel, end_pixel] = [start, end].map(|tile| f64::from(tile) * f64::from(TILE));
+            (start > 0 && at - half <= start_pixel - 1.0) || (end < tiles && at + half >= end_pixel)
+        };
+        let is_cut_off = view.grid.stride() > 1
+            && (is_cut(u, half[0], (x0, x1), image_tiles[0]) || is_cut(v, half[1], (y0, y1), image_tiles[1]));
         let splat = Splat {
             u,
             v,
@@ -291,8 +331,9 @@ impl ProjectedSplats {
             sort_depth: self.sort_depth[i],
             color: [0.0; 3],
             id,
+            drawn_tiles: if is_cut_off { image_rect.narrow() } else { Splat::UNBOUNDED },
         };
-        Some((splat, TileRect { x0, x1, y0, y1 }))
+        Some((splat, rect))
     }
 }
 

@@ -11,6 +11,7 @@ use super::bin::{Bins, STRIP_PAIRS};
 use super::blend::{BlendKernel, ColorSink, SampledPixels, TilePlane, Weight, WeightSink};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
+use super::grid::{PixelGrid, SampledView};
 use super::lanes::LANES;
 use super::project::{CameraTerms, Splat, Splats, TileRect, project};
 use super::removal::{RemovalError, RemovalSink};
@@ -120,9 +121,15 @@ impl Renderer {
         }
     }
 
-    /// Renders `gaussians` from `camera` over the color `background`, like the function [`render`].
-    pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
-        let view = CameraTerms::new(camera);
+    /// Renders `gaussians` in `view` over the color `background`, like the function [`render`]. The image has the size
+    /// of the grid of pixels of `view`.
+    pub fn render<'a>(
+        &mut self,
+        gaussians: &Gaussians,
+        view: impl Into<SampledView<'a>>,
+        background: [f32; 3],
+    ) -> Image {
+        let view = CameraTerms::new(view.into());
         self.prepare(gaussians, &view, true);
         self.render_prepared(&view, background)
     }
@@ -139,7 +146,7 @@ impl Renderer {
             let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
             let render_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
                 for x in tiles {
-                    let sampled = SampledPixels::new([x as u32, y as u32], view.size, 1);
+                    let sampled = SampledPixels::new([x as u32, y as u32], view.size, view.grid);
                     let pairs = bins.pairs_in_row(y, x..x + 1);
                     let planes = blend_colors(blend, splats, pairs, &sampled, background);
                     for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
@@ -177,12 +184,12 @@ impl Renderer {
         seen: &mut Contribution,
     ) {
         assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
-        let view = CameraTerms::new(camera);
+        let view = CameraTerms::new(PixelGrid::centered(stride).of(camera));
         self.prepare(gaussians, &view, false);
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             fill_pairs(bins, strip.clone(), self.parallel, &mut self.weights, |tile, pairs, weights| {
-                let sampled = SampledPixels::new(tile, view.size, stride.get());
+                let sampled = SampledPixels::new(tile, view.size, view.grid);
                 blend.tile(splats, pairs, &sampled, &mut WeightSink { pairs: weights });
             });
             for (&splat, weight) in bins.pairs(strip).iter().zip(&self.weights) {
@@ -193,27 +200,27 @@ impl Renderer {
         }
     }
 
-    /// Adds the removal error of each Gaussian in the view of `camera` (the error of a render without this Gaussian) to
-    /// `errors`, on the calling thread.
+    /// Adds the removal error of each Gaussian in `view` (the error of a render without this Gaussian) to `errors`, on the
+    /// calling thread. Errors are sums over the pixels of the grid of `view`.
     ///
     /// # Panics
     /// Panics if `errors` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
-    pub fn removal_error(
+    pub fn removal_error<'a>(
         &mut self,
         gaussians: &Gaussians,
-        camera: &Camera,
+        view: impl Into<SampledView<'a>>,
         background: [f32; 3],
         errors: &mut RemovalError,
     ) {
         assert_eq!(errors.len(), gaussians.len(), "expected as many removal errors as Gaussians");
-        let view = CameraTerms::new(camera);
+        let view = CameraTerms::new(view.into());
         self.prepare(gaussians, &view, true);
         let mut sums = Vec::new();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats) = (&self.bins, &self.splats.splats);
             for (y, x) in bins.rows(strip).flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
                 let pairs = bins.pairs_in_row(y, x..x + 1);
-                let sampled = SampledPixels::new([x as u32, y as u32], view.size, 1);
+                let sampled = SampledPixels::new([x as u32, y as u32], view.size, view.grid);
                 let behind = blend_colors(self.blend, splats, pairs, &sampled, background);
                 sums.clear();
                 sums.resize(pairs.len(), 0.0);
@@ -359,7 +366,7 @@ mod tests {
         let whole = all_results(Renderer::new());
         let (scene, camera) = scene();
         let mut renderer = Renderer::new();
-        renderer.prepare(&scene, &CameraTerms::new(&camera), true);
+        renderer.prepare(&scene, &CameraTerms::new((&camera).into()), true);
         let tiles = renderer.bins.next_strip(&renderer.splats, usize::MAX).unwrap();
         let pairs = renderer.bins.pairs(0..7 * 5).len();
         assert_eq!(tiles, 0..7 * 5);
@@ -379,6 +386,85 @@ mod tests {
                 at = strip.end;
             }
             assert_eq!(at, 35);
+        }
+    }
+
+    /// Returns the grids with strides from 2 to 5 of all phases along x, and of several along y.
+    fn grids() -> impl Iterator<Item = PixelGrid> {
+        (2..6).flat_map(|stride| {
+            (0..stride).map(move |phase| PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 3 * phase + 1]))
+        })
+    }
+
+    #[test]
+    fn grid_render_equals_the_pixels_of_the_full_render() {
+        let (mut scene, camera) = scene();
+        // Opaque round Gaussians, which are cut off at the edge of their tiles.
+        for i in 0..100 {
+            scene.log_scale.set_row(i, [-3.0; 3]);
+            scene.opacity_logit.set_row(i, [9.0]);
+        }
+        let mut renderer = Renderer::new();
+        let whole = renderer.render(&scene, &camera, [0.3; 3]);
+        let mut bounded = 0;
+        for grid in grids() {
+            let got = renderer.render(&scene, grid.of(&camera), [0.3; 3]);
+            bounded += renderer.splats.splats.iter().filter(|splat| splat.drawn_tiles != Splat::UNBOUNDED).count();
+            assert_eq!([got.width, got.height], grid.size([camera.width, camera.height]));
+            for (k, pixel) in got.data.as_chunks::<3>().0.iter().enumerate() {
+                let [x, y] = [grid.pixel(0, k as u32 % got.width), grid.pixel(1, k as u32 / got.width)];
+                let expected = whole.data.as_chunks::<3>().0[(y * camera.width + x) as usize];
+                for (got, expected) in pixel.iter().zip(expected) {
+                    assert!((got - expected).abs() < 2e-5, "{grid:?}, pixel {x}, {y}: got {got}, expected {expected}");
+                }
+            }
+        }
+        assert!(bounded > 100, "{bounded} splats are cut off");
+    }
+
+    #[test]
+    fn gradients_of_all_phases_add_up_to_the_full_gradient() {
+        let (scene, camera) = scene();
+        let gradient = |view: SampledView<'_>| {
+            let mut gradients = Gradients::new(scene.len(), Attributes::all(), 0);
+            let loss = |image: &Image| (0.0, image.clone());
+            Renderer::new().gradient(&scene, view, [0.3; 3], loss, &mut gradients);
+            gradients
+        };
+        let stride = NonZeroU32::new(3).unwrap();
+        let phases = (0..9).map(|k| PixelGrid::new(stride, [k % 3, k / 3]));
+        let parts: Vec<Gradients> = phases.map(|grid| gradient(grid.of(&camera))).collect();
+        let whole = gradient((&camera).into());
+        for column in Attributes::all().iter() {
+            let expected = whole.column(column).planes();
+            let largest = expected.iter().fold(0.0f32, |largest, x| largest.max(x.abs()));
+            for (i, &expected) in expected.iter().enumerate() {
+                let sum: f64 = parts.iter().map(|part| f64::from(part.column(column).planes()[i])).sum();
+                let error = (sum - f64::from(expected)).abs();
+                assert!(error <= f64::from(1e-5 * largest), "{column:?} {i}: got {sum}, expected {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn grid_results_do_not_depend_on_threads_or_instructions() {
+        let (scene, camera) = scene();
+        let results = |mut renderer: Renderer, grid: PixelGrid| {
+            let mut seen = Contribution::new(scene.len());
+            renderer.contribution(&scene, &camera, NonZeroU32::new(grid.stride()).unwrap(), &mut seen);
+            let mut errors = RemovalError::new(scene.len(), 0.1);
+            renderer.removal_error(&scene, grid.of(&camera), [0.3; 3], &mut errors);
+            let mut gradients = Gradients::new(scene.len(), Attributes::all(), 0);
+            let loss = |image: &Image| (0.0, image.clone());
+            renderer.gradient(&scene, grid.of(&camera), [0.3; 3], loss, &mut gradients);
+            (seen, errors, gradients)
+        };
+        for grid in grids() {
+            let expected = results(Renderer::new(), grid);
+            assert!(results(Renderer::on_all_threads(), grid) == expected, "{grid:?} differs with threads");
+            for blend in BlendKernel::all() {
+                assert!(results(Renderer { blend, ..Renderer::new() }, grid) == expected, "{grid:?} {blend:?} differs");
+            }
         }
     }
 }

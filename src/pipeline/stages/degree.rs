@@ -81,11 +81,14 @@ impl Degree {
         let all = scored.count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.run_cached_stage(NAME, all, scene, key, |journal| {
-            let targets = Targets::new(scene, self.refine.pictures)?;
+            let first = |gaussians: usize| self.refine.first(gaussians, all).min(ranked.order().len());
+            let largest = fits.iter().map(|fit| first(fit.gaussians)).max().unwrap_or_default();
+            let stride = self.refine.stored_stride(scene.workload().pixels, largest);
+            let targets = Targets::new(scene, self.refine.pictures, stride, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
-                let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
-                let start = CompressedModel { sh_degree: fit.sh_degree, ..template.with(ranked.take(first)) };
+                let start =
+                    CompressedModel { sh_degree: fit.sh_degree, ..template.with(ranked.take(first(fit.gaussians))) };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
@@ -100,7 +103,7 @@ impl Degree {
                 format!("{} Gaussians of degree {}: {psnr}", fit.gaussians, fit.sh_degree)
             };
             let tried = tried.iter().map(line).collect::<Vec<_>>().join(", ");
-            let count = targets.parted(false).apart.len();
+            let count = targets.split().apart.len();
             journal.notes.push(format!(
                 "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a \
                  fifth of the optimization steps, dB: {tried}",

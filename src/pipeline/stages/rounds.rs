@@ -7,6 +7,7 @@
 //! of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a larger one.
 //! Memory: see [`removal_error`].
 
+use std::num::NonZeroU32;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -23,7 +24,7 @@ use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
-use crate::pruning::removal::removal_error;
+use crate::pruning::removal::{ranking_stride, removal_error};
 use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
@@ -181,8 +182,10 @@ impl Rounds {
         }
         let turns = self.turns(scene, scored);
         state.errors = vec![vec![0; scored.count()]; turns.len()];
+        // All rounds use the same pixels, because a round adds errors that earlier rounds measured.
+        let stride = ranking_stride(scene.workload().pixels, first);
         // The key does not depend on `fewest`, because the survivors of a round do not.
-        let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
+        let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected, stride));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
             if let Some(found) = scene.work.find(&entry_name(round), key.and(&round))? {
@@ -195,7 +198,7 @@ impl Rounds {
         let progress = scene.events.task(NAME, "views", pictures.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
-                state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
+                state = self.round(scene, scored, (state, &turns), round, (key, left, stride), &progress)?;
             }
             let left = state.free.len() + protected.len();
             Ok((state, left))
@@ -223,7 +226,7 @@ impl Rounds {
         scored: &Scored,
         (mut state, turns): (RoundState, &[Vec<FrameView>]),
         round: usize,
-        (key, left): (CacheKey, usize),
+        (key, left, stride): (CacheKey, usize, NonZeroU32),
         progress: &Progress,
     ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
@@ -245,7 +248,8 @@ impl Rounds {
                 }
                 let pictures = (&scene.schedule.cameras[..], &pictures[range]);
                 let advance = || progress.advance(1);
-                Ok(removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?.sum)
+                Ok(removal_error(scene.source(), &ids, pictures, background, (floor, stride), scene.limits, advance)?
+                    .sum)
             };
             active.iter().map(turn_errors).collect()
         };

@@ -2,6 +2,8 @@
 //! anything is ranked. The second removes Gaussians from the result at the end if its refined values take more bytes
 //! than the values with which the number was found.
 
+use std::num::NonZeroU32;
+
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -241,7 +243,8 @@ impl ByteLimit {
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
         let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
-        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
+        let errors =
+            removal_error(&*result, &places, looked_at, scene.background, (0.0, NonZeroU32::MIN), scene.limits, || ())?;
         Ok(errors.top_by_error(count, |place| scored.is_protected(compressed.kept[place])))
     }
 }

@@ -9,7 +9,7 @@ use std::io::IoSliceMut;
 use rustix::io::{Errno, ReadWriteFlags, preadv2};
 
 pub use cut_short::report_cut_short_maps;
-pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
+pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory, return_freed_memory};
 
 /// Returns whether the byte at `offset` of `file` is in memory (the page cache), so that reading it needs no disk
 /// access. Returns `None` if the system gives no answer.

@@ -21,7 +21,7 @@ use windows_sys::core::BOOL;
 
 use crate::{FileIdentity, FileStatus, TruncatedMapMessage};
 pub use folder::FolderHandle;
-pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
+pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory, return_freed_memory};
 
 /// Fills `bytes` with the bytes of `file` from byte `offset` on. Several threads may read one file at the same time.
 /// Changes the file position, from which a later `Read` continues.

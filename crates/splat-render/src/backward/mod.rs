@@ -20,9 +20,10 @@ use rayon::prelude::*;
 use super::bin::STRIP_PAIRS;
 use super::blend::SampledPixels;
 use super::convention::BLOCK;
+use super::grid::SampledView;
 use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
-use splat_core::{Attributes, Camera, Gaussians, GradientSpan, Gradients};
+use splat_core::{Attributes, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
 
@@ -43,16 +44,17 @@ impl Renderer {
     /// attributes of `gaussians` to `out`.
     ///
     /// `loss` gets the image and returns the loss and its derivative with respect to each value of the image. Returns
-    /// the loss. Results have the same bits for any number of threads. A pixel whose color or derivative is not finite
+    /// the loss. If `view` renders a grid of pixels, the image has the size of the grid, and the derivatives are those of the
+    /// loss of these pixels alone. Results have the same bits for any number of threads. A pixel whose color or derivative is not finite
     /// has no effect on gradients. Gaussians that are not visible get gradient 0.
     ///
     /// # Panics
     /// Panics if `out` has another number of Gaussians or a higher SH degree than `gaussians`, if the attributes of
     /// `gaussians` have different lengths, or if `loss` returns a derivative of another size than the image.
-    pub fn gradient(
+    pub fn gradient<'a>(
         &mut self,
         gaussians: &Gaussians,
-        camera: &Camera,
+        view: impl Into<SampledView<'a>>,
         background: [f32; 3],
         loss: impl FnOnce(&Image) -> (f64, Image),
         out: &mut Gradients,
@@ -62,7 +64,7 @@ impl Renderer {
             out.column(Attributes::SH).width() <= gaussians.sh.width(),
             "expected gradients of at most the SH degree of the Gaussians"
         );
-        let view = CameraTerms::new(camera);
+        let view = CameraTerms::new(view.into());
         self.prepare(gaussians, &view, true);
         let image = self.render_prepared(&view, background);
         let (value, pixel_gradient) = loss(&image);
@@ -107,7 +109,7 @@ impl Renderer {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             for tiles in bins.parts(strip, self.strip_pairs.min(SUMMED_PAIRS)) {
                 fill_pairs(bins, tiles.clone(), self.parallel, pair_sums, |tile, pairs, sums| {
-                    let sampled = SampledPixels::new(tile, view.size, 1);
+                    let sampled = SampledPixels::new(tile, view.size, view.grid);
                     let mut sink = GradientSink::<SHAPE> {
                         gradients: PixelGradients::new(image, pixel_gradient, tile),
                         pairs: sums,

@@ -1,0 +1,87 @@
+//! Choice of the Gaussians that a prune step removes.
+
+use crate::merging::tree::{Nearest, Tree, TreePoint};
+
+/// Number of candidates for removal, as a multiple of the number of Gaussians to remove.
+const CANDIDATES: f64 = 1.6;
+
+/// Returns the indices of the `count` Gaussians that a prune step keeps, in increasing order. `errors` are their removal
+/// errors (the squared error of renders without the Gaussian), `fixed` marks those that must stay if possible, and
+/// `positions` are their centers in scene units.
+///
+/// Gaussians are removed in order of increasing error, equal errors by decreasing index. A removed Gaussian protects its
+/// nearest neighbor, because each error assumes that all others remain, and two neighbors that cover for each other
+/// would otherwise both be removed. If that leaves too few candidates, protected ones are removed too.
+pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &[[f32; 3]]) -> Vec<u32> {
+    let removed_count = errors.len().saturating_sub(count);
+    let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();
+    ranked.sort_by_key(|&i| (fixed[i as usize], errors[i as usize], std::cmp::Reverse(i)));
+    let candidates = &ranked[..((CANDIDATES * removed_count as f64) as usize).min(ranked.len())];
+    let mut points: Vec<TreePoint> = (0..).zip(positions).map(|(index, &at)| TreePoint { at, index }).collect();
+    points.retain(|point| point.at.iter().all(|x| x.is_finite()));
+    let (tree, mut nearest) = (Tree::new(&mut points), Nearest::default());
+    let mut is_protected = vec![false; errors.len()];
+    let mut is_removed = vec![false; errors.len()];
+    let mut left = removed_count;
+    for &i in candidates {
+        if left == 0 {
+            break;
+        }
+        if is_protected[i as usize] || fixed[i as usize] {
+            continue;
+        }
+        is_removed[i as usize] = true;
+        left -= 1;
+        nearest.start(i, positions[i as usize], 1, f64::INFINITY);
+        tree.search(&points, &mut nearest);
+        if let Some(&(_, neighbor)) = nearest.sorted().first() {
+            is_protected[neighbor as usize] = true;
+        }
+    }
+    for &i in &ranked {
+        if left > 0 && !is_removed[i as usize] {
+            is_removed[i as usize] = true;
+            left -= 1;
+        }
+    }
+    (0..errors.len() as u32).filter(|&i| !is_removed[i as usize]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns positions on a line, one per coordinate of `along`.
+    fn line(along: &[f32]) -> Vec<[f32; 3]> {
+        along.iter().map(|&x| [x, 0.0, 0.0]).collect()
+    }
+
+    #[test]
+    fn nearest_neighbor_of_a_removed_gaussian_stays() {
+        // Gaussians 0 and 1 are close together and have the smallest errors; so are 2 and 3.
+        let positions = line(&[0.0, 0.1, 5.0, 9.0, 20.0, 40.0, 60.0, 80.0]);
+        let errors = [1, 2, 3, 4, 50, 60, 70, 80];
+        assert_eq!(survivors(&errors, 6, &[false; 8], &positions), [1, 3, 4, 5, 6, 7]);
+        // Of the four candidates for three removals, 0 protects 1, and 2 protects 3. The lower of these goes too.
+        assert_eq!(survivors(&errors, 5, &[false; 8], &positions), [3, 4, 5, 6, 7]);
+    }
+
+    #[test]
+    fn count_is_exact_and_fixed_gaussians_stay() {
+        let positions = line(&(0..100).map(|i| (i as f32 * 0.618).fract()).collect::<Vec<_>>());
+        let errors: Vec<u64> = (0..100).map(|i| i * 37 % 101).collect();
+        let fixed: Vec<bool> = (0..100).map(|i| i % 10 == 3).collect();
+        for count in 0..=100 {
+            let kept = survivors(&errors, count, &fixed, &positions);
+            assert_eq!(kept.len(), count);
+            let fixed_kept = kept.iter().filter(|&&i| fixed[i as usize]).count();
+            assert_eq!(fixed_kept, count.min(10), "of {count}");
+        }
+    }
+
+    #[test]
+    fn positions_that_are_not_finite_are_accepted() {
+        let positions = [[f32::NAN; 3], [f32::INFINITY, 0.0, 0.0], [0.0; 3], [0.0; 3]];
+        assert_eq!(survivors(&[1, 2, 3, 4], 2, &[false; 4], &positions), [2, 3]);
+    }
+}
