@@ -12,7 +12,7 @@ use crate::source::{FrameSource, Ids};
 
 /// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. Other views change
 /// the ranking more than other pixels do.
-const PIXELS_PER_GAUSSIAN: f64 = 0.9;
+const PIXELS_PER_GAUSSIAN: f64 = 1.5;
 /// Maximum stride of the pixels of views by which Gaussians are ranked.
 const MAX_STRIDE: u32 = 4;
 
@@ -46,7 +46,7 @@ pub fn removal_error(
         pictures,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
-            renderer.removal_error(state, PixelGrid::centered(stride).of(camera), background, errors);
+            renderer.removal_error(state, PixelGrid::centered(stride).viewed_from(camera), background, errors);
             advance();
         },
     )?;

@@ -18,9 +18,10 @@ const EPSILON: f32 = 1e-15;
 /// Number of first steps during which learning rates grow to full size, because Adam's running means are still
 /// unreliable.
 const WARM_UP: usize = 10;
-/// Root mean square error of the renders at the start (values from 0 to 1) from which learning rates have full size.
-/// With a smaller error they are reduced in proportion, so that nearly correct parameters are not disturbed.
-const FULL_ERROR: f64 = 0.045;
+/// Typical error of the renders at the start (geometric mean of the root mean square errors of the views, values from 0 to
+/// 1) from which learning rates have full size. With a smaller error they are reduced in proportion, so that nearly
+/// correct parameters are not disturbed.
+const FULL_ERROR: f64 = 0.036;
 
 /// Factor on all learning rates as a function of the optimization step.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
@@ -32,7 +33,7 @@ pub struct RateSchedule {
 
 impl RateSchedule {
     /// Creates the schedule of `steps` steps, at the end of which the rates have fallen to the fraction `last` of those
-    /// at the beginning. `error`: root mean square error of the renders at the start.
+    /// at the beginning. `error`: typical root mean square error of the renders at the start.
     pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
         RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
@@ -221,7 +222,7 @@ mod tests {
             square = 0.999 * square + 0.001 * slope * slope;
             let t = k as i32 + 1;
             let size = (mean / (1.0 - 0.9f64.powi(t))) / (square / (1.0 - 0.999f64.powi(t))).sqrt();
-            let rate = 0.05 * 0.2 * (f64::from(t) / 10.0).min(1.0) * 0.05f64.powf(k as f64 / steps as f64);
+            let rate = 0.05 * 0.25 * (f64::from(t) / 10.0).min(1.0) * 0.05f64.powf(k as f64 / steps as f64);
             value -= rate * size;
             let got = f64::from(descent.change().0.opacity_logit.row::<1>(0)[0]);
             assert!((got - value).abs() < 1e-5, "step {k}: got {got}, expected {value}");

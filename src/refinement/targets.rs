@@ -86,7 +86,7 @@ impl Targets {
             let mut next = some.start;
             show(subject, &targets.cameras, &targets.pictures[some], Batch::one_frame(&scene.limits), |views| {
                 let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
-                    let view_on_grid = targets.grid(next + k, stride).of(view.camera);
+                    let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
                     narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
                 };
                 let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
@@ -106,8 +106,12 @@ impl Targets {
 
     /// Returns the indices of the training, validation and test views.
     pub(crate) fn split(&self) -> ViewSplit {
-        let of = |purpose| (0..self.pictures.len()).filter(|&k| self.purpose(k) == purpose).collect();
-        ViewSplit { stepped: of(Purpose::Training), apart: of(Purpose::Validation), held: of(Purpose::Test) }
+        let with_purpose = |purpose| (0..self.pictures.len()).filter(|&k| self.purpose(k) == purpose).collect();
+        ViewSplit {
+            stepped: with_purpose(Purpose::Training),
+            apart: with_purpose(Purpose::Validation),
+            held: with_purpose(Purpose::Test),
+        }
     }
 
     fn purpose(&self, k: usize) -> Purpose {
@@ -132,7 +136,7 @@ impl Targets {
 
     /// Returns the pixels of target view `k` that are compared with its values at `stride`, see [`Targets::values`].
     pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
-        self.grid(k, stride).of(self.camera(k))
+        self.grid(k, stride).viewed_from(self.camera(k))
     }
 
     /// Returns the camera of target view `k`.

@@ -47,7 +47,7 @@ impl PixelGrid {
     }
 
     /// Returns the view of `camera` in which only the pixels of this grid are rendered.
-    pub fn of(self, camera: &Camera) -> SampledView<'_> {
+    pub fn viewed_from(self, camera: &Camera) -> SampledView<'_> {
         SampledView { camera, grid: self }
     }
 
@@ -90,7 +90,7 @@ pub struct SampledView<'a> {
 
 impl<'a> From<&'a Camera> for SampledView<'a> {
     fn from(camera: &'a Camera) -> Self {
-        PixelGrid::ALL.of(camera)
+        PixelGrid::ALL.viewed_from(camera)
     }
 }
 
