@@ -56,7 +56,7 @@ pub(super) struct TensorEntry {
     pub(super) channels: Vec<i8>,
     /// Mean of the values, in quantization steps.
     pub(super) mean: i64,
-    /// Weights with which a value is predicted from its neighbors in the tensor.
+    /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
     pub(super) parts: PredictorWeights<NEIGHBORS>,
 }
 
@@ -140,7 +140,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the quantization grid for values of `class` in `channel`.
+    /// Returns the quantization grid for the values of channel `channel` in the class `class`: of a weight, the sum of
+    /// its row and column offsets; of a texel, the octave of its summed squared read weights.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             Role::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),

@@ -216,8 +216,8 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. `None` stands for a number that
-/// overflowed and is refused.
+/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. Fails if they are too many, or if
+/// `bytes` is `None`, which stands for a number that overflowed.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

@@ -182,7 +182,7 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-/// Decodes the sections of an archive whose table of contents has been checked.
+/// Decodes the sections of an archive, whose table of contents has been checked, into its content.
 fn decoded(
     sections: Sections,
     table: Table,

@@ -528,7 +528,7 @@ pub(super) struct Demo {
     pub(super) earlier: Earlier,
 }
 
-/// `test-scene`
+/// Arguments of `test-scene`.
 #[derive(Debug, Args)]
 pub(super) struct TestScene {
     /// Keep the scene and the result in this folder [default: a temporary one]

@@ -21,9 +21,9 @@ use crate::scene::path::along;
 use crate::scene::pictures::{self, ViewSet, background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
-/// Name of the stage, for progress.
+/// Name of the rendering stage, for progress.
 const NAME: &str = "render";
-/// Number of video frames between two cameras of a path through a still.
+/// Number of video frames between two cameras of a path through a still (a model without motion).
 const VIEWS_BETWEEN_STOPS: usize = 24;
 
 /// Camera of a video.
@@ -38,13 +38,14 @@ pub enum FilmPath {
 /// Options of a video.
 #[derive(Debug, Clone)]
 pub struct VideoOptions {
-    /// Input and cameras. Its split is ignored. Its frames can differ from the times of the cameras.
+    /// Input and cameras. The split that its options request is ignored; see `views`. The frames can differ from the
+    /// times of the cameras.
     pub input: InputOptions,
     /// Other model with the same frames, shown to the right.
     pub beside: Option<PathBuf>,
     /// Camera of the video.
     pub path: FilmPath,
-    /// Set of views that `path` selects from.
+    /// Set of views from which `path` selects.
     pub views: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
@@ -67,7 +68,8 @@ pub struct Filmed {
     pub notes: Vec<String>,
 }
 
-/// Renders a video of an input, one image per frame in order. Along a path through a still, the camera moves instead.
+/// Renders a video of an input, one image per frame in order. Along a path through a still (a model without motion),
+/// the camera moves from image to image.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,

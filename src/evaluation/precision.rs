@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::evaluation::cost::{Cost, Spread};
 use crate::files::csv::{known, table};
 
-/// Result of `precision`: all knobs and their common conditions.
+/// Result of `precision`: measurements of all varied settings, and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
     /// Program and version.
@@ -38,7 +38,7 @@ pub struct PrecisionDiagram {
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
     pub enough: f64,
-    /// Knobs that were varied.
+    /// Knobs (settings, or groups of settings) that were varied.
     pub knobs: Vec<PrecisionKnob>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -85,15 +85,16 @@ pub struct PrecisionKnob {
 pub struct PrecisionCurve {
     /// Name of the parameter; the name in the recipe if it is a recipe parameter.
     pub name: String,
-    /// Reference of the errors.
+    /// Description of the reference values from which the errors are measured.
     pub against: String,
     /// Measurements in the order in which they were made, mostly from coarse to fine.
     pub marks: Vec<PrecisionSetting>,
     /// Observed orders of the errors in the step.
     pub orders: Vec<ObservedOrder>,
-    /// Value in the recipe; `None` if it was not measured.
+    /// Value of the parameter in the recipe; `None` if it was not measured.
     pub own: Option<f64>,
-    /// Coarsest value from which on the error added to renders stays below a tenth of the model's own error.
+    /// Coarsest value of the parameter such that, at this and all finer values, the error added to renders stays below
+    /// a tenth of the model's own error; `None` if there is none.
     pub enough: Option<f64>,
 }
 
@@ -128,16 +129,17 @@ pub const PICTURES: &str = "pictures";
 /// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting counts as
 /// the error of the compressed model itself (see [`added`]).
 pub const ADDED: &str = "added";
-/// Error name: difference of the kept sets.
+/// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
+/// keeps.
 pub const KEPT: &str = "kept";
-/// Error name: relative error of the number of survivors.
+/// Error name: relative error of the number of Gaussians that a setting keeps.
 pub const STAYING: &str = "staying";
 /// Error name: largest relative error of the percentiles P1 and P99.
 pub const PERCENTILES: &str = "percentiles";
-/// Error name: results whose bytes differ.
+/// Error name: 1 if the bytes of the result differ from those of the first run, else 0.
 pub const BYTES: &str = "bytes";
 
-/// Maximum of [`ADDED`] from [`PrecisionCurve::enough`] on.
+/// Maximum of the error [`ADDED`] at the value [`PrecisionCurve::enough`] and all finer values.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of the error called `error`.

@@ -32,7 +32,7 @@ const SH_DEGREE: usize = 1;
 
 /// Number of cameras of [`Scene::rig`].
 const CAMERAS: u32 = 6;
-/// Camera of the test view: an inner one, so that its view lies between training views.
+/// Index of the camera whose view is the test view. It is an inner one, so that its view lies between training views.
 const HELD_OUT: u32 = 2;
 
 /// The test scene: a room 4 units wide, 4 deep and 2.5 high, z up, open toward −y.

@@ -31,7 +31,7 @@ const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 /// Maximum number of frames at which the results of complete runs are compared with the whole model.
 const FRAMES_COMPARED: usize = 12;
 
-/// Text for the results: what the results of complete runs are compared with.
+/// Text for the results that says with what the results of complete runs are compared.
 const WHOLE: &str = "renders of the whole model: every held-out view of up to 12 frames";
 
 impl Bench<'_> {

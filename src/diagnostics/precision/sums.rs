@@ -24,7 +24,7 @@ const MOST_FRAMES: usize = 240;
 /// Lengths of the played sequences, in frames.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
-/// Text for the results: what the sums are compared with.
+/// Text for the results that says with what the sums are compared.
 const AGAINST: &str = "f64, compensated";
 
 /// Sum of numbers of type `T` that are added one after the other.
