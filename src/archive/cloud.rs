@@ -1,8 +1,8 @@
 //! Encodes the canonical Gaussians, each attribute on its own quantization grid.
 //!
-//! In: Gaussians, and a quantization step for each attribute. Out: entropy-coded symbols, and the order in which the
-//! Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve from
-//! the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
+//! Input: Gaussians, and a quantization step for each attribute. Output: entropy-coded symbols, and the order in which
+//! the Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve
+//! from the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
 //! Gaussians.
 
 use std::collections::BTreeMap;

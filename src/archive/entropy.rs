@@ -1,7 +1,7 @@
 //! Entropy coder for symbols from 0 to 15. Adaptive models predict the symbols, and an asymmetric numeral system (ANS)
 //! codes them. Plain bits are stored in a stream beside the symbols.
 //!
-//! In: symbols, each with the model that predicts it. Out: bytes. Encoder and decoder update the models alike, so
+//! Input: symbols, each with the model that predicts it. Output: bytes. Encoder and decoder update the models alike, so
 //! models are not stored. Memory: 4 bytes per symbol while encoding. Source: J. Duda, "Asymmetric numeral systems",
 //! 2013; models are updated by F. Giesen's mixing of distributions.
 

@@ -1,8 +1,9 @@
 //! Encodes the tensors of a deformation field, each on its own quantization grid.
 //!
-//! In: a state dict (tensors by name), the role of each tensor, and the stored positions. Out: symbols and a table of
-//! tensors. Of a feature plane only the texels that some Gaussian reads at some time are stored; texels that are read
-//! more have finer steps. Of a weight matrix all values are stored. Tensors that nothing reads are restored as zeros.
+//! Input: a state dict (tensors by name), the role of each tensor, and the stored positions. Output: symbols and a
+//! table of tensors. Of a feature plane only the texels that some Gaussian reads at some time are stored; texels that
+//! are read more have finer steps. Of a weight matrix all values are stored. Tensors that nothing reads are restored as
+//! zeros.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +26,7 @@ const FINER_PER_OCTAVE: i32 = 4;
 /// an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
-/// How the deformation field uses a tensor, which decides how an archive stores the tensor.
+/// Way in which the deformation field uses a tensor. It decides how an archive stores the tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
@@ -285,8 +286,8 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns a tensor rounded with `steps`, as an archive would restore it. One difference remains: rows of a plane over
-/// time that no time reads keep their own values here.
+/// Returns a tensor rounded with `steps`, as an archive would restore it. The only difference: rows of a plane over
+/// time that are read at no time keep their values.
 pub fn rounded(
     tensor: &Tensor,
     role: Role,

@@ -1,6 +1,6 @@
 //! File layout of an archive: a header with lengths and checksums, and four sections.
 //!
-//! In: the contents of the sections. Out: the bytes of the file, and back. Everything read from a file is checked
+//! Input: the contents of the sections. Output: the bytes of the file, and back. Everything read from a file is checked
 //! before it is used: lengths against the length of the file, checksums against the bytes, and sizes to allocate
 //! against both the length of the file and the memory limit.
 

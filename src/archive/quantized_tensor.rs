@@ -1,7 +1,8 @@
 //! Codes a tensor as channels of rows of values; each value is predicted from its neighbors to the left and above.
 //!
-//! In: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the quantization
-//! step of the place or marks it as never read. Out: symbols, and the restored values. Memory: three rows.
+//! Input: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the
+//! quantization step of the place or marks it as never read. Output: symbols, and the restored values. Memory: three
+//! rows.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};

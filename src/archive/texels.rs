@@ -1,8 +1,8 @@
 //! Determines which texels of a feature plane are read by some Gaussian, and with what total weight.
 //!
-//! In: canonical positions as they are stored, the box of space that the plane covers, its axes and its size. Out: a
-//! class for each texel. Writer and reader of an archive both compute the classes, so they are not stored. Sums and
-//! products of f32 in a fixed order give the same classes on every machine.
+//! Input: canonical positions as they are stored, the box of space that the plane covers, its axes and its size.
+//! Output: a class for each texel. Writer and reader of an archive both compute the classes, so they are not stored.
+//! Sums and products of f32 in a fixed order give the same classes on every machine.
 
 use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};

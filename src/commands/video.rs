@@ -119,8 +119,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     Ok(Filmed { frames: views.len(), size, notes: scene.notes })
 }
 
-/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots in `opened`,
-/// so that every camera can show every frame, and returns the shots with their times.
+/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots (views of
+/// the scene) in `opened`, so that every camera can show every frame, and returns a copy of the shots with their times.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -128,7 +128,8 @@ fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<
     Some(own)
 }
 
-/// Returns the shots of the set `views`, sorted by view, then time; shots without a time come first.
+/// Returns the shots (views of the scene) in the set `views`, sorted by view number, then time; shots without a time
+/// come first.
 fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     let split = views.split(rig);
     let mut found: Vec<Shot> =
@@ -178,7 +179,8 @@ fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Resu
     }
 }
 
-/// Returns the shots of view `view`. `flag` names the option in the error if there are none.
+/// Returns the shots (views of the scene) with view number `view`. `flag` names the option in the error if there are
+/// none.
 fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
     views.find(|shots| shots[0].view == view).ok_or_else(|| {

@@ -22,7 +22,7 @@ pub enum Baseline {
     Opacity,
     /// Largest of the three scales.
     Scale,
-    /// Hashed id only.
+    /// Random order: by a hash of the id of the Gaussian.
     Random,
 }
 

@@ -122,7 +122,7 @@ pub struct TruthComparison {
 /// Result of an evaluation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Paths of the models, as given.
     pub path: Both<String>,

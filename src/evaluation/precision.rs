@@ -11,7 +11,7 @@ use crate::files::csv::{known, table};
 /// Result of `precision`: measurements of all varied settings, and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Path of the input, as given.
     pub path: String,
@@ -23,7 +23,7 @@ pub struct PrecisionDiagram {
     pub frames: usize,
     /// Maximum number of frames for scoring and ranking, spread evenly from first to last.
     pub frames_looked_at: usize,
-    /// Number of views of these frames.
+    /// Number of views of the frames that are used for scoring and ranking.
     pub pictures: usize,
     /// Number of views on which rankings are judged: test views if there are any.
     pub judged: usize,

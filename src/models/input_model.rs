@@ -195,8 +195,8 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns whether the frames may be linked again, although the input already identifies each Gaussian across
-    /// frames.
+    /// Returns whether the frames may be linked again (Gaussians matched between frames), although the input already
+    /// identifies each Gaussian across frames.
     fn may_be_linked(&self) -> bool {
         false
     }
@@ -238,7 +238,7 @@ pub trait InputModel: Send + Sync {
     }
 }
 
-/// Where the time stamps of frames come from.
+/// Origin of the time stamps of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timing {
     /// The model is continuous in time: a frame can be at any time.

@@ -23,7 +23,8 @@ pub struct ScanParams {
     pub non_finite: NonFinite,
 }
 
-/// Which steps from one frame to the next count as motion of a Gaussian, and by what their sum is divided.
+/// Definition of the steps from one frame to the next that count as motion of a Gaussian, and of the number by which
+/// their sum is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
@@ -118,9 +119,9 @@ pub struct SelectParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LowPriority {
-    /// They are removed.
+    /// Gaussians that are not candidates are removed.
     Drop,
-    /// Stage 2 decides on them in the same way as on the candidates.
+    /// Stage 2 decides on Gaussians that are not candidates in the same way as on candidates.
     Rescue,
 }
 

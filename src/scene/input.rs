@@ -33,7 +33,7 @@ pub struct InputOptions {
     pub cameras: Option<PathBuf>,
     /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
-    /// Where the times of views come from if the camera file does not state them.
+    /// Origin of the times of views if the camera file does not state them.
     pub times: Times,
     /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,

@@ -72,7 +72,7 @@ impl Joiner {
         + 6 * size_of::<u32>()
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
-    /// Takes note of the frame that `linker` has linked last; to be called after every frame.
+    /// Updates the pairs of tracks by the frame that `linker` has linked last; to be called after every frame.
     pub fn see(&mut self, linker: &Linker) {
         let tracks = linker.open_tracks();
         let born = self.0[0].predecessor.len();

@@ -151,8 +151,8 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Runs the whole program with `recipe` and measures quality and cost. (`value`, `step`): position of this setting
-    /// on its curve.
+    /// Runs the whole program with `recipe` and measures quality and cost. `value` is the value of the varied
+    /// parameter, `step` its step size h (errors grow with a power of h).
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
@@ -167,7 +167,7 @@ impl Bench<'_> {
     }
 
     /// Runs the whole program with `recipe` and compares the digest of the result with `expected`, the digest of the
-    /// first run, which is set if it is `None`. `value`: position of this setting on its curve.
+    /// first run, which is set if it is `None`. `value`: value of the varied parameter.
     fn compare_bytes(
         &self,
         recipe: &Recipe,
