@@ -78,7 +78,7 @@ pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
 }
 
 /// Runs [`render`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`crate::Error::ShardDone`].
+/// error [`Error::ShardDone`].
 fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
     let (kind, format) = match options.selection {

@@ -119,8 +119,9 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     Ok(Filmed { frames: views.len(), size, notes: scene.notes })
 }
 
-/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots (views of
-/// the scene) in `opened`, so that every camera can show every frame, and returns a copy of the shots with their times.
+/// Returns a copy of the shots (views of the scene) of `opened` with their times, and removes the times in `opened`, so
+/// that every camera can show every frame. Does nothing and returns `None` if there are no cameras or if the frames are
+/// the times of the cameras (`has_other_frames` is false).
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();

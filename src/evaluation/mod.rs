@@ -77,7 +77,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
 }
 
 /// Runs [`evaluate`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`crate::Error::ShardDone`].
+/// error [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;

@@ -89,7 +89,7 @@ pub struct PrecisionCurve {
     pub against: String,
     /// Measurements in the order in which they were made, mostly from coarse to fine.
     pub marks: Vec<PrecisionSetting>,
-    /// Observed orders of the errors in the step.
+    /// For each error, its observed order: the exponent with which it depends on the step size.
     pub orders: Vec<ObservedOrder>,
     /// Value of the parameter in the recipe; `None` if it was not measured.
     pub own: Option<f64>,
@@ -113,7 +113,7 @@ pub struct PrecisionSetting {
     pub psnr: Option<f64>,
 }
 
-/// Observed order: of convergence, or of growth for sums.
+/// Observed order of one error: the exponent with which the error depends on the step size, from measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObservedOrder {
     /// Name of the error.

@@ -102,7 +102,7 @@ pub struct PageCamera {
     eye: [f64; 3],
 }
 
-/// Returns the cameras of `rig`, one for each pair of view number and camera, at most [`CAMERAS`].
+/// Returns the cameras of `rig`, one for each pair of view number and camera, at most 400.
 pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();

@@ -90,7 +90,7 @@ pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
 }
 
 /// Runs [`report`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`crate::Error::ShardDone`].
+/// error [`Error::ShardDone`].
 ///
 /// # Errors
 /// Fails as [`report`] does.
