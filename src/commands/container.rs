@@ -43,9 +43,9 @@ const PACK_STAGE: &str = "pack";
 /// Precision with which `pack` stores values.
 #[derive(Debug, Clone)]
 pub enum Storing {
-    /// Every bit, with this compression.
+    /// All values exact to the bit, with the given compression.
     Exact(Compression),
-    /// Errors of the named attributes within bounds, others exact; compressed by zstd at this level.
+    /// Errors of the named attributes within bounds, others exact; compressed by zstd at the given level.
     Within(Vec<MaxError>, i32),
 }
 

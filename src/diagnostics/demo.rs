@@ -53,7 +53,7 @@ const FILM_GAP: u32 = 6;
 const FILM_FRAMES: usize = 24;
 /// Frames of the film per second.
 const FILM_RATE: u32 = 8;
-/// View of the film: a test view in the middle.
+/// Number of the view that the film shows: a test view in the middle of the cameras.
 const FILM_VIEW: u32 = 5;
 
 /// Options of the command `demo`.

@@ -1,4 +1,4 @@
-//! Groups of Gaussians that merging has joined, each with a leader: the Gaussian that took the others.
+//! Groups of Gaussians that merging has joined, each with a leader: the Gaussian into which the others are merged.
 
 /// Partition of the survivors (Gaussians left by pruning) into groups. A Gaussian is identified by its row in the table
 /// of survivors. Groups are ordered by the row of their leader. Memory: at most 12 bytes per row.

@@ -313,9 +313,9 @@ pub struct ColumnInfo {
     pub max_error: f64,
     /// Number of tiles (blocks of Gaussians × frames) of the column.
     pub tiles: usize,
-    /// Number of these tiles that store one frame, as their values are the same in all frames.
+    /// Number of tiles of the column that store one frame, as their values are the same in all frames.
     pub constant_tiles: usize,
-    /// Number of these tiles that are stored without compression.
+    /// Number of tiles of the column that are stored without compression.
     pub raw_tiles: usize,
     /// Bytes that the column takes in the file; bytes that several tiles share count once.
     pub stored_bytes: u64,

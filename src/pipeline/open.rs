@@ -244,7 +244,7 @@ struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Views of the frames so far, under the assumption that views have exactly the times of frames.
+    /// Views of the frames received so far, under the assumption that views have exactly the times of frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,

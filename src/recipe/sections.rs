@@ -296,9 +296,10 @@ impl LengthUnit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Trajectory {
-    /// Mean over the steps of the cosine of the angle between a and b, as in the paper.
+    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
     Cosine,
-    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps; σ is the parameter `motion_noise`.
+    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame; σ
+    /// is the parameter `motion_noise`.
     Alignment,
 }
 

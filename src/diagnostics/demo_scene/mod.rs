@@ -55,9 +55,9 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Usual number of Gaussians.
+    /// Default number of Gaussians of the generated scene.
     pub const COUNT: usize = 6000;
-    /// Usual number of frames.
+    /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
     /// Returns the scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.

@@ -87,9 +87,9 @@ pub struct Playground {
 }
 
 impl Playground {
-    /// Usual number of Gaussians.
+    /// Default number of Gaussians of the generated scene.
     pub const COUNT: usize = 20_000;
-    /// Usual number of frames.
+    /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
     /// Returns the scene as `count` Gaussians at `frames` times from 0 up to, but without, 1.
