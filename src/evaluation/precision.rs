@@ -109,7 +109,7 @@ pub struct PrecisionSetting {
     pub cost: Cost,
     /// Errors by name; [`meaning`] describes them.
     pub errors: BTreeMap<String, f64>,
-    /// Mean PSNR on the judged views, dB; `None` if the setting yields no model.
+    /// Mean PSNR on the views by which settings are judged, dB; `None` if the setting yields no model.
     pub psnr: Option<f64>,
 }
 
@@ -124,10 +124,10 @@ pub struct ObservedOrder {
     pub expected: Option<f64>,
 }
 
-/// Error name: root mean square error of the judged renders against renders of the whole model, colors in [0, 1].
+/// Error name: root mean square error of renders with a setting against renders of the whole model, colors in [0, 1].
 pub const PICTURES: &str = "pictures";
-/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting counts as
-/// the error of the compressed model itself (see [`added`]).
+/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting
+/// counts as the error of the compressed model itself (see [`added`]).
 pub const ADDED: &str = "added";
 /// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
 /// keeps.

@@ -298,8 +298,8 @@ impl LengthUnit {
 pub enum Trajectory {
     /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
     Cosine,
-    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame; σ
-    /// is the parameter `motion_noise`.
+    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame;
+    /// σ is the parameter `motion_noise`.
     Alignment,
 }
 
@@ -330,8 +330,8 @@ pub enum ProxyOpacity {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShHigh {
-    /// Weighted average of the coefficients of the cluster's members.
+    /// Weighted average of the SH coefficients of the cluster's members.
     Average,
-    /// Coefficients of the member with the largest weight.
+    /// SH coefficients of the cluster's member with the largest weight.
     Heaviest,
 }

@@ -69,7 +69,7 @@ enum PlaygroundObject {
     Figure,
 }
 
-/// The scene, z up, with its cameras on the side of −y.
+/// Generated scene of a playground, z up, with its cameras on the side of −y.
 ///
 /// With more Gaussians the surfaces consist of smaller ones; with more frames the same motion is sampled more finely.
 ///
