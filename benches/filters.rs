@@ -28,7 +28,7 @@ struct Filter {
     level: i32,
 }
 
-/// Returns every candidate.
+/// Returns every candidate filter.
 fn filters() -> impl Iterator<Item = Filter> {
     let with = |order| {
         [(false, 1), (false, 3), (true, 1), (true, 3)].map(|(shuffled, level)| Filter { order, shuffled, level })
@@ -107,7 +107,7 @@ fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u3
     (back(1), back(order.min(frame)))
 }
 
-/// Returns the bound of an attribute in the second table.
+/// Returns the error bound of an attribute in the table of encodings within a bound.
 fn bound(column: Attributes) -> f64 {
     match column {
         Attributes::POSITION => 1e-3,
@@ -144,7 +144,7 @@ fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool
 /// Bits of a tile, and the number of values in one frame.
 type TileBits = (Vec<u32>, usize);
 
-/// Returns the row of an attribute in the second table.
+/// Returns the row of the attribute `column` in the table of encodings within an error bound.
 fn within_bounds(name: &str, column: Attributes, tiles: &[TileBits]) -> String {
     let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
     let times =

@@ -37,7 +37,8 @@ use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
-/// Number of renders, and of renders with gradients, whose median times give the rates and the ratio.
+/// Number of renders, and of renders with gradients, over which the median times are taken that give the rates and the
+/// ratio.
 const PICTURES: usize = 21;
 
 /// Operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20 for the
@@ -168,7 +169,7 @@ fn fastest(amount: impl Fn() -> f64) -> f64 {
     (0..7).map(rate).fold(0.0, f64::max)
 }
 
-/// Returns the middle of an odd number of values.
+/// Returns the median of an odd number of values.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]

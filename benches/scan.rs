@@ -42,7 +42,7 @@ use splatsieve::statistics::pass::scan;
 
 const GAUSSIANS: usize = 16_384;
 const FRAMES: usize = 64;
-/// Bytes per second of the simulated slow disk.
+/// Speed of the simulated slow disk, bytes per second.
 const SLOW: f64 = 300e6;
 
 fn random(k: usize) -> f32 {

@@ -22,7 +22,7 @@ struct PathStatistics {
     visible_frames: u32,
     /// Length of the path of the center, scene units.
     path_length: f64,
-    /// Center at the frame before.
+    /// Center at the previous frame.
     last: Option<[f32; 3]>,
 }
 

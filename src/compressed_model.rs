@@ -176,10 +176,10 @@ pub struct CompressedModel {
     pub rule: MergeParams,
     /// Proxies, which replace the merged clusters.
     pub proxies: Proxies,
-    /// What refinement adds to the stored parameters, constant in time.
+    /// Parameter delta: values that refinement adds to the stored parameters, constant in time.
     pub change: ParamDelta,
-    /// What refinement adds beside `change`, varying in time. Used for formats with explicit frames, and only if there
-    /// are no proxies.
+    /// Trajectory delta: values, varying in time, that refinement adds beside the constant `change`. Used for formats
+    /// with explicit frames, and only if there are no proxies.
     pub course: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.
     pub field: Precision,

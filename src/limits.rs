@@ -7,8 +7,8 @@ use crate::error::{Error, Result};
 /// Maximum amounts that stages keep in memory at a time. They change memory and time of a run, never its result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Maximum number of frames that a reader of consecutive frames keeps, of the frames of one tile, which are decoded
-    /// together; at least 1.
+    /// Maximum number of decoded frames that a reader of consecutive frames keeps in memory, at least 1. A tile of a
+    /// container holds several frames, which are decoded together.
     pub frames_held: usize,
     /// Maximum number of frames of which the states of all Gaussians are in memory, ready to be rendered; at least 1.
     pub frames_together: usize,

@@ -1,4 +1,5 @@
-//! Memory of opening linked frames, counted in allocated bytes, against the estimate that `--memory` uses.
+//! Test that compares the memory of opening linked frames, counted in allocated bytes, with the estimate that
+//! `--memory` uses.
 
 #[path = "corpus/memory.rs"]
 mod memory;

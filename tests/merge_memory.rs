@@ -1,5 +1,5 @@
-//! Memory of measuring pairs of Gaussians, counted in allocated bytes: it is bounded by the number of pairs measured
-//! together, for any number of frames.
+//! Test of the memory of measuring pairs of Gaussians, counted in allocated bytes: it is bounded by the number of pairs
+//! measured together, for any number of frames.
 
 #[path = "corpus/memory.rs"]
 mod memory;

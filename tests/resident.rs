@@ -1,5 +1,5 @@
-//! Reading a memory-mapped container keeps no more of the file resident than readers may hold. This file has one test,
-//! because resident memory belongs to the whole process.
+//! Test that reading a memory-mapped container keeps no more of the file resident than readers may hold. This file has
+//! one test, because resident memory belongs to the whole process.
 #![cfg(target_os = "linux")]
 
 use std::collections::BTreeMap;

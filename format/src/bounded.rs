@@ -157,7 +157,7 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Removes all frames but the first.
+    /// Returns the multiples of the first frame only.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -436,7 +436,7 @@ mod tests {
         assert!(encode(&far, 64, 1e-3, 1).unwrap().is_none(), "no multiple is near");
     }
 
-    /// Forged bytes must be refused and must never cause a panic.
+    /// Checks that forged bytes are refused and never cause a panic.
     #[test]
     fn forged_bytes_are_refused() {
         let values: Vec<f32> = (0..8 * 64).map(|i| (i as f32 * 0.37).sin()).collect();

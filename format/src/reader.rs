@@ -19,8 +19,7 @@ mod tile_frames;
 
 pub use tile_frames::{TileFrames, TouchedPages};
 
-/// If the bytes of two tiles are at most this far apart in the file, their pages are prefetched or released in one
-/// call.
+/// Maximum distance, in bytes of the file, of two tiles whose pages are prefetched or released in one call.
 const MERGE_GAP_BYTES: u64 = 1 << 12;
 
 /// Open container, from which tiles are read.

@@ -1,4 +1,4 @@
-//! Damaged files cause an error that names a byte; they never cause a panic or wrong data.
+//! Tests that damaged files cause an error that names a byte, and never a panic or wrong data.
 
 mod scene;
 
@@ -9,7 +9,8 @@ use gseq::{Compression, Error, Reader, TileBuffer, TileFrames, TileId, TouchedPa
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Opens, verifies and reads everything. Checks that an error names a byte inside the file or its end.
+/// Opens the container at `path`, verifies it and reads all its tiles. Checks that an error names a byte inside the
+/// file or its end.
 fn check(scene: &Scene, path: &Path, len: u64) -> Result<(), Error> {
     let checked = Reader::open(path).and_then(|reader| {
         let verified = reader.verify();

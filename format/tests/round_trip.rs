@@ -1,4 +1,4 @@
-//! Values are read back bit for bit, for every shape and order of writing.
+//! Tests that values are read back bit for bit, for every shape and order of writing.
 
 mod scene;
 
@@ -38,7 +38,8 @@ proptest! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Values are within the bound, every method of reading returns the same, and the file declares the bounds.
+    /// Checks that values are within the error bound, that every method of reading returns the same values, and that
+    /// the file declares the bounds.
     #[test]
     fn bounded_columns_are_within_their_bound(
         gaussians in 1u64..90, frames in 1usize..12, gaussian_block in 1u32..70, frame_block in 1u32..6,
@@ -98,8 +99,8 @@ fn digest_ignores_write_order_but_bytes_do_not() {
     assert_ne!(other.write(&b, Compression::Zstd(1), |_| ()), first, "a changed bit must change the digest");
 }
 
-/// The hash was recorded when version 1 was made. The tiles are raw, so zstd does not affect it. If the hash changes,
-/// the format version must change too.
+/// Checks that the bytes of version 1 are unchanged, by a hash recorded when version 1 was made. The tiles are raw, so
+/// zstd does not affect the hash. If it changes, the format version must change too.
 #[test]
 fn bytes_of_version_1_are_unchanged() {
     let folder = scene::folder();

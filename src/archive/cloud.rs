@@ -1,8 +1,8 @@
 //! Encodes the canonical Gaussians, each attribute on its own quantization grid.
 //!
-//! In: Gaussians, and a quantization step for each attribute. Out: entropy-coded symbols, and the order in which the
-//! Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve from
-//! the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
+//! Input: Gaussians, and a quantization step for each attribute. Output: entropy-coded symbols, and the order in which
+//! the Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve
+//! from the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
 //! Gaussians.
 
 use std::collections::BTreeMap;
@@ -15,8 +15,8 @@ use super::residual::Residuals;
 use super::step::QuantizationGrid;
 use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// Attributes that each have their own quantization step, in the order of [`CloudSteps`]; SH coefficients are divided
-/// by degree.
+/// Names of the attributes that each have their own quantization step, in the order of [`CloudSteps`]; SH coefficients
+/// have one step per SH degree.
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
@@ -42,7 +42,8 @@ pub(super) struct PointCloudShape {
     pub(super) loose: u32,
     /// Mean of every plane (scalar component) after the three of the position, in quantization steps.
     pub(super) means: Vec<i64>,
-    /// Predictor weights of every plane (scalar component) after the three of the position.
+    /// Predictor weights (with which a value is predicted from known values) of every plane (scalar component) after
+    /// the three of the position.
     pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
@@ -57,7 +58,8 @@ fn planes(sh_degree: usize) -> Vec<(Attributes, usize, usize)> {
 }
 
 impl PointCloudShape {
-    /// Returns whether the numbers are consistent. Applies to shapes from untrusted files.
+    /// Returns whether the parameters, which may come from an untrusted file, are consistent: a valid SH degree, one
+    /// mean and one set of predictor weights per plane, and steps and counts in their allowed ranges.
     pub(super) fn is_sound(&self) -> bool {
         self.sh_degree <= MAX_SH_DEGREE
             && self.means.len() == planes(self.sh_degree).len()

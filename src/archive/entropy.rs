@@ -1,7 +1,7 @@
 //! Entropy coder for symbols from 0 to 15. Adaptive models predict the symbols, and an asymmetric numeral system (ANS)
 //! codes them. Plain bits are stored in a stream beside the symbols.
 //!
-//! In: symbols, each with the model that predicts it. Out: bytes. Encoder and decoder update the models alike, so
+//! Input: symbols, each with the model that predicts it. Output: bytes. Encoder and decoder update the models alike, so
 //! models are not stored. Memory: 4 bytes per symbol while encoding. Source: J. Duda, "Asymmetric numeral systems",
 //! 2013; models are updated by F. Giesen's mixing of distributions.
 
@@ -18,7 +18,8 @@ const MIN_STATE: u64 = 1 << 31;
 /// Initial learning rate: each symbol moves the probabilities by 1/2^rate of the way to those of a model that was
 /// certain of this symbol. The rate grows every 8 symbols, so the model changes more slowly.
 const FIRST_RATE: u32 = 3;
-/// Final learning rate, as in [`FIRST_RATE`].
+/// Final learning rate: each symbol then moves the probabilities by 1/2^7 of the way to those of a model that was
+/// certain of this symbol.
 const LAST_RATE: u32 = 7;
 
 /// For each symbol, the cumulative probabilities of a model that is certain of this symbol, in units of 1/2^15.
@@ -115,8 +116,8 @@ impl SymbolEncoder {
         }
     }
 
-    /// Writes a number below 2^63 of unknown magnitude: of the number plus one, first how many bits follow the highest
-    /// one bit, then these bits.
+    /// Writes a number below 2^63 of unknown magnitude: first the index of the highest set bit of `value + 1`, in 6
+    /// bits, then the bits of `value + 1` below it.
     pub(super) fn number(&mut self, value: u64) {
         let length = 64 - (value + 1).leading_zeros();
         self.bits(u64::from(length - 1), 6);
@@ -130,7 +131,7 @@ impl SymbolEncoder {
         self.bits(value >> 32, count - low);
     }
 
-    /// Returns the encoded bytes: the length of the words in bytes, the words of the symbols, and the plain bits.
+    /// Returns the encoded bytes: the length in bytes of the ANS coder's 32-bit words, these words, and the plain bits.
     pub(super) fn finish(mut self) -> Vec<u8> {
         if self.pending_bits > 0 {
             self.bits.push(self.pending as u8);

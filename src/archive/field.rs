@@ -1,8 +1,9 @@
 //! Encodes the tensors of a deformation field, each on its own quantization grid.
 //!
-//! In: a state dict (tensors by name), the role of each tensor, and the stored positions. Out: symbols and a table of
-//! tensors. Of a feature plane only the texels that some Gaussian reads at some time are stored; texels that are read
-//! more have finer steps. Of a weight matrix all values are stored. Tensors that nothing reads are restored as zeros.
+//! Input: a state dict (tensors by name), the role of each tensor, and the stored positions. Output: symbols and a
+//! table of tensors. Of a feature plane only the texels that some Gaussian reads at some time are stored; texels that
+//! are read more have finer steps. Of a weight matrix all values are stored. Tensors that nothing reads are restored as
+//! zeros.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +26,7 @@ const FINER_PER_OCTAVE: i32 = 4;
 /// an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
-/// How the deformation field uses a tensor, which decides how an archive stores the tensor.
+/// Way in which the deformation field uses a tensor. It decides how an archive stores the tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
@@ -56,7 +57,7 @@ pub(super) struct TensorEntry {
     pub(super) channels: Vec<i8>,
     /// Mean of the values, in quantization steps.
     pub(super) mean: i64,
-    /// Weights with which a value is predicted from its neighbors in the tensor.
+    /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
     pub(super) parts: PredictorWeights<NEIGHBORS>,
 }
 
@@ -140,7 +141,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the quantization grid for values of `class` in `channel`.
+    /// Returns the quantization grid for the values of channel `channel` in the class `class`: of a weight, the sum of
+    /// its row and column offsets; of a texel, the octave of its summed squared read weights.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             Role::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -284,8 +286,8 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns a tensor rounded with `steps`, as an archive would restore it. One difference remains: rows of a plane over
-/// time that no time reads keep their own values here.
+/// Returns a tensor rounded with `steps`, as an archive would restore it. The only difference: rows of a plane over
+/// time that are read at no time keep their values.
 pub fn rounded(
     tensor: &Tensor,
     role: Role,

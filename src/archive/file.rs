@@ -1,6 +1,6 @@
 //! File layout of an archive: a header with lengths and checksums, and four sections.
 //!
-//! In: the contents of the sections. Out: the bytes of the file, and back. Everything read from a file is checked
+//! Input: the contents of the sections. Output: the bytes of the file, and back. Everything read from a file is checked
 //! before it is used: lengths against the length of the file, checksums against the bytes, and sizes to allocate
 //! against both the length of the file and the memory limit.
 
@@ -216,8 +216,8 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. `None` stands for a number that
-/// overflowed and is refused.
+/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. Fails if they are too many, or if
+/// `bytes` is `None`, which stands for a number that overflowed.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

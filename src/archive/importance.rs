@@ -1,11 +1,11 @@
 //! Estimates how strongly quantization errors in each channel, row and column of a tensor change the output of the
 //! deformation field.
 //!
-//! In: a state dict (tensors by name), positions and times. Out: for every tensor the offsets added to its quantization
-//! step, one per channel of a plane, or one per row and column of a matrix. The estimate is of first order and assumes
-//! that the errors of different values are independent. An error of a plane is multiplied by the product of the five
-//! other planes, an error of a weight by the input of that weight, and both by the weights of all later layers. Only
-//! the writer of an archive uses these numbers, so rounding differences between machines are harmless.
+//! Input: a state dict (tensors by name), positions and times. Output: for every tensor the offsets added to its
+//! quantization step, one per channel of a plane, or one per row and column of a matrix. The estimate is of first order
+//! and assumes that the errors of different values are independent. An error of a plane is multiplied by the product of
+//! the five other planes, an error of a weight by the input of that weight, and both by the weights of all later
+//! layers. Only the writer of an archive uses these numbers, so rounding differences between machines are harmless.
 
 use std::collections::BTreeMap;
 

@@ -1,10 +1,10 @@
 //! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
 //! that keep the renders good, and entropy coded.
 //!
-//! In: [`Content`] and [`Steps`]. Out: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the content.
-//! Every quantized value is restored with an error of at most half a quantization step, every other byte exactly.
-//! Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors; tensors
-//! that nothing reads are restored as zeros.
+//! Input: [`Content`] and [`Steps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the
+//! content. Every quantized value is restored with an error of at most half a quantization step, every other byte
+//! exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors;
+//! tensors that nothing reads are restored as zeros.
 
 mod cloud;
 mod entropy;
@@ -45,7 +45,7 @@ pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 pub struct Content {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
-    /// How the deformation field uses each of its tensors, by name; empty if there is no field.
+    /// Use of each tensor by the deformation field, by name; empty if there is no field.
     pub field: BTreeMap<String, Role>,
     /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
@@ -182,7 +182,7 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-/// Decodes the sections of an archive whose table of contents has been checked.
+/// Decodes the sections of an archive, whose table of contents has been checked, into its content.
 fn decoded(
     sections: Sections,
     table: Table,

@@ -1,7 +1,8 @@
 //! Codes a tensor as channels of rows of values; each value is predicted from its neighbors to the left and above.
 //!
-//! In: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the quantization
-//! step of the place or marks it as never read. Out: symbols, and the restored values. Memory: three rows.
+//! Input: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the
+//! quantization step of the place or marks it as never read. Output: symbols, and the restored values. Memory: three
+//! rows.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
@@ -25,7 +26,7 @@ pub(super) struct QuantizedTensor<'a> {
     /// Class of every place of a channel, `[rows, columns]`, or of one row that holds for all rows, `[columns]`. The
     /// class selects the quantization grid.
     pub(super) classes: &'a [u8],
-    /// Returns the quantization grid for a channel and a class.
+    /// Function that returns the quantization grid of the values of a channel whose places have the given class.
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
     /// Number of classes that select a quantization grid.
     pub(super) class_count: usize,
@@ -42,7 +43,7 @@ struct Context {
 }
 
 impl QuantizedTensor<'_> {
-    /// Returns the mean of the values `data` at places that are read.
+    /// Returns the mean of the values `data` at the places that the deformation field reads.
     pub(super) fn mean(&self, data: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0usize);
         for plane in data.chunks_exact((self.rows * self.columns).max(1)) {

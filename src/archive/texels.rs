@@ -1,8 +1,8 @@
 //! Determines which texels of a feature plane are read by some Gaussian, and with what total weight.
 //!
-//! In: canonical positions as they are stored, the box of space that the plane covers, its axes and its size. Out: a
-//! class for each texel. Writer and reader of an archive both compute the classes, so they are not stored. Sums and
-//! products of f32 in a fixed order give the same classes on every machine.
+//! Input: canonical positions as they are stored, the box of space that the plane covers, its axes and its size.
+//! Output: a class for each texel. Writer and reader of an archive both compute the classes, so they are not stored.
+//! Sums and products of f32 in a fixed order give the same classes on every machine.
 
 use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};
@@ -20,8 +20,8 @@ pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
 
-/// Returns the class of a texel. `squared_weight` is the sum, over the Gaussians that read the texel, of the squared
-/// interpolation weight.
+/// Returns the class of a texel, which selects its quantization grid. `squared_weight` is the sum, over the Gaussians
+/// that read the texel, of the squared interpolation weight.
 fn class(squared_weight: f32) -> u8 {
     if squared_weight <= 0.0 {
         return UNREAD;
@@ -30,7 +30,8 @@ fn class(squared_weight: f32) -> u8 {
     (exponent - MIN_EXPONENT).clamp(0, CLASSES as i32 - 1) as u8
 }
 
-/// Returns the class of each texel, `[size_b, size_a]`, of a feature plane over two spatial axes (a, b).
+/// Returns the class (which selects the quantization grid) of each texel, `[size_b, size_a]`, of a feature plane over
+/// two spatial axes (a, b).
 pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
@@ -46,7 +47,8 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the class of each column, `[size]`, of a feature plane over one spatial axis and time.
+/// Returns the class (which selects the quantization grid) of each column, `[size]`, of a feature plane over one
+/// spatial axis and time.
 pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {

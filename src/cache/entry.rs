@@ -94,7 +94,7 @@ pub(super) struct EntryWriter {
     text: u32,
     length: u64,
     hash: Box<Xxh3>,
-    /// Last error of a write. The serializer does not return it, so it is kept here.
+    /// Error of the last failed write. The serializer does not return it, so the writer stores it here.
     pub(super) failed: Option<io::Error>,
 }
 

@@ -237,9 +237,9 @@ impl Cache {
         }
     }
 
-    /// Returns the number of shards from which `stage` is to be joined, if its full result is not stored. With 1, the
-    /// full result has to be computed; otherwise the shards that are not stored have to be computed. A run that
-    /// computes only one shard computes it here and ends with [`Error::ShardDone`].
+    /// Determines how to obtain the full result of `stage`, which is not stored. Returns the number of shards to join:
+    /// those that are not stored still have to be computed; 1 means that the whole stage has to be computed. A run that
+    /// computes only one shard computes and stores it here and ends with [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,

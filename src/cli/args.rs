@@ -513,10 +513,10 @@ pub(super) struct Demo {
     /// Folder to write the scene, its compressed models, the pages and the film into
     #[arg(short, long, value_name = "FOLDER", default_value = "splatsieve-demo")]
     pub(super) output: PathBuf,
-    /// Gaussians of the scene
+    /// Number of Gaussians of the generated scene
     #[arg(long, value_name = "N", default_value_t = Playground::COUNT as u32, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
     pub(super) gaussians: u32,
-    /// Frames of the scene
+    /// Number of frames of the generated scene
     #[arg(long, value_name = "T", default_value_t = Playground::FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
     pub(super) frames: u32,
     /// Optimization steps of each refinement [default: enough for the usual scene]
@@ -528,7 +528,7 @@ pub(super) struct Demo {
     pub(super) earlier: Earlier,
 }
 
-/// `test-scene`
+/// Arguments of `test-scene`.
 #[derive(Debug, Args)]
 pub(super) struct TestScene {
     /// Keep the scene and the result in this folder [default: a temporary one]

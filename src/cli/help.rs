@@ -12,10 +12,10 @@ use splatsieve::files::atomic::{Kind, Replace, StagedFile, StagedFolder, check_t
 /// Start of the title line in the source of every manual page; identifies pages that this program wrote.
 const PAGE_TITLE: &str = ".TH splatsieve";
 
-/// Order of the help of a command: description, examples, usage, options.
+/// Template of the help of a command: description, examples, usage, options.
 const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
 
-/// Order of the help of the program: description, examples, usage, groups of commands, options.
+/// Template of the help of the program: description, examples, usage, groups of commands, options.
 const TOP_TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{after-help}\n{options}";
 
 /// Examples in the help of the program.
@@ -133,7 +133,7 @@ const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
     ("man", &["splatsieve man share/man/man1                       man splatsieve-compress"]),
 ];
 
-/// Returns the command line with examples and groups of commands.
+/// Returns the definition of the command line, with examples and groups of commands in its help.
 pub(super) fn command() -> Command {
     let command = Cli::command().before_help(EXAMPLES);
     let command = COMMAND_EXAMPLES.iter().fold(command, |command, (name, examples)| {

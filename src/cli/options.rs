@@ -34,8 +34,8 @@ use splatsieve::progress::Events;
 use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
-/// Returns the request of `compress`. Options that the command line leaves open are taken from the run that the recipe
-/// file was written beside.
+/// Returns the request of `compress`. For options that the command line does not give, the values are taken that the
+/// recipe file records of an earlier run.
 ///
 /// # Errors
 /// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal

@@ -147,10 +147,10 @@ impl Drop for Bar {
     }
 }
 
-/// Position in a run.
+/// Position in a run: the stage that is running, and the time since it began.
 #[derive(Debug)]
 struct RunPosition {
-    /// Names of the stages and their expected seconds.
+    /// Name and expected duration, in seconds, of each stage.
     stages: Vec<(&'static str, f64)>,
     start: Instant,
     /// Index of the running stage and its start; `None` before the first stage.
@@ -184,7 +184,7 @@ impl RunPosition {
     }
 }
 
-/// Contents of a bar.
+/// Data that a progress bar shows.
 struct BarSnapshot<'a> {
     name: &'a str,
     unit: &'a str,
@@ -253,7 +253,7 @@ fn whole_seconds(seconds: f64) -> String {
     if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { duration(seconds.floor()) }
 }
 
-/// Task in a log.
+/// Task whose progress is shown as lines in a log.
 #[derive(Debug)]
 struct Log {
     name: String,
@@ -261,7 +261,7 @@ struct Log {
     total: Option<u64>,
     start: Instant,
     done: AtomicU64,
-    /// Seconds from the start to the next line.
+    /// Seconds from the start of the task to the next log line.
     next: AtomicU64,
     /// Whether another task was running when this one began.
     is_nested: bool,
@@ -285,7 +285,8 @@ impl Log {
         }
     }
 
-    /// Returns the line at `elapsed` after the start: count, rate, and the time left, or the elapsed time if `ended`.
+    /// Returns the log line at `elapsed` after the start of the task: count, rate, and the time left, or the elapsed
+    /// time if `ended`.
     fn line(&self, elapsed: Duration, ended: bool) -> String {
         let done = self.done.load(Ordering::Relaxed);
         let per_second = done as f64 / elapsed.as_secs_f64().max(1e-9);

@@ -10,7 +10,7 @@ use splatsieve::files::text::read_text;
 use splatsieve::pipeline::RecipeRecord;
 use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
-/// Heading of these options in the help.
+/// Heading of the recipe options in the help.
 const HEADING: &str = "Recipe";
 
 /// Maximum size of a recipe file, bytes. A recipe that splatsieve writes has about 4,000.
@@ -39,7 +39,8 @@ pub(super) struct RecipeFlags {
 }
 
 impl RecipeFlags {
-    /// Returns the record of the run that the recipe file was written beside; empty without a file.
+    /// Returns what the recipe file records of the run that wrote it: program, input and options; empty if no recipe
+    /// file is given.
     ///
     /// # Errors
     /// Fails if the file cannot be read or its record is invalid.

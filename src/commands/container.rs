@@ -43,14 +43,15 @@ const PACK_STAGE: &str = "pack";
 /// Precision with which `pack` stores values.
 #[derive(Debug, Clone)]
 pub enum Storing {
-    /// Every bit, with this compression.
+    /// All values exact to the bit, with the given compression.
     Exact(Compression),
-    /// Errors of the named attributes within bounds, others exact; compressed by zstd at this level.
+    /// Errors of the named attributes within bounds, others exact; compressed by zstd at the given level.
     Within(Vec<MaxError>, i32),
 }
 
 impl Storing {
-    /// Returns the packing of a scene. Calls `extent` only if a bound is relative to the extent of the scene.
+    /// Returns how the values of a scene are stored in a container. Calls `extent` (length of the scene, scene units)
+    /// only if an error bound is relative to it.
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
             Storing::Exact(compression) => Ok((*compression).into()),
@@ -74,7 +75,8 @@ pub fn pack(
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
-/// Runs [`pack`]; the end of a shard is an error value.
+/// Runs [`pack`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
+/// error [`Error::ShardDone`].
 fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Converted> {
     check_container_name(output, "convert")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
@@ -285,7 +287,7 @@ fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
 }
 
 impl InputInfo {
-    /// Returns a text for the terminal.
+    /// Returns this description of an input as text for the terminal.
     pub fn text(&self) -> String {
         let input = &self.input;
         let mut out = format!(

@@ -23,7 +23,7 @@ use crate::scene::pictures::{self, ViewSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 
-/// Name of the stage, for progress and cache entries.
+/// Name of the rendering stage, for progress and cache entries.
 const NAME: &str = "render";
 
 /// Views to render.
@@ -33,7 +33,7 @@ pub enum RenderSelection {
     One {
         /// Frame of the sequence.
         frame: usize,
-        /// View number.
+        /// Number of the view (of the camera that shows it).
         view: u32,
     },
     /// Every view of the set, to a folder, as files named `tNNN_vNN` (frame, view).
@@ -43,11 +43,11 @@ pub enum RenderSelection {
 /// Options of `render`.
 #[derive(Debug, Clone)]
 pub struct RenderOptions {
-    /// Input and cameras. Its split is ignored.
+    /// Input and cameras. The split that its options request is ignored; see `views`.
     pub input: InputOptions,
     /// Views to render.
     pub selection: RenderSelection,
-    /// Set of views from which they are selected.
+    /// Set of views from which `selection` selects.
     pub views: ViewSet,
     /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
     pub background: Option<[f32; 3]>,
@@ -77,7 +77,8 @@ pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
     Completion::from_result(render_whole(options))
 }
 
-/// Runs [`render`]; the end of a shard is an error value.
+/// Runs [`render`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
+/// error [`Error::ShardDone`].
 fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
     let (kind, format) = match options.selection {

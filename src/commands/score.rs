@@ -58,7 +58,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
 /// Result of `score`.
 #[derive(Debug)]
 pub struct ScoreReport {
-    /// Path of the file.
+    /// Path of the written file.
     pub output: PathBuf,
     /// Number of rows, one per Gaussian.
     pub gaussians: usize,

@@ -21,9 +21,9 @@ use crate::scene::path::along;
 use crate::scene::pictures::{self, ViewSet, background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
-/// Name of the stage, for progress.
+/// Name of the rendering stage, for progress.
 const NAME: &str = "render";
-/// Number of video frames between two cameras of a path through a still.
+/// Number of video frames between two cameras of a path through a still (a model without motion).
 const VIEWS_BETWEEN_STOPS: usize = 24;
 
 /// Camera of a video.
@@ -38,13 +38,14 @@ pub enum FilmPath {
 /// Options of a video.
 #[derive(Debug, Clone)]
 pub struct VideoOptions {
-    /// Input and cameras. Its split is ignored. Its frames can differ from the times of the cameras.
+    /// Input and cameras. The split that its options request is ignored; see `views`. The frames can differ from the
+    /// times of the cameras.
     pub input: InputOptions,
     /// Other model with the same frames, shown to the right.
     pub beside: Option<PathBuf>,
     /// Camera of the video.
     pub path: FilmPath,
-    /// Set of views that `path` selects from.
+    /// Set of views from which `path` selects.
     pub views: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
@@ -67,7 +68,8 @@ pub struct Filmed {
     pub notes: Vec<String>,
 }
 
-/// Renders a video of an input, one image per frame in order. Along a path through a still, the camera moves instead.
+/// Renders a video of an input, one image per frame in order. Along a path through a still (a model without motion),
+/// the camera moves from image to image.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
@@ -117,8 +119,9 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     Ok(Filmed { frames: views.len(), size, notes: scene.notes })
 }
 
-/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots in `opened`,
-/// so that every camera can show every frame, and returns the shots with their times.
+/// Returns a copy of the shots (views of the scene) of `opened` with their times, and removes the times in `opened`, so
+/// that every camera can show every frame. Does nothing and returns `None` if there are no cameras or if the frames are
+/// the times of the cameras (`has_other_frames` is false).
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -126,7 +129,8 @@ fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<
     Some(own)
 }
 
-/// Returns the shots of the set `views`, sorted by view, then time; shots without a time come first.
+/// Returns the shots (views of the scene) in the set `views`, sorted by view number, then time; shots without a time
+/// come first.
 fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     let split = views.split(rig);
     let mut found: Vec<Shot> =
@@ -176,7 +180,8 @@ fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Resu
     }
 }
 
-/// Returns the shots of view `view`. `flag` names the option in the error if there are none.
+/// Returns the shots (views of the scene) with view number `view`. `flag` names the option in the error if there are
+/// none.
 fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
     views.find(|shots| shots[0].view == view).ok_or_else(|| {

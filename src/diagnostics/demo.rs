@@ -28,21 +28,21 @@ use crate::report::{self, ReportOptions};
 use crate::scene::pictures::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
-/// The generated scene.
+/// File name of the generated scene.
 pub const SCENE: &str = "scene.gseq";
-/// Its cameras.
+/// File name of the cameras of the generated scene.
 pub const CAMERAS: &str = "cameras.json";
-/// A tenth of the Gaussians, refined.
+/// File name of the scene compressed to a tenth of its Gaussians and refined.
 pub const TENTH: &str = "compressed_10x.gseq";
-/// A twentieth of the Gaussians, refined.
+/// File name of the scene compressed to a twentieth of its Gaussians and refined.
 pub const TWENTIETH: &str = "compressed_20x.gseq";
-/// A tenth of the Gaussians, without refinement.
+/// File name of the scene compressed to a tenth of its Gaussians without refinement.
 pub const PRUNED: &str = "pruned_10x.gseq";
-/// The page that plays the scene beside [`TENTH`].
+/// File name of the page that plays the scene beside [`TENTH`].
 pub const PLAYER: &str = "player.html";
-/// Folder of the report.
+/// Name of the folder with the report.
 pub const REPORT: &str = "report";
-/// The film: the scene, [`PRUNED`] and [`TENTH`] side by side.
+/// File name of the film: the scene, [`PRUNED`] and [`TENTH`] side by side.
 pub const FILM: &str = "comparison.gif";
 
 /// Size of one render in the film, pixels: three of them, side by side, fit a page of text.
@@ -53,10 +53,10 @@ const FILM_GAP: u32 = 6;
 const FILM_FRAMES: usize = 24;
 /// Frames of the film per second.
 const FILM_RATE: u32 = 8;
-/// View of the film: a test view in the middle.
+/// Number of the view that the film shows: a test view in the middle of the cameras.
 const FILM_VIEW: u32 = 5;
 
-/// Options of [`run`].
+/// Options of the command `demo`.
 #[derive(Debug)]
 pub struct DemoOptions {
     /// Number of Gaussians of the scene.
@@ -78,19 +78,19 @@ pub struct DemoOptions {
 /// One model of the demo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DemoModel {
-    /// Name of its file.
+    /// File name of the model.
     pub name: &'static str,
-    /// Number of its Gaussians.
+    /// Number of Gaussians of the model.
     pub gaussians: usize,
-    /// Bytes of its file.
+    /// Size of the model's file in bytes.
     pub bytes: u64,
     /// Mean PSNR against the scene over the test views, dB; `None` for the scene itself.
     pub psnr: Option<f64>,
-    /// Mean SSIM over the same views.
+    /// Mean SSIM against the scene over the test views; `None` for the scene itself.
     pub ssim: Option<f64>,
 }
 
-/// Result of [`run`].
+/// Result of the command `demo`.
 #[derive(Debug)]
 pub struct DemoReport {
     /// The scene, then its compressed models.
@@ -104,7 +104,7 @@ pub struct DemoReport {
 /// Generates the scene, compresses it and writes everything into one folder.
 ///
 /// # Errors
-/// An output that may not be written; errors of the compression; a failed write.
+/// Fails if the output exists and may not be replaced, if the compression fails, or if a file cannot be written.
 pub fn run(options: &DemoOptions) -> Result<DemoReport> {
     let output = &options.output;
     check_folder_name(output, "demo")?;
@@ -173,7 +173,8 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     Ok(DemoReport::new(&found))
 }
 
-/// Compresses the scene in `folder` into the file `name` there. Returns the limits by which the memory limit holds.
+/// Compresses the scene in `folder` into the file `name` there. Returns the limits (such as the block sizes) with which
+/// the run fits into the memory limit.
 fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options: &DemoOptions) -> Result<Limits> {
     let input = Box::new(Container::open(&folder.join(SCENE))?);
     let rig = Playground::new(options.gaussians, options.frames).rig();
@@ -186,7 +187,7 @@ fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options:
     Ok(scene.limits)
 }
 
-/// Returns the cameras of `rig`, each at every frame, with their splits.
+/// Returns a JSON text with the cameras of `rig`, each at every frame, and the split of each view.
 fn cameras_json(rig: &Rig) -> String {
     let frame = |shot: &crate::model::Shot| {
         let camera = &rig.cameras[shot.camera as usize];
@@ -213,7 +214,7 @@ fn cameras_json(rig: &Rig) -> String {
     format!("{:#}\n", serde_json::json!({ "background": rig.background, "frames": frames }))
 }
 
-/// Writes the film: the scene, pruned, and refined, side by side.
+/// Writes the film, an animated image: the scene, the pruned and the refined model side by side.
 fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()> {
     let models = [SCENE, PRUNED, TENTH].map(|name| Container::open(&folder.join(name)));
     let [scene, pruned, refined] = models;
@@ -242,7 +243,7 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     film.finish()
 }
 
-/// Returns `camera` with renders of [`FILM_RENDER`].
+/// Returns `camera` scaled to renders of the size [`FILM_RENDER`].
 fn smaller(camera: &Camera) -> Camera {
     let (width, height) = FILM_RENDER;
     let scale = f64::from(width) / f64::from(camera.width);

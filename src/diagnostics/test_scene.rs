@@ -22,14 +22,14 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
-/// Options of [`run`].
+/// Options of the command `test-scene`.
 #[derive(Debug)]
 pub struct TestSceneOptions {
     /// Number of Gaussians of the scene.
     pub gaussians: usize,
     /// Number of frames of the scene.
     pub frames: usize,
-    /// Number of Gaussians that stay.
+    /// Number or fraction of the Gaussians that remain after the compression.
     pub kept: Target,
     /// Recipe of the compression.
     pub recipe: Recipe,
@@ -43,19 +43,20 @@ pub struct TestSceneOptions {
     pub events: Events,
 }
 
-/// Result of [`run`].
+/// Result of the command `test-scene`.
 #[derive(Debug)]
 pub struct TestSceneReport {
     /// Summary of the compression.
     pub summary: Summary,
-    /// Gaussians of every body: all, kept as they were or as leaders, merged away.
+    /// For every body (object of the test scene): its number of Gaussians, of those that remain (unmerged or as leaders
+    /// of a merged cluster), and of those that were merged into others.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
 /// Generates the scene, packs it and compresses it.
 ///
 /// # Errors
-/// A number of survivors that is impossible; errors of the compression; a failed write.
+/// Fails if the requested number of Gaussians is impossible, if the compression fails, or if a file cannot be written.
 pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     options.kept.count(options.gaussians)?;
     let Some(output) = &options.output else {

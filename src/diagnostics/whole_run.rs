@@ -24,7 +24,7 @@ pub(crate) struct WholeRun<'a> {
     pub(crate) scratch: &'a Path,
     /// File name of the result, which determines the kind of output.
     pub(crate) name: &'a str,
-    /// How often each run is repeated to measure its time.
+    /// Limits on the repetition of each run for measuring its time.
     pub(crate) repeats: Repeats,
     /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,

@@ -18,11 +18,11 @@ use crate::scene::{InputOptions, open_scene};
 /// Property by which a baseline ranks Gaussians, largest first; ties are ordered by hashed id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
-    /// Opacity.
+    /// By opacity, largest first.
     Opacity,
-    /// Largest of the three scales.
+    /// By the largest of the three scales, in descending order.
     Scale,
-    /// Hashed id only.
+    /// In random order: by a hash of the id of the Gaussian.
     Random,
 }
 

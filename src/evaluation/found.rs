@@ -115,20 +115,20 @@ pub struct TruthComparison {
     /// Scores of the compressed model.
     #[serde(flatten)]
     pub compressed: Comparison,
-    /// Scores of the original, as the reference for the loss.
+    /// Scores of the original model against the photographs, as the reference for the loss.
     pub original: Comparison,
 }
 
 /// Result of an evaluation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Paths of the models, as given.
     pub path: Both<String>,
     /// Numbers of Gaussians.
     pub count: Both<usize>,
-    /// Bytes of all files that a renderer opens.
+    /// Bytes of each model, divided by purpose ([`Size`]).
     pub bytes: Both<u64>,
     /// Bytes of the models by part.
     pub size: Both<Size>,

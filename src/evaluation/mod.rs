@@ -45,7 +45,7 @@ const NAME: &str = "evaluate";
 /// Options of an evaluation.
 #[derive(Debug, Clone)]
 pub struct EvaluateOptions {
-    /// Original model and its cameras. Its split is ignored.
+    /// Original model and its cameras. The split that these options request is ignored; see `views`.
     pub original: InputOptions,
     /// Path of the compressed model, in any format.
     pub compressed: PathBuf,
@@ -76,7 +76,8 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
 
-/// Runs [`evaluate`]; the end of a shard is an error value.
+/// Runs [`evaluate`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
+/// error [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;

@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 use crate::evaluation::cost::{Cost, Spread};
 use crate::files::csv::{known, table};
 
-/// Result of `precision`: all knobs and their common conditions.
+/// Result of `precision`: measurements of all varied settings, and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Path of the input, as given.
     pub path: String,
@@ -23,7 +23,7 @@ pub struct PrecisionDiagram {
     pub frames: usize,
     /// Maximum number of frames for scoring and ranking, spread evenly from first to last.
     pub frames_looked_at: usize,
-    /// Number of views of these frames.
+    /// Number of views of the frames that are used for scoring and ranking.
     pub pictures: usize,
     /// Number of views on which rankings are judged: test views if there are any.
     pub judged: usize,
@@ -38,7 +38,7 @@ pub struct PrecisionDiagram {
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
     pub enough: f64,
-    /// Knobs that were varied.
+    /// Knobs (settings, or groups of settings) that were varied.
     pub knobs: Vec<PrecisionKnob>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -85,15 +85,16 @@ pub struct PrecisionKnob {
 pub struct PrecisionCurve {
     /// Name of the parameter; the name in the recipe if it is a recipe parameter.
     pub name: String,
-    /// Reference of the errors.
+    /// Description of the reference values from which the errors are measured.
     pub against: String,
     /// Measurements in the order in which they were made, mostly from coarse to fine.
     pub marks: Vec<PrecisionSetting>,
-    /// Observed orders of the errors in the step.
+    /// For each error, its observed order: the exponent with which it depends on the step size.
     pub orders: Vec<ObservedOrder>,
-    /// Value in the recipe; `None` if it was not measured.
+    /// Value of the parameter in the recipe; `None` if it was not measured.
     pub own: Option<f64>,
-    /// Coarsest value from which on the error added to renders stays below a tenth of the model's own error.
+    /// Coarsest value of the parameter such that, at this and all finer values, the error added to renders stays below
+    /// a tenth of the model's own error; `None` if there is none.
     pub enough: Option<f64>,
 }
 
@@ -108,11 +109,11 @@ pub struct PrecisionSetting {
     pub cost: Cost,
     /// Errors by name; [`meaning`] describes them.
     pub errors: BTreeMap<String, f64>,
-    /// Mean PSNR on the judged views, dB; `None` if the setting yields no model.
+    /// Mean PSNR on the views by which settings are judged, dB; `None` if the setting yields no model.
     pub psnr: Option<f64>,
 }
 
-/// Observed order: of convergence, or of growth for sums.
+/// Observed order of one error: the exponent with which the error depends on the step size, from measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObservedOrder {
     /// Name of the error.
@@ -123,21 +124,22 @@ pub struct ObservedOrder {
     pub expected: Option<f64>,
 }
 
-/// Error name: root mean square error of the judged renders against renders of the whole model, colors in [0, 1].
+/// Error name: root mean square error of renders with a setting against renders of the whole model, colors in [0, 1].
 pub const PICTURES: &str = "pictures";
-/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting counts as
-/// the error of the compressed model itself (see [`added`]).
+/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting
+/// counts as the error of the compressed model itself (see [`added`]).
 pub const ADDED: &str = "added";
-/// Error name: difference of the kept sets.
+/// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
+/// keeps.
 pub const KEPT: &str = "kept";
-/// Error name: relative error of the number of survivors.
+/// Error name: relative error of the number of Gaussians that a setting keeps.
 pub const STAYING: &str = "staying";
 /// Error name: largest relative error of the percentiles P1 and P99.
 pub const PERCENTILES: &str = "percentiles";
-/// Error name: results whose bytes differ.
+/// Error name: 1 if the bytes of the result differ from those of the first run, else 0.
 pub const BYTES: &str = "bytes";
 
-/// Maximum of [`ADDED`] from [`PrecisionCurve::enough`] on.
+/// Maximum of the error [`ADDED`] at the value [`PrecisionCurve::enough`] and all finer values.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of the error called `error`.

@@ -10,7 +10,7 @@ use crate::files::csv::{known, table};
 /// Result of a sweep: all points and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOff {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Path of the input, as given.
     pub path: String,
@@ -64,7 +64,7 @@ pub struct TradeOffPoint {
 pub struct EffortCurve {
     /// Name of the parameter in the recipe.
     pub parameter: String,
-    /// Measurements by increasing value.
+    /// Measurements, one for each value of the parameter, by increasing value.
     pub settings: Vec<Setting>,
 }
 

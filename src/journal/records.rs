@@ -58,9 +58,9 @@ pub enum Saved {
         /// Maximum amount read, in full reads (every frame of the input once).
         reads: f64,
     },
-    /// Statistics that had not changed and were therefore not read again.
+    /// Values of attributes that are the same in every frame and were therefore not read again.
     Values {
-        /// Number of bytes of these statistics.
+        /// Number of bytes that were not read.
         bytes: u64,
     },
 }

@@ -23,13 +23,13 @@ pub enum Verbosity {
     Plan,
 }
 
-/// Memory that a run may take, and what it tells about memory and time before it starts.
+/// Memory that a run may take, and how much the run reports about memory and time before it starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Budget {
     /// Number of bytes that the run may take; `None`: a quarter of the memory available to this process, see
     /// [`memory_limit`].
     pub bytes: Option<u64>,
-    /// What the run tells before any work.
+    /// Information that the run reports before any work.
     pub tell: Verbosity,
 }
 

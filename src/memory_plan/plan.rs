@@ -31,7 +31,7 @@ const HALVINGS: [fn(&Limits) -> Limits; 5] = [
 pub struct Plan {
     work: Workload,
     budget: u64,
-    /// How much stages keep in memory at a time.
+    /// Maximum amounts (frames, views, Gaussians) that stages keep in memory at a time.
     pub limits: Limits,
     estimates: Vec<ResourceEstimate>,
 }
@@ -42,7 +42,7 @@ impl Plan {
     /// fit.
     ///
     /// # Errors
-    /// If no limits make the stages fit; the error states the smallest sufficient budget.
+    /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
     pub fn fit(
         work: Workload,
         budget: Budget,

@@ -298,8 +298,9 @@ pub struct RenderCost {
     pace: fn(&Throughput) -> f64,
 }
 
-/// Time for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. This and the next two are
-/// fitted to runs on three trained models; `scripts/estimate.py` compares estimated with measured times.
+/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. [`LOOK`],
+/// [`REMOVE`] and [`RENDER`] are fitted to runs on three trained models; `scripts/estimate.py` compares estimated with
+/// measured times.
 pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
 /// Time for finding the removal error of every Gaussian in a view: the squared error that removing it alone would
 /// cause.

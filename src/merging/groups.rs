@@ -1,4 +1,4 @@
-//! Groups of Gaussians that merging has joined, each with a leader: the Gaussian that took the others.
+//! Groups of Gaussians that merging has joined, each with a leader: the Gaussian into which the others are merged.
 
 /// Partition of the survivors (Gaussians left by pruning) into groups. A Gaussian is identified by its row in the table
 /// of survivors. Groups are ordered by the row of their leader. Memory: at most 12 bytes per row.
@@ -15,8 +15,8 @@ impl MergeGroups {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
-    /// Returns the groups after group g has joined group `leader_of[g]`. A group with `leader_of[g]` = g stays as it is
-    /// or is joined by others. The joined group keeps its own leader.
+    /// Returns the groups after group g has joined group `leader_of[g]`, for every g. A group with `leader_of[g]` = g
+    /// joins no other, but others may join it. The combined group has the leader of the group that was joined.
     pub fn joined(&self, leader_of: &[u32]) -> Self {
         let mut new_index = vec![0; leader_of.len()];
         let mut leaders = Vec::new();

@@ -29,8 +29,8 @@ const BATCH: usize = 4096;
 pub struct MergedSequence<'a> {
     source: &'a dyn FrameSource,
     info: SequenceInfo,
-    /// Id in the source of each Gaussian of this sequence. A proxy has the id of its leader, the Gaussian that took the
-    /// others.
+    /// Id in the source of each Gaussian of this sequence. A proxy has the id of its leader, the Gaussian into which
+    /// the others are merged.
     survivors: &'a [u32],
     /// For each Gaussian of this sequence that is a proxy: the ids and weights of the Gaussians it replaces; otherwise
     /// empty.

@@ -184,7 +184,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
-    /// Reference frame of all tests.
+    /// Frame at which the tests take the reference positions of the Gaussians.
     const REFERENCE: usize = 3;
 
     /// Test case: every third Gaussian of a demo scene, and all pairs of these that are at most `reach` apart.

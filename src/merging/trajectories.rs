@@ -189,7 +189,7 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::BlockReader;
 
-    /// Scene that declares fewer attributes as varying with time and keeps all others as they are at frame 0.
+    /// Test scene that declares fewer attributes as varying with time and keeps all others as they are at frame 0.
     struct PartlyStatic(Scene, SequenceInfo);
 
     impl PartlyStatic {

@@ -195,8 +195,8 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns whether the frames may be linked again, although the input already identifies each Gaussian across
-    /// frames.
+    /// Returns whether the frames may be linked again (Gaussians matched between frames), although the input already
+    /// identifies each Gaussian across frames.
     fn may_be_linked(&self) -> bool {
         false
     }
@@ -238,7 +238,7 @@ pub trait InputModel: Send + Sync {
     }
 }
 
-/// Where the time stamps of frames come from.
+/// Origin of the time stamps of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timing {
     /// The model is continuous in time: a frame can be at any time.
@@ -313,9 +313,9 @@ pub struct ColumnInfo {
     pub max_error: f64,
     /// Number of tiles (blocks of Gaussians × frames) of the column.
     pub tiles: usize,
-    /// Number of these tiles that store one frame, as their values are the same in all frames.
+    /// Number of tiles of the column that store one frame, as their values are the same in all frames.
     pub constant_tiles: usize,
-    /// Number of these tiles that are stored without compression.
+    /// Number of tiles of the column that are stored without compression.
     pub raw_tiles: usize,
     /// Bytes that the column takes in the file; bytes that several tiles share count once.
     pub stored_bytes: u64,

@@ -78,7 +78,7 @@ enum FrameOrder {
     Assumed,
     /// Measured: the same index means the same Gaussian. The note for the user gives the measured differences.
     Confirmed(String),
-    /// The same index does not mean the same Gaussian, for the reason given.
+    /// The same index does not mean the same Gaussian in every frame. Holds the reason, for messages.
     Lost(String),
 }
 

@@ -74,7 +74,7 @@ pub(super) fn unrecognized_folder(path: &Path) -> Error {
     error(found).hint(layouts())
 }
 
-/// Returns the error for the file at `path`, which is no input.
+/// Returns the error for the file at `path`, which has none of the input formats.
 pub(super) fn unrecognized_file(path: &Path) -> Error {
     Error::input(path, "", "a model or frames in a file", "a file of none of the known formats").hint(layouts())
 }

@@ -273,7 +273,7 @@ impl ContainerWriter {
     }
 }
 
-/// How a block of Gaussians changes within a frame block (consecutive frames).
+/// Change of a block of Gaussians within a frame block (consecutive frames).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
     /// Attributes that vary with time may change from frame to frame; all others equal those of the frame block before.

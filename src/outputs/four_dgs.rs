@@ -91,8 +91,8 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     }
 }
 
-/// Checks that the rounded positions in `set` are close to the positions `wanted`. `ids`: index of the Gaussian that
-/// each piece belongs to.
+/// Checks that the rounded positions in `set` are close to `wanted`, the positions before rounding. `ids`: index of the
+/// Gaussian that each piece belongs to.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
     let mut accuracy = Accuracy::new(&AttributeValues::from_planes(3, planes));

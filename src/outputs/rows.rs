@@ -29,7 +29,7 @@ pub struct RowTable<'a> {
     pub dynamic_score: &'a [f64],
     /// Total score S of each Gaussian.
     pub score: &'a [f64],
-    /// Whether each Gaussian is kept by stage 2 of the selection.
+    /// Whether each Gaussian is kept by the selection (stage 2 of the paper's method).
     pub keep: &'a [bool],
 }
 

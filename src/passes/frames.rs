@@ -22,7 +22,7 @@ impl<'a> FrameReaders<'a> {
     /// Opens readers for the attributes `columns` of the Gaussians `ids`. `wanted` names the frames that will be read.
     ///
     /// # Errors
-    /// A source that cannot be opened.
+    /// Fails if the source cannot be opened.
     pub fn open(
         source: &'a dyn FrameSource,
         ids: Ids<'_>,
@@ -46,7 +46,7 @@ impl<'a> FrameReaders<'a> {
         Ok(FrameReaders { info: source.info(), columns, count, readers })
     }
 
-    /// Returns a buffer with space for all these Gaussians, for reading frames into.
+    /// Returns a buffer with space for the attributes of all Gaussians of these readers at one frame.
     pub fn state(&self) -> Gaussians {
         Gaussians::zeros(self.count, self.sh_degree())
     }

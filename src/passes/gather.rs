@@ -17,7 +17,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// Memory: the result; on each thread a reader of one block of Gaussians, and the attributes of that block.
 ///
 /// # Errors
-/// A frame that cannot be read.
+/// Fails if the frame cannot be read.
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Attributes) -> Result<Gaussians> {
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
@@ -39,7 +39,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Attribu
 /// Returns the attributes `want` of all Gaussians at frame `frame`; all other attributes are empty.
 ///
 /// # Errors
-/// A frame that cannot be read.
+/// Fails if the frame cannot be read.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Attributes) -> Result<Gaussians> {
     let mut all = Gaussians::zeros(0, source.info().sh_degree);
     open_all(source, want, &ReadPlan::new([frame]))?.read(frame, want, &mut all)?;

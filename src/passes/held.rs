@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Frame source whose frames are in memory with all attributes. Its frame 0 is the first of these frames.
+/// Frame source whose frames are in memory with all attributes. Its frame 0 is the first frame in memory.
 pub struct HeldFrames {
     info: SequenceInfo,
     constant: Gaussians,

@@ -156,7 +156,7 @@ struct StateSlot<const S: usize> {
 /// Memory: for each subject its reader, the frames that this reader keeps, and the Gaussians at every frame of a batch.
 ///
 /// # Errors
-/// Frames that cannot be read; errors of `visit`.
+/// Fails if a frame cannot be read or if `visit` fails.
 pub fn show<const S: usize>(
     subjects: [RenderedSource<'_>; S],
     cameras: &[Camera],
@@ -236,7 +236,7 @@ impl<W: Send> Workers<W> {
     /// Passes each of the views `pictures` of the Gaussians `subject` to one of the workers.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if a frame cannot be read.
     pub(crate) fn show(
         &mut self,
         subject: RenderedSource<'_>,

@@ -21,7 +21,7 @@ impl<'a> States<'a> {
     /// Opens a reader of `source` for the frames that `wanted` names.
     ///
     /// # Errors
-    /// A source that cannot be opened.
+    /// Fails if the source cannot be opened.
     pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<States<'a>> {
         let info = source.info();
         Ok(States {

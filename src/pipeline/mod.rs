@@ -100,8 +100,8 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Resu
     Measure::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. `arrived` holds statistics that were taken while a stream arrived.
-/// Returns the summary, and for every input Gaussian its index in the output, or `None` if it was removed.
+/// Runs the stages of `plan`, one after the other. `arrived` holds statistics that were computed while a stream
+/// arrived. Returns the summary, and for every input Gaussian its index in the output, or `None` if it was removed.
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,

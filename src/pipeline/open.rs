@@ -1,4 +1,4 @@
-//! Opens a scene and takes its statistics. A stream is measured while it arrives, so that it is read only once.
+//! Opens a scene and computes its statistics. A stream is measured while it arrives, so that it is read only once.
 //!
 //! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). When measuring, also the
 //! running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes each) and the memory of
@@ -99,7 +99,7 @@ fn send_forecast(
     Ok(())
 }
 
-/// Packs a stream into a scratch container. If memory suffices, also takes statistics of the frames as they arrive.
+/// Packs a stream into a scratch container. If memory suffices, also computes statistics of the frames as they arrive.
 /// `loaded` holds the user's cameras, if any. Returns the statistics unless the assumptions about the times of the
 /// stream (see the module) proved wrong.
 fn receive_measured(
@@ -208,8 +208,8 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Returns the statistics that were taken while the frames arrived. Returns `None`, and adds a note to the scene, if an
-/// assumption about the times of the stream proved wrong or Gaussians have to be dropped.
+/// Returns the statistics that were computed while the frames arrived. Returns `None`, and adds a note to the scene, if
+/// an assumption about the times of the stream proved wrong or Gaussians have to be dropped.
 fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
@@ -244,7 +244,7 @@ struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Views of the frames so far, under the assumption that views have exactly the times of frames.
+    /// Views of the frames received so far, under the assumption that views have exactly the times of frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,

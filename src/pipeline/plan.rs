@@ -24,7 +24,7 @@ use crate::scene::Scene;
 pub struct RunPlan {
     /// Stages in the order in which they run, and the omitted stages.
     pub(super) stages: StageList,
-    /// Stages that take statistics. A stream is measured by them while it arrives.
+    /// Stages that compute statistics. A stream is measured by them while it arrives.
     pub measure: Measure,
     /// Stage that writes the result; `None` if the run only measures and scores.
     pub output: Option<WriteStage>,
@@ -172,7 +172,7 @@ impl RunPlan {
     }
 
     /// Returns the resource estimates (memory, time, reads) of the stages that are still to run. `measured` states
-    /// which statistics were already taken while a stream arrived; these are not counted.
+    /// which statistics were already computed while a stream arrived; these are not counted.
     pub fn remaining_estimates(
         &self,
         work: &Workload,

@@ -1,4 +1,4 @@
-//! What the planning of stages starts from: the request, and facts about the input that several stages depend on.
+//! Input of the planning of stages: the request, and facts about the input model that several stages depend on.
 
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
@@ -29,8 +29,7 @@ impl InputMeta {
     }
 }
 
-/// What the planning of stages starts from: the request of the user, and decisions and facts that several stages depend
-/// on.
+/// Input of the planning of stages: the request of the user, and decisions and facts that several stages depend on.
 pub struct Planning<'a> {
     /// Request of the user.
     pub request: &'a Request,

@@ -95,7 +95,7 @@ pub struct Request {
     pub drop_ids: Option<String>,
     /// Box, in scene units, whose Gaussians are kept: the three low coordinates, then the three high ones.
     pub keep_box: Option<[f64; 6]>,
-    /// What to do if the output exists already.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 

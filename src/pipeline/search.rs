@@ -46,7 +46,8 @@ const FIRST_FRACTION: f64 = 0.2;
 const SIZES_USUALLY_TRIED: f64 = 4.0;
 /// Maximum number of sizes (numbers of Gaussians) that are tried, apart from the full size if all of them fail.
 const MAX_SIZES: usize = 8;
-/// The search ends when the smallest size that passed is at most this factor times the largest size that failed.
+/// Ratio of the smallest size (number of Gaussians) that passed to the largest that failed, at or below which the
+/// search ends.
 const SAME_SIZE_RATIO: f64 = 1.04;
 /// Approximate cost of halving the number of Gaussians: the PSNR that is lost, dB, and the factor by which a loss of
 /// PSNR grows. The search guesses its next size from them.
@@ -56,7 +57,7 @@ const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
-/// One of this many views with photographs is held back from the search, for the report.
+/// Number n: one of every n views with photographs is held back from the search, for the report.
 const HELD_EVERY: usize = 4;
 
 /// Search of a run for the smallest model with a requested quality. Repeats the stages that reduce the model.

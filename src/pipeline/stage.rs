@@ -42,7 +42,7 @@ pub enum Phase {
     Write,
 }
 
-/// What the estimates of a stage's memory, time and reads depend on.
+/// Quantities on which the estimates of a stage's memory, time and reads depend.
 #[derive(Debug, Clone, Copy)]
 pub struct EstimateInput<'a> {
     /// Sizes of the input and of its views.
@@ -52,7 +52,7 @@ pub struct EstimateInput<'a> {
     /// Number of Gaussians in the output, as a fraction of the input's, above 0 and at most 1; 1 if not known in
     /// advance.
     pub left: f64,
-    /// Statistics of a stream that were already taken while it arrived.
+    /// Statistics of a stream that were already computed while it arrived.
     pub measured: MeasuredOnArrival,
 }
 
@@ -102,7 +102,7 @@ pub trait Stage: Debug + Send + Sync {
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Kinds of statistics of a stream that were already taken while it arrived.
+/// Kinds of statistics of a stream that were already computed while it arrived.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
     /// Whether all frames were scanned for the statistics of every Gaussian, except its visible contribution.
@@ -120,13 +120,13 @@ pub struct Measured {
 }
 
 impl Measured {
-    /// Returns the kinds of statistics that were taken.
+    /// Returns the kinds of statistics that were computed.
     pub fn kinds(&self) -> MeasuredOnArrival {
         MeasuredOnArrival { scanned: true, seen: self.seen.is_some() }
     }
 }
 
-/// How many Gaussians each part of a run leaves: ranking removes the first ones; refinement then removes the rest in
+/// Plan of the numbers of Gaussians in a run: ranking removes the first Gaussians; refinement then removes the rest in
 /// prune steps (removals of the lowest-ranked Gaussians between optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
@@ -138,13 +138,14 @@ pub struct CountPlan {
 }
 
 impl CountPlan {
-    /// Returns with how many of `all` Gaussians refinement begins if the output is to have `wanted`.
+    /// Returns the number of Gaussians with which refinement begins, of `all`, if the output is to have `wanted`
+    /// Gaussians.
     pub fn before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
-    /// Returns how many of `all` Gaussians ranking leaves if the output is to have `wanted`. A search for a quality
-    /// ranks only once, down to the number that its smallest model needs.
+    /// Returns the number of Gaussians, of `all`, that ranking leaves if the output is to have `wanted` Gaussians. A
+    /// search for a quality ranks only once, down to the number that its smallest model needs.
     pub fn after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
@@ -190,7 +191,7 @@ struct LeftOutStage {
 pub struct StageList {
     stages: Vec<(Phase, Box<dyn Stage>)>,
     left_out: Vec<LeftOutStage>,
-    /// How many Gaussians ranking and refinement leave.
+    /// Numbers of Gaussians that ranking and refinement leave.
     pub counts: CountPlan,
     /// Whether the amount of work depends on results of stages, so that the time of the run is less certain.
     is_open_ended: bool,
@@ -302,7 +303,7 @@ pub struct RunState<'a> {
     pub input: Option<InputSummary>,
     /// Text of the file `recipe.toml` that is written beside the result.
     pub recipe: String,
-    /// Statistics of a stream that were already taken while it arrived.
+    /// Statistics of a stream that were already computed while it arrived.
     pub arrived: Option<Measured>,
     /// Statistics and scores of all Gaussians.
     pub scored: Option<Arc<Scored>>,
@@ -319,8 +320,8 @@ pub struct RunState<'a> {
     pub result: CompressedModel,
     /// Number of Gaussians of [`result`](RunState::result) that refinement is to leave.
     pub wanted: usize,
-    /// In a search for a quality: states of refinement after prune steps (removals of the lowest-ranked Gaussians),
-    /// from which a smaller model continues.
+    /// States of refinement after prune steps (removals of the lowest-ranked Gaussians), from which a smaller model
+    /// continues; only in a search for a quality.
     pub prune_steps: Option<PruneSteps<'a>>,
     /// Counts of the merge stage, if Gaussians were merged.
     pub merge: Option<MergeSummary>,

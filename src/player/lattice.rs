@@ -1,7 +1,8 @@
-//! Quantization of frame states for the page: every value becomes the nearest point of a grid, so that differences in
-//! time are small integers that repeat.
+//! Quantization of frame states for the page that plays a scene: every value becomes the nearest point of a grid, so
+//! that differences between frames are small integers that repeat.
 //!
-//! In: the Gaussians of one frame. Out: planes of i32, component after component. Memory: one plane per component.
+//! Input: the Gaussians of one frame. Output: planes of i32 (one scalar component of all Gaussians each), one after
+//! another. Memory: one plane per component.
 
 use std::ops::Range;
 
@@ -11,7 +12,8 @@ use crate::error::Result;
 use crate::files::accuracy::{Accuracy, RenderedAttributes};
 use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
 
-/// Quantization steps. Each value is off by at most half of its step.
+/// Quantization steps of the values on the player page. Each stored value differs from the original by at most half a
+/// step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Steps {
     /// Step of positions, scene units.
@@ -26,20 +28,22 @@ pub struct Steps {
     pub sh: f64,
 }
 
-/// Negative exponent of two of a position step relative to the scene's extent: in a render of the whole scene on 800
-/// pixels, positions are at most a fortieth of a pixel off.
+/// Size of a position step: the scene's extent, rounded down to a power of two, times 2^−14. In a render of the whole
+/// scene on 800 pixels, positions are off by at most a fortieth of a pixel.
 const POSITION_BITS: i32 = 14;
-/// Limit of the absolute logarithm of scales, as in the rasterizer.
+/// Largest absolute value of a log scale on the player page, as in the rasterizer; other values are clamped.
 const LOGARITHM_LIMIT: f32 = 80.0;
-/// Largest SH coefficient in steps: the page stores them in 16 bits.
+/// Largest absolute SH coefficient, in quantization steps: the player page stores coefficients in 16 bits.
 const SH_LIMIT: f64 = 32767.0;
-/// Largest absolute position in steps.
+/// Largest absolute position, in quantization steps.
 const POSITION_LIMIT: f64 = (1 << 30) as f64;
 
 impl Steps {
-    /// Returns the steps for a scene of this extent: powers of two, so that grid points are exact in any precision.
+    /// Returns the quantization steps for a scene of the extent `extent` (scene units). The steps are powers of two, so
+    /// that grid points are exact in any precision.
     ///
-    /// The other steps were chosen by renders: with them `deform2` and `room2_big` reach over 50 dB PSNR.
+    /// Only the position step depends on the extent. The others were chosen by renders: with them, two trained models
+    /// (`deform2`, `room2_big`) reach over 50 dB PSNR against unquantized renders.
     pub fn from_extent(extent: f64) -> Steps {
         let position = extent.log2().floor() as i32 - POSITION_BITS;
         Steps {
@@ -52,27 +56,27 @@ impl Steps {
     }
 }
 
-/// Returns the components of an attribute among all components, in the order position, rotation, log scale, opacity,
-/// SH.
+/// Returns the indices of the scalar components of the attribute `column` among all components of a Gaussian, in the
+/// order position, rotation, log scale, opacity, SH.
 pub fn components(column: Attributes, sh_degree: usize) -> Range<usize> {
     let width = |column: Attributes| column.width(sh_degree);
     let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
     before..before + width(column)
 }
 
-/// Returns the number of components of all attributes.
+/// Returns the number of scalar components of all attributes of a Gaussian.
 pub fn width(sh_degree: usize) -> usize {
     11 + 3 * sh_coefficients(sh_degree)
 }
 
-/// Writes the attributes `which` of `state` as grid points into `points`, `[width, N]`; leaves the other attributes as
-/// they are. Returns the number of invisible Gaussians.
+/// Writes the attributes `which` of `state` as multiples of their quantization steps into `points`, `[width, N]`;
+/// leaves the other attributes in `points` as they are. Returns the number of Gaussians that become invisible.
 ///
-/// Quaternions are normalized; of both signs the one closer to the earlier content of `points` is taken. A Gaussian
-/// that is not finite, or too far away for its integer, gets opacity 0 and is invisible.
+/// Quaternions are normalized and get the sign that is closer to the earlier content of `points`. A Gaussian with a
+/// value that is not finite, or too far away for the integers, gets opacity 0 and is invisible.
 ///
 /// # Panics
-/// If `points` is not that large.
+/// Panics if `points` has fewer than `width` × N values.
 pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points: &mut [i32]) -> usize {
     let (count, degree) = (state.len(), state.sh_degree());
     let of = |column: Attributes| {
@@ -113,11 +117,11 @@ pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points:
     unseen
 }
 
-/// Checks that the positions of `points`, written of all attributes of `state` with SH up to `sh_degree`, match the
-/// state.
+/// Checks that the quantized positions in `points` are close to those of `state`. `points` holds all attributes of
+/// `state`, with SH up to `sh_degree`.
 ///
 /// # Errors
-/// A visible Gaussian that moved further than [`accuracy`](crate::files::accuracy) allows.
+/// Fails if a visible Gaussian moved further than [`accuracy`](crate::files::accuracy) allows.
 pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
     let count = state.len();
     let mut accuracy = Accuracy::new(&state.position);
@@ -130,13 +134,13 @@ pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, point
     accuracy.check("a page")
 }
 
-/// Returns the number of the grid point nearest to `value`; 0 for NaN.
+/// Returns the multiple of `step` that is nearest to `value`; 0 for NaN.
 fn nearest(value: f64, step: f64) -> i32 {
     (value / step).round_ties_even() as i32
 }
 
-/// Writes unit quaternions. Of both signs of a rotation the one closer to the earlier content is taken, so that an even
-/// turn gives even differences.
+/// Writes unit quaternions as multiples of `step` into `points`. Of both signs of a rotation the one closer to the
+/// earlier content of `points` is taken, so that a steady rotation gives equal differences.
 fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {
@@ -161,7 +165,7 @@ mod tests {
     use super::*;
     use crate::model::AttributeValues;
 
-    /// Returns the step of a component.
+    /// Returns the quantization step of the scalar component with the index `component`.
     fn step_of(component: usize, steps: &Steps) -> f64 {
         match component {
             0..3 => steps.position,

@@ -1,8 +1,9 @@
-//! Page: a program for the browser, the description of the scene, and the chunks of its models.
+//! Writes the page that plays a scene: a program for the browser, the description of the scene, and the chunks (encoded
+//! groups of frames) of its models.
 //!
-//! In: chunks, in the order in which they are encoded. Out: one HTML file, or a folder whose page loads the chunks as
-//! scripts, because a page from a disk may not read files. Memory: one chunk. Names are in JSON without `<`, and the
-//! program shows names as text.
+//! Input: chunks, in the order in which they are encoded. Output: one HTML file, or a folder whose page loads the
+//! chunks as scripts, because a page opened from a disk may not read files. Memory: one chunk. Names of files are
+//! inserted as JSON without `<`, and the program shows them as text.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -21,19 +22,19 @@ use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{digest_of, policy};
 use crate::model::{Rig, Split};
 
-/// File name of the page in a folder.
+/// File name of the player page in an output folder.
 pub const INDEX: &str = "index.html";
-/// Maximum number of cameras on the page, evenly chosen.
+/// Maximum number of cameras on the player page; of more cameras an even selection is taken.
 const CAMERAS: usize = 400;
 
 const PAGE: &str = include_str!("page/page.html");
-/// Marks in the page and the files that replace them.
+/// Placeholders in the HTML of the player page, each with the file content that replaces it.
 const PARTS: [(&str, &str); 3] = [
     ("/*page.css*/", include_str!("page/page.css")),
     ("/*sorter.js*/", include_str!("page/sorter.js")),
     ("/*player.js*/", concat!(include_str!("page/painter.js"), include_str!("page/player.js"))),
 ];
-/// Names and sources of the shaders.
+/// Names and sources of the shaders of the player page.
 const SHADERS: [(&str, &str); 5] = [
     ("cover", include_str!("page/cover.vert")),
     ("project", include_str!("page/project.frag")),
@@ -42,53 +43,55 @@ const SHADERS: [(&str, &str); 5] = [
     ("compose", include_str!("page/compose.frag")),
 ];
 
-/// Description of a model for the page.
+/// Description of one model on the player page.
 #[derive(Debug, Serialize)]
 pub struct PageModel {
     /// Role of the model: `original` or `compressed`.
     pub role: &'static str,
-    /// Name of its file or folder.
+    /// Name of the model's file or folder.
     pub name: String,
-    /// Bytes of the model on disk.
+    /// Size of the model on disk in bytes.
     pub bytes: u64,
     /// Number of frames of the model.
     pub frames: usize,
     /// SH degree of the model.
     pub degree: usize,
-    /// Encoded frames.
+    /// Description of the encoded frames.
     pub track: PageSequence,
 }
 
-/// Description of the scene for the page.
+/// Description of the scene on the player page.
 #[derive(Debug, Serialize)]
 pub struct PageScene {
-    /// Program and version.
+    /// Name and version of the program that wrote the page.
     pub tool: &'static str,
     /// One model, or the original and the compressed model.
     pub models: Vec<PageModel>,
     /// Cameras of the scene.
     pub cameras: Vec<PageCamera>,
-    /// Background, red, green, blue in [0, 1].
+    /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
-    /// Center of the scene.
+    /// Center of the scene, in scene units.
     pub middle: [f64; 3],
-    /// Longest side of the scene without its floaters.
+    /// Longest side of the scene without its floaters, in scene units.
     pub extent: f64,
     /// Mean upward direction of the cameras.
     pub up: [f64; 3],
-    /// Files of the chunks to load, in order; none where they are in the page.
+    /// Names of the files of the chunks (encoded groups of frames) to load, in order; empty if the page itself contains
+    /// the chunks.
     pub files: Vec<String>,
-    /// Data URI of the image shown until the scene is drawn; it is part of the page's elements.
+    /// Data URI of the image that the page shows until the scene is drawn. It becomes an `<img>` element, not a part of
+    /// the JSON.
     #[serde(skip)]
     pub poster: Option<String>,
 }
 
-/// Camera of the page.
+/// Camera on the player page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageCamera {
     view: u32,
     split: Split,
-    /// Time of its only shot; `None` for several shots or any time.
+    /// Time of the camera's only view; `None` if it has several views or its view has no time.
     time: Option<f64>,
     size: [u32; 2],
     focal: [f64; 2],
@@ -99,7 +102,7 @@ pub struct PageCamera {
     eye: [f64; 3],
 }
 
-/// Returns the cameras of a rig, one for each place and size.
+/// Returns the cameras of `rig`, one for each pair of view number and camera, at most 400.
 pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();
@@ -128,35 +131,37 @@ pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     found.into_iter().step_by(step).map(|(look, _)| look).collect()
 }
 
-/// Returns the mean upward direction of the cameras of a rig; z where it is undefined.
+/// Returns the mean upward direction of the cameras of `rig` as a unit vector; z if the directions cancel.
 pub fn upwards(rig: &Rig) -> DVec3 {
     let sum: DVec3 = rig.cameras.iter().map(|camera| -camera.rotation.row(1)).sum();
     let is_known = sum.is_finite() && sum.length() > 1e-3 * rig.cameras.len() as f64;
     if is_known { sum.normalize() } else { DVec3::Z }
 }
 
-/// Chunks as scripts, waiting in scratch files.
+/// Chunks (encoded groups of frames) as scripts in scratch files, until the page is written.
 pub struct Chunks {
     folder: ScratchFolder,
-    /// Start time as a share of the time shown; model; chunk; bytes.
+    /// For each chunk: its start as a fraction of the frames shown, index of its model, its index in the model, bytes
+    /// of its script.
     made: Vec<(f64, usize, usize, u64)>,
-    /// Digests of the scripts for the content security policy.
+    /// Digests of the chunks' scripts, for the content security policy of the page.
     digests: Vec<String>,
 }
 
 impl Chunks {
-    /// Creates an empty collection with a folder in `scratch`.
+    /// Creates an empty collection of chunks, with a temporary folder in `scratch`.
     ///
     /// # Errors
-    /// The system refuses.
+    /// Fails if the folder cannot be created.
     pub fn new(scratch: &Path) -> Result<Chunks> {
         Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
-    /// Adds chunk `chunk` of model `model`, whose first frame is at the share `since` of the time shown.
+    /// Adds the encoded chunk `bytes` as chunk `chunk` of model `model`. `since` is the index of its first frame as a
+    /// fraction of the frames shown.
     ///
     /// # Errors
-    /// A disk that is full.
+    /// Fails if the scratch file cannot be written.
     pub fn add(&mut self, model: usize, chunk: usize, since: f64, bytes: &[u8]) -> Result<()> {
         let path = self.path(model, chunk);
         let script = format!("splatsieve.chunk({model},{chunk},\"{}\");\n", STANDARD.encode(bytes));
@@ -166,7 +171,7 @@ impl Chunks {
         Ok(())
     }
 
-    /// Returns the bytes of all chunks.
+    /// Returns the size of all chunks in bytes, as scripts.
     pub fn bytes(&self) -> u64 {
         self.made.iter().map(|made| made.3).sum()
     }
@@ -175,17 +180,18 @@ impl Chunks {
         self.folder.path().join(name(model, chunk))
     }
 
-    /// Returns (model, chunk) in the order of time, so that the first frames of both models load first.
+    /// Returns (model, chunk) of all chunks in the order of their first frames, so that the first frames of both models
+    /// load first.
     fn ordered(&self) -> Vec<(usize, usize)> {
         let mut made = self.made.clone();
         made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
         made.into_iter().map(|(_, model, chunk, _)| (model, chunk)).collect()
     }
 
-    /// Writes one page with all chunks inside. Returns its bytes.
+    /// Writes one HTML file with all chunks inside to `path`. Returns its size in bytes.
     ///
     /// # Errors
-    /// A disk that is full.
+    /// Fails if a file cannot be read or written.
     pub fn write_page(&self, stage: &PageScene, path: &Path) -> Result<u64> {
         let failed = || Error::io("write", path);
         let mut to = BufWriter::new(File::create(path).map_err(failed())?);
@@ -200,10 +206,10 @@ impl Chunks {
         Ok(fs::metadata(path).map_err(failed())?.len())
     }
 
-    /// Writes the page and its chunks into a folder. Returns the names of all files, and their bytes.
+    /// Writes the page and its chunks into `folder`. Returns the names of all files, and their size in bytes together.
     ///
     /// # Errors
-    /// A disk that is full.
+    /// Fails if a file cannot be read or written.
     pub fn write_folder(&self, stage: &mut PageScene, folder: &Path) -> Result<(Vec<String>, u64)> {
         stage.files = self.ordered().into_iter().map(|(model, chunk)| name(model, chunk)).collect();
         for file in &stage.files {
@@ -223,7 +229,8 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the page up to its chunks. Its policy allows its own scripts and those with the digests `chunks`.
+/// Returns the HTML of the page up to its chunks. Its content security policy allows the scripts of the page and those
+/// with the digests `chunks`.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
@@ -245,13 +252,13 @@ fn head(stage: &PageScene, chunks: &[String]) -> String {
     page.replace("<!--policy-->", &policy) + "<script>" + &begin + "</script>\n"
 }
 
-/// Returns the text between the first `start` and the next `end`.
+/// Returns the part of `page` between the first `start` and the next `end`.
 fn between<'a>(page: &'a str, start: &str, end: &str) -> &'a str {
     let rest = page.split_once(start).map_or("", |(_, rest)| rest);
     rest.split_once(end).map_or(rest, |(content, _)| content)
 }
 
-/// Returns JSON that may stand in a script.
+/// Returns `json` as text that may stand in a script element: `<` is escaped.
 fn inline(json: &serde_json::Value) -> String {
     json.to_string().replace('<', "\\u003c")
 }

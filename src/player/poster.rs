@@ -19,11 +19,11 @@ const MAX_PIXELS: f64 = 160_000.0;
 /// JPEG quality of a poster, of 100.
 const QUALITY: u8 = 80;
 
-/// Renders `source` from the first camera of `rig`, at the camera's time, else at the first frame. Returns a data URI;
-/// `None` without cameras.
+/// Renders `source` by the first camera of `rig`, at the camera's time if it has one, else at the first frame. Returns
+/// a JPEG as a data URI; `None` without cameras or frames.
 ///
 /// # Errors
-/// A frame that cannot be read.
+/// Fails if a frame cannot be read.
 pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits: &Limits) -> Result<Option<String>> {
     let Some(shot) = rig.shots.first() else { return Ok(None) };
     let times = &source.info().times;
@@ -43,13 +43,13 @@ pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits:
     Ok(uri)
 }
 
-/// Returns the memory of a poster: bytes per Gaussian, and bytes of the render itself.
+/// Returns the memory for rendering a poster: bytes per Gaussian, and bytes of the render itself.
 pub fn memory() -> [MemoryPart; 2] {
     // Three channels of f32, their bytes, and the JPEG.
     [("poster", SHARED_VIEW_BYTES_PER_GAUSSIAN), ("poster", render::STRIP_BYTES as u64 + 16 * MAX_PIXELS as u64)]
 }
 
-/// Returns `camera` with renders of at most [`MAX_PIXELS`].
+/// Returns `camera` scaled to renders of at most [`MAX_PIXELS`] pixels.
 fn smaller(camera: &Camera) -> Camera {
     let pixels = f64::from(camera.width) * f64::from(camera.height);
     let scale = (MAX_PIXELS / pixels).sqrt().min(1.0);

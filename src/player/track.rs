@@ -1,16 +1,16 @@
 //! Encoding of a sequence for the page: a first state, then groups of frames as differences in time.
 //!
-//! In: a source of frames. Out: chunks of bytes, in order. Each chunk is a zlib stream (RFC 1950) and is decoded with
-//! the first chunk only. Memory: one state, and the grid points of a group's frames, at most [`GROUP_VALUES`] or those
-//! of one frame.
+//! Input: a source of frames. Output: chunks of bytes, in order. Each chunk is a zlib stream (RFC 1950) and is decoded
+//! with the first chunk only. Memory: one state, and the grid points of a group's frames, at most [`GROUP_VALUES`] or
+//! those of one frame.
 //!
-//! A chunk holds, for each of its components, a byte of flags and then planes of bytes. Chunk 0 has every component at
-//! the first frame; the other chunks have the components of varying attributes at consecutive frames. Flags: bits 0 to
-//! 2, number of planes; bit 3, second-order differences; bit 4, some value takes more than 16 bits. Planes hold byte 0,
-//! 1, … of every difference d, coded as 2d or −2d − 1, Gaussian by Gaussian, and frame by frame for one Gaussian. The
-//! first difference of a Gaussian in a group is relative to the first frame of the sequence (in chunk 0 to 0), the
-//! second to the frame before. Later differences are relative to the frame before; with bit 3 the last step is
-//! extrapolated. No planes: all differences are 0.
+//! A chunk holds, for each of its scalar components (such as the x of the position), a byte of flags and then planes of
+//! bytes. Chunk 0 has every component at the first frame; the other chunks have the components of varying attributes at
+//! consecutive frames. Flags: bits 0 to 2, number of planes; bit 3, second-order differences; bit 4, some value takes
+//! more than 16 bits. Planes hold byte 0, 1, … of every difference d, coded as 2d or −2d − 1, Gaussian by Gaussian, and
+//! frame by frame for one Gaussian. The first difference of a Gaussian in a group is relative to the first frame of the
+//! sequence (in chunk 0 to 0), the second to the frame before. Later differences are relative to the frame before; with
+//! bit 3 the last step is extrapolated. No planes: all differences are 0.
 
 use std::io::Write;
 
@@ -26,39 +26,42 @@ use crate::passes::States;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// Maximum number of grid points of a group in memory.
+/// Maximum number of quantized values of a group of frames in memory, unless one frame alone has more.
 pub const GROUP_VALUES: usize = 1 << 23;
-/// Maximum number of frames of a group, which the page unpacks for a jump in time.
+/// Maximum number of frames of a group. The page decodes a whole group to jump in time.
 const GROUP_FRAMES: usize = 20;
 /// Compression level of deflate. Differences are mostly noise, so higher levels gain little for their time.
 const LEVEL: u32 = 6;
-/// Flag of second-order differences.
+/// Flag in the first byte of a component: its differences are of second order.
 const SECOND_ORDER: u8 = 8;
-/// Flag of a component with values of more than 16 bits.
+/// Flag in the first byte of a component: it has values of more than 16 bits.
 const WIDE: u8 = 16;
 
-/// Description of a sequence, which the page reads before the chunks.
+/// Description of a sequence of frames, which the player page reads before the chunks.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageSequence {
     /// Number of Gaussians.
     pub count: usize,
-    /// SH degree that is shown.
+    /// SH degree of the encoded frames.
     pub sh_degree: usize,
-    /// Time stamps of the frames that are shown.
+    /// Time stamps of the encoded frames.
     pub times: Vec<f64>,
     /// Quantization steps of the values.
     pub steps: Steps,
-    /// Runs of components that vary with time: first component and number, in order.
+    /// Ranges of scalar components that vary with time, in order: index of the first component, and number of
+    /// components.
     pub varying: Vec<[usize; 2]>,
-    /// First frame of each group, then the number of frames.
+    /// Index of the first frame of each group, followed by the number of frames.
     pub groups: Vec<usize>,
-    /// Largest number of Gaussians of a frame that have no place on the grid and are invisible there.
+    /// Largest number of Gaussians, over all frames, that are not finite or too far away for the quantization grid and
+    /// therefore invisible at a frame.
     #[serde(skip)]
     pub unseen: usize,
 }
 
 impl PageSequence {
-    /// Divides `frames` of `source` into groups, with SH of at most `sh_degree`.
+    /// Plans the encoding of the frames `frames` of `source`: divides them into groups, with SH coefficients up to
+    /// `sh_degree` and the quantization steps `steps`.
     pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
@@ -78,23 +81,23 @@ impl PageSequence {
         }
     }
 
-    /// Returns the number of chunks.
+    /// Returns the number of chunks: one for the first frame, and one per group.
     pub fn chunks(&self) -> usize {
         self.groups.len()
     }
 }
 
-/// Returns the attributes to encode where `varying` vary. Opacity is among them, because a Gaussian that is not finite
-/// at some frames is invisible there.
+/// Returns the attributes that are encoded for every frame if the attributes `varying` vary with time. Opacity is among
+/// them, because a Gaussian that is not finite at some frames is invisible there.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
-/// Encodes the chunks of `track`, planned for `frames` of `source`, and passes them to `sink` in order. A reader keeps
-/// `held` of the frames that are decoded together.
+/// Encodes the chunks of `track`, planned for `frames` of `source`, and passes each with its index to `sink`, in order.
+/// A reader keeps at most `held` of the frames that are decoded together in memory.
 ///
 /// # Errors
-/// A frame that cannot be read; those of `sink`.
+/// Fails if a frame cannot be read, if a position cannot be stored accurately, or if `sink` fails.
 pub fn encode(
     source: &dyn FrameSource,
     frames: &[usize],
@@ -163,7 +166,8 @@ fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     to.finish().map_err(failed)
 }
 
-/// Returns the flags and planes of a component.
+/// Returns the encoded bytes of one scalar component: a byte of flags, then the planes of the differences between
+/// frames.
 fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
     let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();
@@ -178,7 +182,8 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the differences, Gaussian by Gaussian, with the sign in the lowest bit.
+/// Returns the differences between successive frames, Gaussian by Gaussian, with the sign in the lowest bit. The first
+/// difference is relative to `start`. With `is_second`, later ones are second-order differences.
 fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
     let mut values = Vec::with_capacity(start.len() * frames.len());
     for (i, &first) in start.iter().enumerate() {
@@ -206,7 +211,7 @@ mod tests {
     use crate::passes::gather_all;
 
     /// Decodes every frame of the chunks, `[frames][width][N]`, one value at a time, by the description at the top of
-    /// this file.
+    /// this file; shares no code with the encoder.
     fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
         let (count, width) = (track.count, width(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {

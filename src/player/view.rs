@@ -19,51 +19,51 @@ use crate::scene::open_compressed;
 use crate::scene::pictures::background;
 use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
 
-/// Name of the stage.
+/// Name of the stage, for progress and the memory plan.
 const NAME: &str = "view";
 
-/// Options of [`view`].
+/// Options of the command `view`.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
-    /// The model, or the original of a compressed one; its split is ignored.
+    /// Model to play, or the original of a compressed model. The split that these options request is ignored.
     pub original: InputOptions,
-    /// The compressed model, of any format.
+    /// Path of the compressed model to show beside the original, in any format.
     pub compressed: Option<PathBuf>,
-    /// Maximum number of frames, evenly from first to last.
+    /// Maximum number of frames, evenly spaced from the first to the last.
     pub max_frames: usize,
     /// Maximum number of frames of an original beside a compressed model; `None`: `max_frames`.
     pub original_frames: Option<usize>,
     /// Maximum SH degree of an original beside a compressed model; `None`: its own.
     pub original_degree: Option<usize>,
-    /// Background, red, green, blue in [0, 1]; `None`: see [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
     pub background: Option<[f32; 3]>,
-    /// Maximum number of bytes of frames in one file; larger pages become folders.
+    /// Maximum number of bytes of encoded frames in one HTML file; with more bytes a folder is written.
     pub page_limit: u64,
-    /// Path of a page, NAME.html, or of a folder.
+    /// Path of the output: an HTML file NAME.html, or a folder.
     pub output: PathBuf,
     /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// Result of [`view`].
+/// Result of the command `view`.
 #[derive(Debug)]
 pub struct Viewed {
-    /// Page to open.
+    /// Path of the page to open in a browser.
     pub page: PathBuf,
-    /// Bytes of all files.
+    /// Size of all written files in bytes.
     pub bytes: u64,
-    /// Number of files.
+    /// Number of written files.
     pub files: usize,
-    /// Number of frames shown.
+    /// Number of frames that the page shows.
     pub frames: usize,
-    /// Notes for a person.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
 /// Checks, before any work, that the page may be written.
 ///
 /// # Errors
-/// Those of [`check_target`].
+/// Fails as [`check_target`] does, for example if the output exists and may not be replaced.
 pub fn check(options: &ViewOptions) -> Result<()> {
     let mut inputs = vec![options.original.path.as_path()];
     inputs.extend(options.original.cameras.as_deref());
@@ -72,18 +72,18 @@ pub fn check(options: &ViewOptions) -> Result<()> {
     check_target(&options.output, kind, &inputs, options.overwrite)
 }
 
-/// Returns whether `output` names a page rather than a folder.
+/// Returns whether `output` names a single HTML file rather than a folder.
 fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
 }
 
-/// Writes the page.
+/// Writes the page that plays the model, or two models side by side.
 ///
-/// Memory: one state of one model, a group of its frames as grid points ([`GROUP_VALUES`]), and the render of the
-/// poster.
+/// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values ([`GROUP_VALUES`]), and
+/// the render of the poster.
 ///
 /// # Errors
-/// Invalid inputs, cameras or output. Nothing is written then.
+/// Fails if the inputs, the cameras or the output are invalid. Nothing is written then.
 pub fn view(options: &ViewOptions) -> Result<Viewed> {
     check(options)?;
     let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
@@ -157,7 +157,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     Ok(Viewed { page: folder.join(INDEX), bytes, files: names.len(), frames, notes })
 }
 
-/// Options for one model of the page.
+/// Settings for one model of the page: its role, path, maximum number of frames and maximum SH degree.
 struct ModelView<'a> {
     role: &'static str,
     path: &'a Path,
@@ -165,7 +165,7 @@ struct ModelView<'a> {
     degree: usize,
 }
 
-/// Encodes model `place` of the page.
+/// Encodes `model` as model number `place` of the page, adds its chunks to `chunks`, and returns its description.
 fn show(
     model: &dyn InputModel,
     place: usize,
@@ -195,14 +195,14 @@ fn show(
     })
 }
 
-/// Returns at most `count` of `frames` frames, evenly from first to last.
+/// Returns at most `count` of the indices from 0 to `frames` − 1, evenly spaced from first to last.
 fn evenly(frames: usize, count: usize) -> Vec<usize> {
     let count = count.clamp(1, frames.max(1));
     let step = (frames.max(1) - 1) as f64 / (count - 1).max(1) as f64;
     (0..count.min(frames)).map(|i| (i as f64 * step).round_ties_even() as usize).collect()
 }
 
-/// Estimates the resources of encoding.
+/// Returns the resource estimate (memory, time, reads) of encoding the frames for the page.
 fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
     let [per_gaussian, render] = poster::memory();
     let points = 4 * width(work.sh_degree) as u64;

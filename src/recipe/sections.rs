@@ -23,7 +23,8 @@ pub struct ScanParams {
     pub non_finite: NonFinite,
 }
 
-/// Which steps from one frame to the next count as motion of a Gaussian, and by what their sum is divided.
+/// Definition of the steps from one frame to the next that count as motion of a Gaussian, and of the number by which
+/// their sum is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
@@ -118,9 +119,9 @@ pub struct SelectParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LowPriority {
-    /// They are removed.
+    /// Gaussians that are not candidates are removed.
     Drop,
-    /// Stage 2 decides on them in the same way as on the candidates.
+    /// Stage 2 decides on Gaussians that are not candidates in the same way as on candidates.
     Rescue,
 }
 
@@ -295,9 +296,10 @@ impl LengthUnit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Trajectory {
-    /// Mean over the steps of the cosine of the angle between a and b, as in the paper.
+    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
     Cosine,
-    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps; σ is the parameter `motion_noise`.
+    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame;
+    /// σ is the parameter `motion_noise`.
     Alignment,
 }
 
@@ -328,8 +330,8 @@ pub enum ProxyOpacity {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShHigh {
-    /// Weighted average of the coefficients of the cluster's members.
+    /// Weighted average of the SH coefficients of the cluster's members.
     Average,
-    /// Coefficients of the member with the largest weight.
+    /// SH coefficients of the cluster's member with the largest weight.
     Heaviest,
 }

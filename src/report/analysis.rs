@@ -1,20 +1,20 @@
-//! One result with everything that the page shows of it.
+//! Comparison of one compressed model with the original, with everything that the report page shows of it.
 
 use super::film::FilmPanel;
 use super::findings::{Close, ResultData};
 use super::run::RunFiles;
 use super::shown::ShownImage;
 
-/// Comparison of one result with the original.
+/// Comparison of one compressed model with the original, for the report page.
 pub(super) struct Analysis {
-    /// Data of the result.
+    /// Scores, failure modes and notes of the compressed model.
     pub(super) data: ResultData,
-    /// Files beside the result.
+    /// Files that `compress` left beside the compressed model.
     pub(super) run: RunFiles,
-    /// Images of the chosen renders.
+    /// Images of the renders that the page shows.
     pub(super) shown: Vec<ShownImage>,
-    /// Animations.
+    /// Animations that the page shows.
     pub(super) films: Vec<FilmPanel>,
-    /// Worst parts of the failure modes.
+    /// For each failure mode that can be judged, the images of the place where it is worst.
     pub(super) close: Vec<Close>,
 }

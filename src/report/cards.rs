@@ -1,4 +1,5 @@
-//! The head of the page: the verdict, and what changed in four cards or, of several results, in one table.
+//! Head of the report page: the verdict, and the changes in four cards, or in one table if there are several compressed
+//! models.
 
 use super::analysis::Analysis;
 use super::findings::ResultData;
@@ -6,7 +7,8 @@ use super::html::{bytes, count, db, escape, figure, percent};
 use crate::evaluation::found::Both;
 use crate::models::Size;
 
-/// Returns the names, the verdict, and the cards.
+/// Returns the HTML of the head of the page: names of the models, verdict, and cards (of one result) or a table (of
+/// several).
 pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
     let found = &results[0].data.evaluation;
     let original = escape(&found.path.original);
@@ -48,7 +50,7 @@ fn plural(number: usize) -> &'static str {
     if number == 1 { "" } else { "s" }
 }
 
-/// A card: label, value before, value after, and a line of more.
+/// Returns the HTML of a card: label, value before, value after, and a line with further figures.
 fn card(label: &str, before: &str, after: &str, more: &str) -> String {
     format!(
         "<div class=\"card\"><span class=\"label\">{label}</span><span class=\"change\"><span>{before}</span> \
@@ -56,7 +58,8 @@ fn card(label: &str, before: &str, after: &str, more: &str) -> String {
     )
 }
 
-/// Returns the four cards of a result: Gaussians, size, quality, and photographs, render time or SSIM.
+/// Returns the HTML of the four cards of a result: Gaussians, size, quality, and the comparison with photographs (else
+/// the render time, else SSIM).
 fn cards(result: &ResultData) -> String {
     let found = &result.evaluation;
     let (counts, sizes, mean) = (found.count, found.bytes, found.loss.overall);
@@ -95,7 +98,8 @@ fn cards(result: &ResultData) -> String {
     out + "</div>\n"
 }
 
-/// Returns for example "10.0× fewer (10%)".
+/// Returns the change from `before` to `after` as text, such as "10.0× fewer (10%)". `fewer` and `more` are the words
+/// for a decrease and an increase.
 fn times_fewer(before: f64, after: f64, fewer: &str, more: &str) -> String {
     if before == after {
         return "unchanged".to_owned();
@@ -111,7 +115,8 @@ fn milliseconds(value: f64) -> String {
     format!("{value:.1} ms")
 }
 
-/// Returns the parts that both models have, if there are several: name, bytes before, bytes after.
+/// Returns the parts of the size that both models have (at least 1% of the compressed model's bytes), as (name, bytes
+/// before, bytes after); empty for fewer than two parts.
 pub(super) fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named().into_iter().zip(size.compressed.named());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
@@ -121,7 +126,7 @@ pub(super) fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
     if both.len() > 1 { both } else { Vec::new() }
 }
 
-/// Returns a table with a row for the original and one for each result.
+/// Returns an HTML table with a row for the original and one for each compressed model.
 fn table(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].data.evaluation;
     let has_photographs = results.iter().all(|result| result.data.evaluation.ground_truth.is_some());

@@ -1,8 +1,8 @@
 //! Charts as SVG elements of a page.
 //!
-//! Data in: numbers and names. Data out: one `<svg>` element with colors from [`STYLE`] and the font of the page around
-//! it. Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are
-//! those of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
+//! Input: numbers and names. Output: one `<svg>` element with colors from [`STYLE`] and the font of the page around it.
+//! Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are those
+//! of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
 
 use std::fmt::{self, Write as _};
 
@@ -11,27 +11,27 @@ use super::html::{escape, figure};
 /// Style sheet of charts, which a page must hold once.
 pub const STYLE: &str = include_str!("chart.css");
 
-/// Width of a chart in its own units, which are about a pixel each.
+/// Width of a chart in SVG units, which are about a pixel each.
 const WIDTH: f64 = 480.0;
-/// Height of a chart with two axes.
+/// Height of a chart with two axes, in SVG units (about pixels).
 const HEIGHT: f64 = 270.0;
-/// Left margin.
+/// Left margin of a chart, in SVG units (about pixels).
 const LEFT: f64 = 80.0;
-/// Right margin.
+/// Right margin of a chart, in SVG units (about pixels).
 const RIGHT: f64 = 14.0;
-/// Bottom margin.
+/// Bottom margin of a chart, in SVG units (about pixels).
 const BOTTOM: f64 = 46.0;
-/// Height of a line of the legend.
+/// Height of a line of a chart's legend, in SVG units (about pixels).
 const LINE: f64 = 18.0;
-/// Approximate width of a letter on a narrow page, where letters are largest.
+/// Approximate width of a letter in SVG units (about pixels), on a narrow page, where letters are largest.
 const LETTER: f64 = 8.2;
-/// Number of styles of series in [`STYLE`].
+/// Number of different styles (color, shape, dash) of series that [`STYLE`] defines.
 const LOOKS: usize = 9;
 
-/// Axis of a plot.
+/// Axis of a chart.
 #[derive(Debug, Clone, Default)]
 pub struct ChartAxis {
-    /// Measure and unit.
+    /// Measured quantity and its unit, written beside the axis.
     pub label: String,
     /// Whether the axis is logarithmic; values that are not positive are then left out.
     pub log: bool,
@@ -39,7 +39,7 @@ pub struct ChartAxis {
     pub from_zero: bool,
 }
 
-/// Series of points.
+/// Series of points in a plot.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
     /// Name in the legend; a series without a name is not listed.
@@ -50,14 +50,14 @@ pub struct Series {
     pub joined: bool,
     /// Whether the series is paired with the one before it: same color, dashed and hollow.
     pub paired: bool,
-    /// Labels beside the points where there is room: one per point, or none.
+    /// Texts beside the points, shown where there is room: one per point, or none at all.
     pub labels: Vec<String>,
 }
 
 /// Plot of series over two axes.
 #[derive(Debug, Clone, Default)]
 pub struct Plot {
-    /// Description for readers who do not see the chart.
+    /// Description of the chart for readers who do not see it.
     pub title: String,
     /// Horizontal axis.
     pub x: ChartAxis,
@@ -67,33 +67,34 @@ pub struct Plot {
     pub series: Vec<Series>,
 }
 
-/// Horizontal bars, or marks, of one value per name.
+/// Chart of horizontal bars, or marks, with one value per name.
 #[derive(Debug, Clone, Default)]
 pub struct Bars {
-    /// Description.
+    /// Description of the chart for readers who do not see it.
     pub title: String,
-    /// Measure and unit of the values.
+    /// Measured quantity and its unit, written below the axis.
     pub label: String,
-    /// Names and values from the top.
+    /// Names and values, from top to bottom.
     pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers the values instead of starting at 0; marks then stand for bars.
+    /// Whether the axis covers only the range of the values instead of starting at 0. Marks are then drawn instead of
+    /// bars.
     pub is_fitted: bool,
 }
 
-/// Stacked counts per bin.
+/// Chart of stacked counts: for each bin of values, the counts of several groups on top of one another.
 #[derive(Debug, Clone, Default)]
 pub struct Stack {
-    /// Description.
+    /// Description of the chart for readers who do not see it.
     pub title: String,
     /// Axis of the binned values.
     pub x: ChartAxis,
-    /// Edges of the bins, increasing, one more than bins.
+    /// Edges of the bins in increasing order; one more than there are bins.
     pub edges: Vec<f64>,
-    /// Groups from the bottom, with a count per bin.
+    /// Groups from bottom to top, each with its name and its count in every bin.
     pub groups: Vec<(String, Vec<usize>)>,
 }
 
-/// Axis with its range and its place in the chart.
+/// Axis with its range of values and its range of pixels in the chart.
 struct AxisScale {
     log: bool,
     low: f64,
@@ -132,20 +133,20 @@ impl AxisScale {
         })
     }
 
-    /// Adds `room` pixels behind the last value.
+    /// Leaves `room` pixels free behind the last value on the axis.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
 
-    /// Returns the pixel of a value; `None` if it cannot be shown.
+    /// Returns the pixel at which `value` is drawn; `None` if it is not finite, or not positive on a logarithmic axis.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
         let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
         at.is_finite().then_some(at)
     }
 
-    /// Returns round values inside the range.
+    /// Returns round values within the range of the axis, for its ticks.
     fn ticks(&self) -> Vec<f64> {
         if self.log {
             let decades = (self.low.floor() as i32)..=(self.high.ceil() as i32);
@@ -181,7 +182,7 @@ fn even_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 impl Plot {
-    /// Draws the chart.
+    /// Returns the plot as an `<svg>` element.
     pub fn svg(&self) -> String {
         let looks = self.looks();
         let legend: Vec<LegendEntry<'_>> = self
@@ -229,7 +230,7 @@ impl Plot {
 }
 
 impl Bars {
-    /// Draws the chart, as high as its rows need.
+    /// Returns the bars as an `<svg>` element, whose height depends on the number of bars.
     pub fn svg(&self) -> String {
         const ROW: f64 = 24.0;
         let height = ROW * self.bars.len() as f64 + BOTTOM + 8.0;
@@ -269,7 +270,7 @@ impl Bars {
 }
 
 impl Stack {
-    /// Draws the chart.
+    /// Returns the stacked counts as an `<svg>` element.
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
         let legend: Vec<LegendEntry<'_>> = names
@@ -310,16 +311,16 @@ impl Stack {
     }
 }
 
-/// Style of a series: class names of [`STYLE`].
+/// Style of a series, which selects CSS classes of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Number below [`LOOKS`].
+    /// Index of the style, below [`LOOKS`].
     number: usize,
     hollow: bool,
 }
 
 impl SeriesStyle {
-    /// Returns the style of a series without a pair.
+    /// Returns the style with the index `number` modulo [`LOOKS`], drawn solid.
     fn from_number(number: usize) -> SeriesStyle {
         SeriesStyle { number: number % LOOKS, hollow: false }
     }
@@ -338,13 +339,13 @@ struct LegendEntry<'a> {
     joined: bool,
 }
 
-/// SVG being written.
+/// SVG element that is being written.
 struct Drawing {
     text: String,
     height: f64,
-    /// Top of the plot, below the legend.
+    /// Top of the plot area, below the legend, in SVG units (about pixels).
     top: f64,
-    /// Left end, foot and width of the labels placed so far.
+    /// Left end, baseline and width of each label placed so far, in SVG units (about pixels).
     labels: Vec<(f64, f64, f64)>,
 }
 
@@ -380,7 +381,7 @@ impl Drawing {
         self.text.push_str(element);
     }
 
-    /// Draws a point in the shape of its series.
+    /// Draws a point at (`x`, `y`) in the shape of the style `look`, with the tooltip `tip`.
     fn mark(&mut self, look: SeriesStyle, x: f64, y: f64, tip: &str) {
         let shape = match look.number % 4 {
             0 => format!("<circle class=\"mark {look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
@@ -400,7 +401,8 @@ impl Drawing {
         let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
     }
 
-    /// Writes a label beside a point where it overlaps no other, inside the plot; leaves it out where there is no room.
+    /// Writes the label `words` beside the point (`x`, `y`), inside the plot, where it overlaps no other label. Writes
+    /// nothing if there is no such place.
     fn label(&mut self, x: f64, y: f64, words: &str) {
         let wide = words.chars().count() as f64 * LETTER;
         // Left end and foot. Places above come first, because curves of error against time fall.

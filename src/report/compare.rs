@@ -1,11 +1,12 @@
-//! Images of the page: sliders between the original and its results, and animations.
+//! Images of the report page: sliders that compare the original with compressed models, and animations.
 
 use super::analysis::Analysis;
 use super::film::{KINDS, QUALITY};
 use super::html::{db, escape, figure};
 use super::shown::{MEDIAN, ShownImage, WORST};
 
-/// Returns the sliders of the median render and of the worst one.
+/// Returns the HTML of the sliders of the median and the worst render. A slider shows two images of one view with a
+/// movable border between them.
 pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let median = place_of(first, MEDIAN);
@@ -19,7 +20,7 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
            made brighter until it can be seen.</p>\n"
 }
 
-/// Returns the sliders of the other chosen renders.
+/// Returns the HTML of the sliders of all chosen renders except the median and the worst one.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
@@ -39,15 +40,16 @@ fn place_of(shown: &[ShownImage], why: &str) -> Option<usize> {
     shown.iter().position(|shown| shown.choice.why.iter().any(|own| own == why))
 }
 
-/// An image of a slider.
+/// Image of a slider (two images of one view with a movable border between them).
 struct Layer<'a> {
     name: String,
     uri: &'a str,
-    /// Note on the image, for its caption.
+    /// Text about the image, for the caption of the slider.
     note: String,
 }
 
-/// Returns the images of render `place`: the original, the results, the differences and the photograph.
+/// Returns the images of the chosen render with the index `place`: original, compressed models, differences, and the
+/// photograph if there is one.
 fn layers<'a>(results: &'a [Analysis], names: &[String], place: usize) -> Vec<Layer<'a>> {
     let image = |result: &'a Analysis, kind: &str| {
         let found = result.shown.get(place)?.images.iter().find(|image| image.0 == kind)?;
@@ -76,7 +78,8 @@ fn scores(shown: &ShownImage) -> String {
     format!("PSNR {}, SSIM {:.4}{flip}", db(shown.choice.psnr), shown.choice.ssim)
 }
 
-/// Returns a slider. Its images lie on one another; classes say which two are visible.
+/// Returns the HTML of the slider for the chosen render with the index `place`. Its images lie on one another; CSS
+/// classes select the two that are visible.
 fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> String {
     let shown = &results[0].shown[place];
     let layers = layers(results, names, place);
@@ -111,7 +114,8 @@ fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> 
     out + &format!("</div>\n<p class=\"caption\">{}{shrunk}</p>\n</figure>\n", scores(shown))
 }
 
-/// Returns a remark on images of which `shrunk` pixels each way became one.
+/// Returns a remark on the size of images in which each pixel stands for `shrunk` × `shrunk` pixels of the render;
+/// empty if `shrunk` is 1.
 fn at_size(shrunk: u32) -> String {
     match shrunk {
         1 => String::new(),
@@ -119,7 +123,7 @@ fn at_size(shrunk: u32) -> String {
     }
 }
 
-/// Returns the animations with their controls. Without scripts their first frames are visible.
+/// Returns the HTML of the animations with their controls. Without scripts the first frames are visible.
 pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
     let films = &results[0].films;
     let Some(first) = films.first() else { return String::new() };

@@ -1,4 +1,4 @@
-//! The collapsed part of the page: every figure, the stages of the run, the scores, the notes and the data files.
+//! Collapsed sections of the report page: all figures, the stages of the run, the scores, the notes and the data files.
 
 use super::analysis::Analysis;
 use super::chart::{Bars, ChartAxis, Stack};
@@ -14,7 +14,7 @@ use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::StageRecord;
 use crate::pipeline::summary::Summary;
 
-/// Returns the collapsed sections. Each has a plain label and one line of explanation.
+/// Returns the HTML of the collapsed sections of the page. Each has a label and one line of explanation.
 pub(super) fn details(
     results: &[Analysis],
     names: &[String],
@@ -85,12 +85,12 @@ pub(super) fn details(
         .collect()
 }
 
-/// Returns a remark on absent data.
+/// Returns an HTML paragraph with the remark `text`, in place of data that do not exist.
 fn absent(text: &str) -> String {
     format!("<p class=\"note\">{text}</p>\n")
 }
 
-/// Returns the tables of all measures, of the render times and of the parts of the size.
+/// Returns HTML tables of all quality measures, of the render times, and of the parts of the size.
 fn numbers(result: &ResultData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(
@@ -131,10 +131,12 @@ fn numbers(result: &ResultData, name: &str) -> String {
     out
 }
 
-/// Value of a measure, its text, and whether larger values are better.
+/// Quality measure: its name, the function that returns its mean, the function that formats it, and whether larger
+/// values are better.
 type Measure = (&'static str, fn(&QualityMeans) -> Option<f64>, fn(f64) -> String, bool);
 
-/// Returns a row per measure of `of`: the average, the worst frame and the worst view.
+/// Returns HTML table rows, one per quality measure of the comparison `of`: the average, the worst frame and the worst
+/// view.
 fn measures(name: &str, of: &Comparison) -> String {
     const MEASURES: [Measure; 4] = [
         ("PSNR", |means| Some(means.psnr), db, true),
@@ -191,7 +193,7 @@ fn stages(run: &RunFiles) -> String {
     out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
 }
 
-/// Returns a chart of one value per stage; empty for fewer than two.
+/// Returns a bar chart of one value per stage of the run; empty for fewer than two stages with a value.
 fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
     let bars: Vec<(String, f64)> =
         summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
@@ -202,7 +204,7 @@ fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&Stage
     figure_of(title, &chart.svg())
 }
 
-/// Returns the histograms of the scores; those whose values are all alike as a line of text.
+/// Returns the histograms of the scores as charts; a score with equal values for all Gaussians becomes a line of text.
 fn score_histograms(result: &ResultData) -> String {
     let Some(histograms) = &result.histograms else {
         return absent(
@@ -253,7 +255,7 @@ fn histogram(of: &Histogram) -> String {
     .svg()
 }
 
-/// Returns the skipped steps with their reasons, the percentiles of the score's terms, and all notes.
+/// Returns the HTML of the omitted stages with their reasons, the percentiles of the terms of the score, and all notes.
 fn skipped(result: &ResultData, run: &RunFiles) -> String {
     let mut out = String::new();
     if let Some((summary, _)) = &run.summary {
@@ -285,7 +287,7 @@ fn skipped(result: &ResultData, run: &RunFiles) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-/// Returns the chart of the sizes that a run tried, if it searched for one.
+/// Returns the chart of the numbers of Gaussians that a search for a quality tried; empty if the run did not search.
 fn searched(summary: &Summary) -> String {
     summary.goal.as_ref().map_or(String::new(), trade_off::search)
 }

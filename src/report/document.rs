@@ -9,7 +9,8 @@ use crate::files::page_policy::{digest_of, policy};
 
 const STYLE: &str = include_str!("page.css");
 
-/// Returns a whole file. `scripts` run at its end and must hold no text from files.
+/// Returns a whole HTML file with the title `title` and the content `body`. `scripts` run at its end; they must not
+/// contain text from files.
 pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     let scripts: Vec<String> = scripts.iter().map(|script| format!("\n{script}")).collect();
     let digests: Vec<String> = scripts.iter().map(|script| digest_of(script)).collect();
@@ -30,24 +31,24 @@ pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     )
 }
 
-/// Returns a chart under its name.
+/// Returns an HTML figure: the chart `svg` below the caption `caption`.
 pub(super) fn figure_of(caption: &str, svg: &str) -> String {
     format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
 }
 
-/// Returns a list of notes; empty without notes.
+/// Returns an HTML list of the notes `notes`; empty without notes.
 pub(super) fn list<'a>(notes: impl IntoIterator<Item = &'a String>) -> String {
     let items: Vec<String> = notes.into_iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
     if items.is_empty() { String::new() } else { format!("<ul class=\"note\">{}</ul>\n", items.join("\n")) }
 }
 
-/// Returns links to files beside the page.
+/// Returns HTML links to the files `names`, which lie beside the page.
 pub(super) fn links(names: &[&str]) -> String {
     let links: Vec<String> = names.iter().map(|name| format!("<a href=\"{name}\">{name}</a>")).collect();
     links.join(", ")
 }
 
-/// Returns the heading of result `number` where there are several, else nothing.
+/// Returns the HTML heading of the compressed model with the index `number`; empty if there is only one model.
 pub(super) fn heading(names: &[String], number: usize) -> String {
     if names.len() < 2 { String::new() } else { format!("<h3>{}</h3>\n", escape(&names[number])) }
 }

@@ -1,9 +1,9 @@
 //! Failure modes that the paper names, detected in renders.
 //!
-//! In: the kinds of every Gaussian ([`mod@super::traits`]) and the renders of both models. Out: for each kind the error
-//! where the kind is visible and elsewhere, the worst place, and a verdict. Where a kind is visible is
-//! known exactly: the original is rendered once more with colors that encode the kinds, which gives for every pixel the
-//! share w of each kind.
+//! Input: the kinds of every Gaussian ([`mod@super::traits`]: fast, thin or changing in appearance) and the renders of
+//! both models. Output: for each kind the error where the kind is visible and elsewhere, the worst place, and a
+//! verdict. Where a kind is visible is known exactly: the original is rendered once more with colors that encode the
+//! kinds, which gives for every pixel the share w of each kind.
 //!
 //! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
 //! Memory: per thread one more render, and the original's state without its colors.
@@ -16,112 +16,123 @@ use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{AttributeValues, Camera, Gaussians, SH_C0};
 use crate::render::{Image, render};
 
-/// PSNR below which an error is visible, dB: one part in a hundred, root mean square.
+/// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
+/// colors.
 pub const VISIBLE_DB: f64 = 40.0;
-/// Least distance to the PSNR elsewhere for a flag, dB: 3 dB are twice the squared error.
+/// Minimum difference in dB between the PSNR where a kind of Gaussian is visible and the PSNR elsewhere for a failure
+/// mode to be flagged: 3 dB lower is twice the squared error.
 pub const APART_DB: f64 = 3.0;
-/// Least share of the pixels for a kind to be judged.
+/// Minimum fraction of the pixels that a kind of Gaussian must cover in a render to be judged there.
 pub const SHOWN: f64 = 1e-3;
-/// Least share of a kind's coverage that was dropped or merged for a flag.
+/// Minimum fraction of a kind's contribution to renders that must have been dropped or merged for its failure mode to
+/// be flagged.
 pub const LOST: f64 = 0.01;
-/// Side of the square of the worst place, pixels.
+/// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP: u32 = 64;
 
-/// Error sums of one render, in f64 over pixels.
+/// Sums over the pixels of one view of the error between both models' renders, in total and for each kind of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observed {
-    /// Sums by kind, in the order of [`GaussianKind::ALL`].
+    /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
     kinds: [FailureSums; 3],
-    /// Σ e², e² the mean over channels of the squared difference.
+    /// Sum over pixels of e², the squared difference of the two renders, averaged over channels.
     error: f64,
     pixels: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct FailureSums {
-    /// Σ w.
+    /// Sum over pixels of w, the share of this kind of Gaussian in the pixel.
     weight: f64,
-    /// Σ w e².
+    /// Sum over pixels of w e²: the share of the kind times the squared difference of the renders.
     error: f64,
-    /// Σ w ∇c·∇o and Σ w ∇o·∇o; c and o are the brightness of the compressed and the original render.
+    /// Sums over pixels of w ∇c·∇o, and (`detail`) of w ∇o·∇o. w is the share of the kind, c and o are the brightness
+    /// of the compressed and the original render.
     kept_detail: f64,
     detail: f64,
 }
 
-/// Result of the search for one failure mode.
+/// Result of the check for one failure mode, that is, for one kind of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// The scene has no Gaussian of the kind.
+    /// The scene has no Gaussian of this kind.
     Absent,
-    /// The scene has such Gaussians, but their share of every render is too small to be judged.
+    /// The scene has Gaussians of this kind, but their share of every render is too small to be judged.
     Unseen,
-    /// No Gaussian of the kind was dropped or merged, or almost none.
+    /// No Gaussian of this kind was dropped or merged, or almost none.
     Untouched,
-    /// The error there is not visible, or not larger than elsewhere.
+    /// Where this kind is visible, the error is not visible or not much larger than elsewhere.
     Passed,
-    /// The error there is visible and much larger than elsewhere.
+    /// Where this kind is visible, the error is visible and much larger than elsewhere.
     Flagged,
 }
 
 /// Render in which a failure mode is worst.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WorstPlace {
-    /// Index into the evaluation's renders.
+    /// Index of the render in [`crate::evaluation::found::Evaluation::pictures`].
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
     pub frame: usize,
     /// View number.
     pub view: u32,
-    /// PSNR of this render where the kind is visible, dB.
+    /// PSNR of this render where the kind of Gaussian is visible, dB.
     pub psnr: f64,
 }
 
-/// Figures and verdict of one failure mode.
+/// Measurements and verdict of one failure mode: damage to one kind of Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FailureMode {
-    /// Name of the mode.
+    /// Name of the failure mode.
     pub name: &'static str,
-    /// Description of the Gaussians of this kind.
+    /// Description of the kind of Gaussian that the failure mode concerns.
     pub happens_to: String,
-    /// Verdict.
+    /// Verdict on the failure mode.
     pub verdict: Verdict,
     /// Number of Gaussians of this kind in the original.
     pub gaussians: usize,
-    /// Number of them that were dropped; `None` without an index map.
+    /// Number of Gaussians of this kind that were dropped; `None` without an index map (file that maps input to output
+    /// Gaussians).
     pub dropped: Option<usize>,
-    /// Number of them that were merged; `None` without an index map.
+    /// Number of Gaussians of this kind that were merged; `None` without an index map (file that maps input to output
+    /// Gaussians).
     pub merged: Option<usize>,
-    /// Share of the scene's coverage.
+    /// Contribution of this kind to renders, as a fraction of that of all Gaussians.
     pub coverage: f64,
-    /// Share of their coverage that was dropped or merged; `None` without an index map.
+    /// Fraction of the contribution of this kind that was dropped or merged; `None` without an index map (file that
+    /// maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
-    /// Share of all pixels.
+    /// Share of this kind in all pixels of all compared renders, from 0 to 1.
     pub shown: f64,
-    /// PSNR where the kind is visible, weighted by its shares, dB; `None` where it is nowhere.
+    /// PSNR where the kind is visible, with each pixel weighted by the share of the kind, dB; `None` if the kind is
+    /// nowhere visible.
     pub psnr_there: Option<f64>,
-    /// PSNR elsewhere, dB.
+    /// PSNR where the kind is not visible, with each pixel weighted by the share of all others, dB.
     pub psnr_elsewhere: Option<f64>,
-    /// Share of the original's brightness gradients that the compressed renders do not follow; negative where they
-    /// exaggerate.
+    /// Fraction of the original's brightness gradients that the compressed renders lose where the kind is visible;
+    /// negative if they are exaggerated.
     pub detail_lost: Option<f64>,
-    /// Render in which the mode is worst.
+    /// Render in which the failure mode is worst; `None` if the kind cannot be judged in any render.
     pub worst: Option<WorstPlace>,
 }
 
-/// Counts of the Gaussians of a kind, known before rendering.
+/// Counts and contribution of the Gaussians of one kind, known before rendering.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KindMembers {
-    /// Number of Gaussians.
+    /// Number of Gaussians of this kind.
     pub count: usize,
-    /// Numbers of dropped and merged ones, where known.
+    /// Numbers of Gaussians of this kind that were dropped and merged; `None` without an index map (file that maps
+    /// input to output Gaussians).
     pub fates: Option<(usize, usize)>,
-    /// Share of the scene's coverage, and the share of that coverage that was dropped or merged.
+    /// Contribution of this kind to renders as a fraction of that of all Gaussians, and the fraction of it that was
+    /// dropped or merged.
     pub shares: (f64, f64),
 }
 
-/// Renders the share of each kind in every pixel, as red, green and blue.
+/// Renders the Gaussians `state` with colors that encode their kinds (`traits`): red, green and blue of a pixel are the
+/// shares of the three kinds in it.
 pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
@@ -138,10 +149,11 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -
     render(&marked, camera, [0.0; 3])
 }
 
-/// Sums the error of one render by kind.
+/// Returns the sums of the error between the two renders `taken` of one view, for each kind of Gaussian. `state` holds
+/// the original's Gaussians, `traits` their kinds.
 ///
 /// # Panics
-/// If the sizes differ.
+/// Panics if the sizes of the two renders and of the camera's images differ.
 pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &RenderedViews) -> Observed {
     let shares = shares_of_pixels(state, traits, camera);
     let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
@@ -168,7 +180,8 @@ pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Re
     found
 }
 
-/// Returns per pixel the mean over channels of the squared difference of values clamped to [0, 1].
+/// Returns for each pixel the squared difference of `a` and `b`, averaged over the channels; values are first clamped
+/// to [0, 1].
 pub fn squared_error(a: &Image, b: &Image) -> Vec<f64> {
     let square = |(a, b): (&f32, &f32)| (clamped(*a) - clamped(*b)).powi(2);
     let pixels = a.data.chunks_exact(3).zip(b.data.chunks_exact(3));
@@ -179,7 +192,8 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges one kind by the error sums `seen` of all renders, whose (frame, view) are `names`.
+/// Judges the failure mode of one kind of Gaussian. `seen` holds the error sums of all renders, `names` their (frame,
+/// view).
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
@@ -228,7 +242,7 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names:
     }
 }
 
-/// Returns the name of a kind's failure mode and the description of its Gaussians.
+/// Returns the name of the failure mode of a kind of Gaussian, and a description of the Gaussians of this kind.
 fn described(kind: GaussianKind) -> (&'static str, String) {
     use super::traits::{COLOR_CHANGE, FAST, NEIGHBORS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
     match kind {
@@ -255,13 +269,15 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
     }
 }
 
-/// Returns the PSNR of a weighted sum of squared errors, dB; `None` without weight.
+/// Returns the PSNR in dB for a weighted sum of squared errors and the sum of the weights; `None` if the weights sum to
+/// 0.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the corner of the square of [`CROP`] pixels, or less in a smaller render, with the largest error of a kind,
-/// Σ w e². Of equal squares the first by rows wins.
+/// Returns the upper left corner of the square with the largest error of one kind of Gaussian: the sum of w e² over its
+/// pixels, where w is the share of the kind and e² the squared difference of the renders. The square has a side of
+/// [`CROP`] pixels, or less in a smaller render. In a tie, the first square by rows is taken.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP as usize).min(width), (CROP as usize).min(height));
@@ -290,7 +306,8 @@ pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -
     best.1
 }
 
-/// Returns the part of a render from `corner`, [`CROP`] pixels each way or up to the border.
+/// Returns the part of `image` whose upper left pixel is (`left`, `top`), with [`CROP`] pixels along each side or fewer
+/// at the border.
 pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     let (width, height) = (CROP.min(image.width - left), CROP.min(image.height - top));
     let row = |y: u32| {
@@ -300,7 +317,7 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     Image { width, height, data: (top..top + height).flat_map(row).copied().collect() }
 }
 
-/// Returns the PSNR of the part that [`crop`] returns, dB.
+/// Returns the PSNR in dB, compressed against original, of the part of the renders that [`crop`] returns for `corner`.
 pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
     psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
 }

@@ -1,10 +1,11 @@
-//! The failure modes on the page.
+//! Section of the report page about the failure modes.
 
 use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
 use super::findings::Close;
 use super::html::{count, db, escape, figure, percent};
 
-/// Returns a card for each failure mode, with its figures and the part of a render where it is worst.
+/// Returns the HTML of a card for each failure mode, with its measurements and the part of a render in which it is
+/// worst.
 pub(super) fn modes(modes: &[FailureMode], close: &[Close]) -> String {
     let mut out = format!(
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \
@@ -44,7 +45,7 @@ pub(super) fn modes(modes: &[FailureMode], close: &[Close]) -> String {
     out + "</div>\n"
 }
 
-/// Returns the known figures of a mode with their names.
+/// Returns the known measurements of a failure mode as text, each with its name.
 fn rows(mode: &FailureMode) -> Vec<(&'static str, String)> {
     let of = |part: Option<usize>| part.map(|n| format!("{} ({})", count(n), percent(n as f64, mode.gaussians as f64)));
     let mut rows = vec![("Gaussians", Some(count(mode.gaussians)))];

@@ -1,8 +1,8 @@
 //! Animations of the page: one or two views over time, before and after, with the difference.
 //!
-//! In: the chosen renders, and both models. Out: JPEG files as data URIs. A page holds at most [`VIEWS`] animations of
-//! at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference: about 3 MB
-//! per result.
+//! Input: the chosen renders, and both models. Output: JPEG files as data URIs. A page holds at most [`VIEWS`]
+//! animations of at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference:
+//! about 3 MB per result.
 
 use std::io;
 
@@ -22,55 +22,56 @@ use crate::scene::pictures::thin;
 
 /// Maximum number of animated views: the view of the worst render, and of the median one if it is another.
 pub const VIEWS: usize = 2;
-/// Maximum number of frames of an animation, evenly from first to last.
+/// Maximum number of frames of an animation, evenly spaced from first to last.
 pub const FRAMES: usize = 24;
-/// Maximum number of pixels of an image; larger renders are shown smaller.
+/// Maximum number of pixels of an image in an animation; larger renders are scaled down.
 pub const MAX_PIXELS: u64 = 90_000;
-/// Maximum number of pixels of a difference, whose noise takes most bytes.
+/// Maximum number of pixels of a difference image in an animation. It is smaller because noise takes most bytes.
 pub const MAX_PIXELS_OF_DIFFERENCE: u64 = 30_000;
-/// JPEG quality, of 100.
+/// JPEG quality of the images of animations, from 1 to 100.
 pub const QUALITY: u8 = 80;
 
-/// An animation of the page.
+/// Animation of one view on the report page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FilmPanel {
-    /// Reasons for the choice of its view: "worst render", ...
+    /// Reasons for the choice of this view, such as "worst render".
     pub why: Vec<String>,
     /// View number.
     pub view: u32,
-    /// Frame whose camera is used, for views with a moving camera.
+    /// Frame whose camera is used for all frames, if the camera of the view moves.
     pub camera_of_frame: usize,
-    /// Frames of the sequence, in order.
+    /// Numbers of the frames that the animation shows, in order.
     pub frames: Vec<usize>,
-    /// PSNR of compressed against original at each frame, in full size, dB.
+    /// PSNR of the full-size render, compressed against original, at each shown frame, dB.
     pub psnr: Vec<f64>,
-    /// Data URIs of original, compressed and difference of every frame.
+    /// Data URIs of the original, the compressed and the difference image of each shown frame.
     #[serde(skip)]
     pub images: Vec<[String; 3]>,
-    /// Pixels across and down, as shown.
+    /// Width and height of the shown images, pixels.
     #[serde(skip)]
     pub size: (u32, u32),
-    /// Pixels of the render, each way, that one shown pixel stands for.
+    /// Number of pixels of the render, along each axis, that one shown pixel stands for.
     #[serde(skip)]
     pub shrunk: u32,
-    /// Factor by which the difference was made brighter.
+    /// Factor by which the difference images are brightened.
     #[serde(skip)]
     pub factor: u32,
 }
 
-/// Names of the images of a frame, in order.
+/// Names of the three images of each frame, in the order of [`FilmPanel::images`].
 pub const KINDS: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Returns the bytes of memory of the animations and of the page with them: about one byte per pixel.
+/// Returns the bytes of memory of the animations and of the page that contains them, estimated at one byte per pixel
+/// each.
 pub fn bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)
 }
 
-/// Makes the animations of the views of `shown`; none for a scene of one frame.
+/// Renders the animations of the views of the worst and the median render in `shown`; none for a scene of one frame.
 ///
 /// # Errors
-/// A source that cannot be read.
+/// Fails if a frame cannot be read.
 pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let every = side.scene.source().info().times.len();
     let mut films: Vec<FilmPanel> = Vec::new();
@@ -110,7 +111,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     Ok(films)
 }
 
-/// Returns an image as a JPEG inside a data URI.
+/// Returns `image` as a data URI that contains a JPEG file.
 fn data_uri(image: &Image) -> Result<String> {
     let bytes = jpeg_bytes(image, QUALITY)
         .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;

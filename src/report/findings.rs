@@ -1,4 +1,4 @@
-//! Data of a report.
+//! Data of a report, as written to `report.json`.
 
 use serde::Serialize;
 
@@ -11,65 +11,66 @@ use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::RenderTime;
 
-/// Content of `report.json`. The first result's values stand at the top level.
+/// Content of `report.json`. The fields of the first compressed model's data are at the top level.
 #[derive(Debug, Serialize)]
 pub struct ReportData {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
-    /// The first result.
+    /// Data of the first compressed model.
     #[serde(flatten)]
     pub result: ResultData,
     /// Renders that the page shows.
     pub shown: Vec<Choice>,
     /// Animations that the page shows.
     pub films: Vec<FilmPanel>,
-    /// Sweep over the original.
+    /// Result of the command `sweep` for the original, if one was given.
     pub trade_off: Option<TradeOff>,
-    /// Work-precision diagrams of the original.
+    /// Result of the command `precision` for the original, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub precision: Option<PrecisionDiagram>,
-    /// Further results, in the order of the command line.
+    /// Data of the further compressed models, in the order of the command line.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub others: Vec<ResultData>,
 }
 
-/// Data of one result.
+/// Data of one compressed model in a report.
 #[derive(Debug, Serialize)]
 pub struct ResultData {
-    /// The verdict: two or three sentences.
+    /// Verdict in two or three sentences: size, visibility of the loss, and failure modes.
     pub verdict: String,
-    /// Means overall, by view and by frame.
+    /// Comparison with the original: mean scores overall, by view and by frame.
     pub evaluation: Evaluation,
-    /// Scores of every render.
+    /// Scores of every compared render.
     pub pictures: Vec<PictureScores>,
-    /// Time of a render before and after, where it was measured.
+    /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
     /// For each kind of Gaussian (fast, thin, …), in the order of [`super::traits::GaussianKind::ALL`], whether the loss shows
     /// where Gaussians of this kind are visible.
     pub failure_modes: Vec<FailureMode>,
-    /// Histograms of the scores by fate; `None` without an index map.
+    /// Histograms of the scores of kept, merged and dropped Gaussians; `None` without an index map (file that maps
+    /// input to output Gaussians).
     pub histograms: Option<Vec<Histogram>>,
-    /// Content of the run's `summary.json`.
+    /// Content of the file `summary.json` of the run that wrote the compressed model, if it was found.
     pub run: Option<serde_json::Value>,
-    /// Files that were not found beside the result, with the reason.
+    /// Names of the files that were not found beside the compressed model, with the reasons.
     pub missing: Vec<String>,
-    /// Notes for a person.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// Notes of the cache, which are no part of the result.
+    /// Notes about the cache folder, which are not part of the result.
     #[serde(skip)]
     pub work_notes: Vec<String>,
 }
 
-/// Part of a render of both models where a failure mode is worst.
+/// Images of the place where a failure mode is worst: a square part of a render of both models.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Close {
-    /// Index into the failure modes.
+    /// Index of the failure mode in [`ResultData::failure_modes`].
     pub(super) mode: usize,
-    /// Upper left pixel of the part.
+    /// Upper left pixel of the part in the render.
     pub(super) corner: (u32, u32),
-    /// PSNR inside, dB.
+    /// PSNR of the part, compressed against original, dB.
     pub(super) psnr: f64,
-    /// Data URIs: original, compressed.
+    /// Data URIs of the part: original, compressed.
     pub(super) images: [String; 2],
 }

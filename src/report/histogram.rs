@@ -1,8 +1,8 @@
 //! Histograms of the scores of kept, merged and dropped Gaussians.
 //!
-//! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins have equal ratios over the positive
-//! values, because scores span many powers of ten; bins of shares of the frames have equal width from 0 to 1. Zeros are
-//! counted separately.
+//! Input: one value per Gaussian, and its fate (kept, merged or dropped). Output: counts per bin and fate. Bins have
+//! equal ratios over the positive values, because scores span many powers of ten; bins of fractions of frames have
+//! equal width from 0 to 1. Zeros are counted separately.
 
 use std::borrow::Cow;
 
@@ -15,22 +15,23 @@ use crate::statistics::score::{Quantity, Scores};
 
 /// Maximum number of bins of a histogram.
 const BINS: usize = 40;
-/// Smallest value with its own bin, as a share of the largest value.
+/// Lower edge of the first bin, as a fraction of the largest value; smaller positive values are counted in the first
+/// bin.
 const DEEPEST: f64 = 1e-8;
 
-/// Counts by fate.
+/// One value for each fate of Gaussians: kept, merged, dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ByFate<T> {
-    /// Value for Gaussians that survive as they were.
+    /// Value for Gaussians that remain unchanged.
     pub kept: T,
-    /// Value for Gaussians merged into a proxy.
+    /// Value for Gaussians that were merged into a proxy (Gaussian that replaces a cluster).
     pub merged: T,
-    /// Value for removed Gaussians.
+    /// Value for Gaussians that were removed.
     pub dropped: T,
 }
 
 impl<T> ByFate<T> {
-    /// Returns the value of a fate.
+    /// Returns a mutable reference to the value for `fate`.
     pub fn get_mut(&mut self, fate: Fate) -> &mut T {
         match fate {
             Fate::Kept => &mut self.kept,
@@ -43,22 +44,23 @@ impl<T> ByFate<T> {
 /// Histogram of one score over all Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Histogram {
-    /// Name of the score.
+    /// Name of the score or statistic.
     pub name: &'static str,
-    /// Meaning of the score, with the unit.
+    /// Meaning of the score or statistic, with its unit.
     pub meaning: &'static str,
-    /// Whether bins have equal ratios; otherwise they have equal width from 0 to 1.
+    /// Whether all bins have the same ratio of upper to lower edge; otherwise they have equal width from 0 to 1.
     pub log: bool,
-    /// Edges of the bins, increasing, one more than bins; empty if no value is positive.
+    /// Edges of the bins in increasing order, one more than bins; empty if no value is positive.
     pub edges: Vec<f64>,
-    /// Counts per bin. A bin includes its lower edge, the last bin both edges; the first bin also holds smaller
-    /// positive values.
+    /// Counts of Gaussians per bin and fate. A bin includes its lower edge, the last bin both edges; the first bin also
+    /// holds smaller positive values.
     pub bins: ByFate<Vec<usize>>,
-    /// Counts of values of 0 or below, or not finite.
+    /// Counts, by fate, of values that are not positive or not finite.
     pub zero: ByFate<usize>,
 }
 
-/// Returns the histograms of every score and statistic.
+/// Returns the histograms of every score and statistic, divided by the fate of the Gaussians. `frames` is the number of
+/// frames.
 pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
@@ -85,14 +87,14 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
         .collect()
 }
 
-/// Returns edges from 0 to 1 for shares of `frames` frames. No bin is narrower than one frame.
+/// Returns edges of bins from 0 to 1 for fractions of `frames` frames. No bin is narrower than one frame.
 fn even(frames: usize) -> Vec<f64> {
     let bins = frames.clamp(1, BINS);
     (0..=bins).map(|k| k as f64 / bins as f64).collect()
 }
 
 impl Histogram {
-    /// Counts `values`, one per fate, in bins of equal ratios.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in bins whose edges have equal ratios.
     fn from_values(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
@@ -117,7 +119,7 @@ impl Histogram {
         Histogram { log: true, ..Histogram::within(name, meaning, edges, values, fates) }
     }
 
-    /// Counts `values`, one per fate, between `edges`.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in the bins between `edges`.
     fn within(name: &'static str, meaning: &'static str, edges: Vec<f64>, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let bins = edges.len().saturating_sub(1);
@@ -143,7 +145,8 @@ impl Histogram {
     }
 }
 
-/// Returns one line per bin, and one for the zeros of each score.
+/// Returns a CSV table of all histograms: one line per bin, and one line per score for the values that are not
+/// positive.
 pub fn csv(histograms: &[Histogram]) -> String {
     let mut rows = Vec::new();
     for Histogram { name, edges, bins, zero, .. } in histograms {

@@ -1,9 +1,9 @@
-//! Text and numbers in the form that a page shows.
+//! Formatting of text and numbers for HTML pages.
 
 use crate::error::printable;
 
-/// Escapes characters that could end a text or a quoted attribute. Shows unprintable characters, among them marks of
-/// direction, by their codes.
+/// Escapes characters that could end an HTML text or a quoted attribute. Replaces unprintable characters, such as marks
+/// of text direction, by their codes.
 pub(super) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for letter in printable(text).chars() {
@@ -19,18 +19,18 @@ pub(super) fn escape(text: &str) -> String {
     out
 }
 
-/// Returns the last name of a path.
+/// Returns the last component of a path.
 pub(super) fn file_name(path: &str) -> &str {
     let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
     if name.is_empty() { path } else { name }
 }
 
-/// Returns decibels with two decimals.
+/// Formats a value in decibels with two decimals, such as "40.00 dB".
 pub(super) fn db(value: f64) -> String {
     format!("{value:.2} dB")
 }
 
-/// Returns a number in at most four significant digits, without needless zeros: for ticks and bars.
+/// Formats a number with at most four significant digits and without trailing zeros, for ticks and bars.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();
     if value == 0.0 || !value.is_finite() {
@@ -47,7 +47,7 @@ pub(super) fn figure(value: f64) -> String {
     }
 }
 
-/// Returns a whole number with its thousands apart.
+/// Formats a whole number with separators between groups of three digits.
 pub(super) fn count(value: usize) -> String {
     let digits = value.to_string();
     let mut out = String::new();
@@ -60,7 +60,7 @@ pub(super) fn count(value: usize) -> String {
     out
 }
 
-/// Returns bytes in kB, MB or GB.
+/// Formats a number of bytes in kB, MB or GB.
 pub(super) fn bytes(value: u64) -> String {
     let value = value as f64;
     match value {
@@ -71,7 +71,7 @@ pub(super) fn bytes(value: u64) -> String {
     }
 }
 
-/// Returns `part` of `whole` in percent; 100% where `whole` is 0. A share below 0.1% is not rounded to 0.
+/// Formats `part` as a percentage of `whole`; 100% if `whole` is 0. A percentage below 0.1% is not rounded to 0.
 pub(super) fn percent(part: f64, whole: f64) -> String {
     let share = if whole > 0.0 { 100.0 * part / whole } else { 100.0 };
     match share {

@@ -1,7 +1,7 @@
 //! Report: one page that shows what compression did to a model, with the data behind it.
 //!
-//! Data in: the original, one or more compressed models, their cameras, and the files that `compress` left beside its
-//! results. Data out: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
+//! Input: the original, one or more compressed models, their cameras, and the files that `compress` left beside its
+//! results. Output: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
 //! The steps are `run` (files of `compress`), `traits` (Gaussians at risk), the evaluation observed by `failure`,
 //! `histogram`, `shown` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`, `details`.
 //!
@@ -59,40 +59,41 @@ use run::{Fate, RunFiles};
 use shown::{Choice, ShownImage, choices, scores_at, show};
 use traits::{GaussianKind, Traits, shares, traits};
 
-/// File name of the page.
+/// File name of the report page.
 pub const PAGE: &str = "report.html";
 
-/// Options of [`report`].
+/// Options of the command `report`.
 #[derive(Debug, Clone)]
 pub struct ReportOptions {
-    /// The original, the first result, and the renders to compare; its files to write are ignored.
+    /// Original, first compressed model, and views to compare. The CSV file named in these options is not written.
     pub evaluate: EvaluateOptions,
-    /// Further results of the same original.
+    /// Paths of further compressed models of the same original.
     pub more: Vec<PathBuf>,
-    /// Data of a sweep, written by `sweep`.
+    /// Path of a file `sweep.json` that the command `sweep` wrote, to include its curves.
     pub sweep: Option<PathBuf>,
-    /// Data of work-precision diagrams, written by `precision`.
+    /// Path of a file `precision.json` that the command `precision` wrote, to include its plots.
     pub precision: Option<PathBuf>,
-    /// Whether to measure the time of a render. Measured times differ from run to run.
+    /// Whether to measure the time for rendering a view of each model. Measured times differ between runs.
     pub render_time: bool,
-    /// Folder to write.
+    /// Path of the output folder.
     pub output: PathBuf,
     /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// Compares one or more results with their original and writes the report.
+/// Compares one or more compressed models with their original and writes the report.
 ///
 /// # Errors
-/// Invalid inputs, cameras, photographs, sweep or output. Nothing is written then.
+/// Fails if an input, the cameras, the photographs, the sweep or the output is invalid. Nothing is written then.
 pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
     Completion::from_result(report_whole(options))
 }
 
-/// Writes the report of a whole run, without shards.
+/// Runs [`report`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
+/// error [`Error::ShardDone`].
 ///
 /// # Errors
-/// Those of [`report`].
+/// Fails as [`report`] does.
 pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let mut inputs = options.evaluate.inputs();
     inputs.extend(options.more.iter().map(PathBuf::as_path));
@@ -129,7 +130,8 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     Ok(report)
 }
 
-/// Compares the result of `options` with the original. Shows the renders of `wanted`; `None`: chooses them.
+/// Compares the compressed model that `options` name with the original. The page will show the renders `wanted`; with
+/// `None` they are chosen here.
 fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
@@ -197,10 +199,10 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bo
     Ok(Analysis { data, run, shown, films, close })
 }
 
-/// Maximum number of bytes of data that another command wrote. A thousand runs take less than one million.
+/// Maximum size in bytes of a file that `sweep` or `precision` wrote. A thousand runs take less than one million bytes.
 const MAX_FOUND: u64 = 16 << 20;
 
-/// Reads the data that the command `command` wrote.
+/// Reads the JSON file at `path`, which the command `command` wrote.
 fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
     let text = read_text(path, MAX_FOUND)?;
     serde_json::from_str(&text).map_err(|error| {
@@ -210,7 +212,7 @@ fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
     })
 }
 
-/// Returns a note if the summary beside the result belongs to another original.
+/// Returns a note if the summary beside the compressed model belongs to another original; otherwise none.
 fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     let Some((summary, _)) = &run.summary else { return Ok(Vec::new()) };
     let digest = scene.input.digest()?;
@@ -223,8 +225,8 @@ fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     })
 }
 
-/// Returns the recipe beside the result, else the default one. Values that are not finite are kept, so that they do
-/// not stop the report.
+/// Returns the recipe found beside the compressed model, else the default one, changed so that Gaussians with NaN or
+/// infinite values are kept and do not stop the report.
 fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     let mut recipe = match &run.recipe {
         Some(recipe) => recipe.clone(),
@@ -234,8 +236,8 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views that the run scored with: the split with as many views as its summary says, else the training
-/// views, else all.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians: the split with as many views as
+/// the run's summary states; if there is none, the training views, else all views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -253,8 +255,8 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     first.map_or_else(|| scene.rig.schedule(times, None), Ok)
 }
 
-/// Returns a note if the percentiles of a term differ from those of the run: the scores shown are then not the scores
-/// that decided.
+/// Returns a note if the percentiles of a term of the score differ from those of the run that wrote the compressed
+/// model. The scores in the report are then not those by which Gaussians were removed.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
@@ -271,7 +273,8 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Counts the Gaussians of each kind by fate.
+/// Returns for each kind of Gaussian its number, the numbers of dropped and merged ones, and its contribution. `fates`
+/// is `None` without an index map (file that maps input to output Gaussians).
 fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -285,7 +288,8 @@ fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembe
     })
 }
 
-/// Renders the chosen views again, and the worst part of each failure mode's worst view.
+/// Renders the chosen views again, and for each failure mode the part of a render in which it is worst. Returns the
+/// images of both.
 fn show_again(
     side: &ModelPair,
     choices: &[Choice],
@@ -314,7 +318,7 @@ fn show_again(
     Ok((shown, close))
 }
 
-/// Writes the page and its data.
+/// Writes the report page and its data files to the output folder.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");

@@ -1,4 +1,4 @@
-//! The page of a report: its sections in order.
+//! Content of the report page: its sections in order.
 
 use super::analysis::Analysis;
 use super::document::document;
@@ -7,12 +7,12 @@ use super::{cards, compare, details, quality};
 use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 
-/// Script of the sliders.
+/// JavaScript of the sliders.
 const SLIDER: &str = include_str!("slider.js");
-/// Script of the animations.
+/// JavaScript of the animations.
 const FILM: &str = include_str!("film.js");
 
-/// Returns the page of one or more results of one original.
+/// Returns the HTML of the report page for one or more compressed models of one original.
 pub(super) fn page(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
     let names = names(results);
     let title = format!("{} – splatsieve report", names.join(", "));
@@ -31,7 +31,7 @@ pub(super) fn page(results: &[Analysis], sweep: Option<&TradeOff>, precision: Op
     document(&title, &out, &[SLIDER, FILM])
 }
 
-/// Returns a short name of every result, all different.
+/// Returns a short name for each compressed model; all names are different.
 fn names(results: &[Analysis]) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     for result in results {

@@ -1,7 +1,7 @@
 //! Work-precision diagrams as a page: error against time and memory, a curve for every parameter, a mark for every
 //! value.
 //!
-//! Data in: a [`PrecisionDiagram`]. Data out: charts as SVG, and a page with charts.
+//! Input: a [`PrecisionDiagram`]. Output: charts as SVG, and a page with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
@@ -11,20 +11,20 @@ use crate::evaluation::precision::{
     ADDED, KEPT, PICTURES, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, STAYING, meaning,
 };
 
-/// File name of the page in the folder of its data.
+/// File name of the page that the command `precision` writes.
 pub const PAGE: &str = "precision.html";
 
-/// Measure of work: its name, and the function that returns it.
+/// Measure of work (time or memory): its name, and the function that returns its value.
 type WorkMeasure = (&'static str, fn(&PrecisionSetting) -> Option<f64>);
 
-/// Measures along the horizontal axis.
+/// Measures of work along the horizontal axes of the charts.
 const WORK: [WorkMeasure; 3] = [
     ("time of all processors, s", |mark| mark.cost.processor_seconds.map(|seconds| seconds.median)),
     ("wall time, s", |mark| Some(mark.cost.seconds.median)),
     ("peak memory, MiB", |mark| mark.cost.peak_memory_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20))),
 ];
 
-/// Returns the page.
+/// Returns the HTML of the page that the command `precision` writes.
 pub fn page(found: &PrecisionDiagram) -> String {
     let title = format!("{} – error against run time", file_name(&found.path));
     let mut body = format!(
@@ -48,7 +48,7 @@ pub fn page(found: &PrecisionDiagram) -> String {
     document(&title, &body, &[])
 }
 
-/// Returns the diagrams as a section of a report.
+/// Returns the diagrams as an HTML section of a report.
 pub(super) fn section(found: &PrecisionDiagram) -> String {
     let knob = |knob: &PrecisionKnob| {
         format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
@@ -56,7 +56,7 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
-/// Returns the conditions of the measurement, and the notes.
+/// Returns the HTML of the conditions of the measurement and the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
@@ -75,7 +75,7 @@ fn conditions(found: &PrecisionDiagram) -> String {
     said + &list(&found.notes)
 }
 
-/// Returns the charts and tables of one parameter.
+/// Returns the HTML of the charts and tables of one knob (group of varied parameters).
 fn turned(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
@@ -88,8 +88,8 @@ fn turned(knob: &PrecisionKnob) -> String {
     out
 }
 
-/// Returns the charts of one parameter: its errors against the time of all processors, and the first error also against
-/// wall time and memory. An error that is always 0 has no chart.
+/// Returns the charts of one knob (group of varied parameters): each error against the time of all processors, and the
+/// first error also against wall time and memory. An error that is always 0 has no chart.
 pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     let mut errors: Vec<&String> =
         knob.curves.iter().flat_map(|curve| &curve.marks).flat_map(|m| m.errors.keys()).collect();
@@ -106,7 +106,7 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of an error against work, both on logarithmic axes.
+/// Returns the chart of the error called `error` against a measure of work, both on logarithmic axes.
 fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
@@ -125,13 +125,14 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     (title, plot.svg())
 }
 
-/// Returns the label of a mark: its value, with a star if it is the recipe's.
+/// Returns the label of a measurement in a chart: the value of the parameter, with a star if it is the value in the
+/// recipe.
 fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
     let own = if curve.own == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))
 }
 
-/// Returns a table of all marks with all their numbers.
+/// Returns an HTML table of all measurements of a curve.
 fn table(curve: &PrecisionCurve) -> String {
     let mut errors: Vec<&String> = curve.marks.iter().flat_map(|mark| mark.errors.keys()).collect();
     errors.sort_unstable();

@@ -1,15 +1,15 @@
-//! Charts of quality by frame and by view. Their axes cover the values, so that differences show; a chart without
-//! differences to show is left out.
+//! Charts of quality by frame and by view. Their axes cover only the range of the values, so that differences are
+//! visible; a chart without differences is left out.
 
 use super::analysis::Analysis;
 use super::chart::{Bars, ChartAxis, Plot, Series};
 use super::document::figure_of;
 use crate::evaluation::found::{Comparison, FrameMeans, QualityMeans, ViewMeans};
 
-/// Maximum number of views in a chart, the worst ones.
+/// Maximum number of views in a chart; of more views, the worst are shown.
 const MOST_VIEWS: usize = 16;
 
-/// Returns the charts of PSNR by frame and by view; empty where there is one frame and one view only.
+/// Returns the HTML of the charts of PSNR by frame and by view; empty for a single view of a single frame.
 pub(super) fn charts(results: &[Analysis], names: &[String]) -> String {
     let mut charts = by_frame(results, names, "PSNR", "PSNR, dB", &|means| Some(means.psnr));
     for (result, name) in results.iter().zip(names) {
@@ -19,7 +19,7 @@ pub(super) fn charts(results: &[Analysis], names: &[String]) -> String {
     wrapped(charts)
 }
 
-/// Returns the charts of the other measures by frame.
+/// Returns the HTML of the charts by frame of the quality measures other than PSNR.
 pub(super) fn other_charts(results: &[Analysis], names: &[String]) -> String {
     let mut charts = by_frame(results, names, "SSIM", "SSIM", &|means| Some(means.ssim));
     charts += &by_frame(results, names, "Temporal error", "error", &|means| means.temporal);
@@ -31,7 +31,7 @@ fn wrapped(charts: String) -> String {
     if charts.is_empty() { charts } else { format!("<div class=\"charts\">\n{charts}</div>\n") }
 }
 
-/// Returns a chart of one measure over the frames; empty for fewer than two frames.
+/// Returns the HTML of a chart of one quality measure over the frames; empty for fewer than two frames.
 fn by_frame(
     results: &[Analysis],
     names: &[String],
@@ -71,7 +71,7 @@ fn by_frame(
     figure_of(&title, &plot.svg())
 }
 
-/// Returns a chart of the PSNR of each view, the worst first; empty for a single view.
+/// Returns the HTML of a chart of the PSNR of each view, worst first; empty for a single view.
 fn by_view(of: &Comparison, title: &str) -> String {
     let bar = |view: &ViewMeans| (format!("view {}", view.view), view.means.psnr);
     let mut bars: Vec<(String, f64)> = of.per_view.iter().map(bar).collect();

@@ -1,7 +1,7 @@
 //! Reads the files that `compress` writes beside its result: the summary, the recipe, the index map.
 //!
-//! In: the path of the result. Out: the files that exist and belong to the two compared models; for every other file the
-//! reason why it is not used, which the report page shows. Memory: 8 bytes per Gaussian.
+//! Input: the path of the result. Output: the files that exist and belong to the two compared models; for every other
+//! file the reason why it is not used, which the report page shows. Memory: 8 bytes per Gaussian.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -18,32 +18,33 @@ use crate::pipeline::stages::write::{INDEX_MAP, RECIPE, beside};
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 
-/// Fate of a Gaussian of the original.
+/// Result of compression for one Gaussian of the original.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// Survives as it was.
+    /// The Gaussian remains, unmerged.
     Kept,
-    /// Merged with others into a proxy.
+    /// The Gaussian was merged with others into a proxy (one Gaussian that replaces them).
     Merged,
-    /// Removed.
+    /// The Gaussian was removed.
     Dropped,
 }
 
-/// Files found beside a result.
+/// Files of `compress` that were found beside a compressed model and belong to it.
 #[derive(Debug, Default)]
 pub struct RunFiles {
-    /// The summary, and the whole content of its file.
+    /// Parsed summary of the run, and the whole JSON content of its file.
     pub summary: Option<(Summary, Value)>,
-    /// The recipe.
+    /// Recipe (parameters) of the run.
     pub recipe: Option<Recipe>,
-    /// Fate of every Gaussian of the original.
+    /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map.
     pub fates: Option<Vec<Fate>>,
-    /// Reason for each missing file.
+    /// For each file that was not used, its name and the reason.
     pub missing: Vec<String>,
 }
 
 impl RunFiles {
-    /// Reads the files beside `result`, which has `compressed` Gaussians made of `original` ones.
+    /// Reads the files that `compress` left beside the compressed model at `result`, which has `compressed` Gaussians;
+    /// its original has `original` Gaussians.
     ///
     /// A file that is absent or does not fit is no error: any two models can be compared.
     pub fn beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
@@ -67,9 +68,9 @@ impl RunFiles {
     }
 }
 
-/// Maximum number of bytes of a summary.
+/// Maximum size of a summary file in bytes.
 const MAX_SUMMARY: u64 = 16 << 20;
-/// Maximum number of bytes of a recipe.
+/// Maximum size of a recipe file in bytes.
 const MAX_RECIPE: u64 = 1 << 20;
 
 fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
@@ -100,7 +101,8 @@ fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fat
     fates(&map, compressed)
 }
 
-/// Returns the fates by an index map into a result of `compressed` Gaussians. Gaussians that share a place were merged.
+/// Returns the fate of each Gaussian of the original from the index map `map`, which holds its index in the output or
+/// −1. Gaussians with the same index were merged. Fails if an index is not below `compressed`.
 fn fates(map: &[i64], compressed: usize) -> Result<Vec<Fate>, String> {
     let mut sharers = vec![0u32; compressed];
     for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place != -1) {

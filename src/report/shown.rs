@@ -1,7 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
-//! In: the scores of all renders, then the chosen renders again. Out: PNG files as data URIs. A page holds at most
-//! [`CHOSEN`] renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! Input: the scores of all renders, then the chosen renders again. Output: PNG files as data URIs. A page holds at
+//! most [`CHOSEN`] renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per
+//! result.
 
 use std::io;
 
@@ -15,44 +16,46 @@ use crate::evaluation::found::{Evaluation, ImageScore};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
-/// Reason of the render with the lowest PSNR.
+/// Reason for showing the render with the lowest PSNR, as text for the page.
 pub(super) const WORST: &str = "worst render";
-/// Reason of the render with the median PSNR.
+/// Reason for showing the render with the median PSNR, as text for the page.
 pub(super) const MEDIAN: &str = "median render";
 
-/// Maximum number of chosen renders: the worst one, the worst of the worst view, the worst of the worst frame, and the
-/// median one.
+/// Maximum number of renders that the page shows: the worst one, the worst one of the worst view, the worst one of the
+/// worst frame, and the median one.
 pub const CHOSEN: usize = 4;
-/// Maximum number of pixels of an image; larger renders are shown smaller. Trained scenes take about 2 bytes per pixel
-/// in base64.
+/// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
+/// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
-/// Least share of the values of a difference that its brightening does not clip.
+/// Minimum fraction of the values of a difference image that must not be clipped when it is brightened.
 const UNCLIPPED: f64 = 0.999;
-/// Maximum brightening of differences: one step of 255 is then a quarter of the range.
+/// Maximum factor by which difference images are brightened. At 64, a difference of 1/255 becomes a quarter of the
+/// range.
 const MAX_FACTOR: u32 = 64;
 
-/// A render that the page shows.
+/// Render that the page shows, with its scores.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Choice {
-    /// Reasons of the choice: "worst render", "median render", ...
+    /// Reasons for the choice, such as "worst render".
     pub why: Vec<String>,
-    /// Index into the evaluation's renders.
+    /// Index of the render in [`Evaluation::pictures`].
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
     pub frame: usize,
     /// View number.
     pub view: u32,
-    /// PSNR of compressed against original, dB.
+    /// PSNR of the compressed model's render against the original's, dB.
     pub psnr: f64,
-    /// SSIM of compressed against original.
+    /// SSIM of the compressed model's render against the original's.
     pub ssim: f64,
-    /// FLIP of compressed against original, where it was computed.
+    /// FLIP of the compressed model's render against the original's; `None` if it was not computed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flip: Option<f64>,
 }
 
-/// Chooses the renders to show, the worst first. A render with several reasons comes once.
+/// Chooses the renders that the page shows, the worst first. A render that is chosen for several reasons occurs once,
+/// with all its reasons.
 pub fn choices(found: &Evaluation) -> Vec<Choice> {
     let pictures = &found.pictures;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
@@ -84,7 +87,8 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
     chosen
 }
 
-/// Returns the renders of `choices`, made for another result of the same original, with the scores of `found`.
+/// Returns the renders `choices`, which were chosen for another compressed model of the same original, with their
+/// scores in the evaluation `found`.
 pub fn scores_at(found: &Evaluation, choices: &[Choice]) -> Vec<Choice> {
     let scored = |choice: &Choice| {
         let ImageScore { psnr, ssim, flip, .. } = found.pictures[choice.place].loss;
@@ -93,25 +97,26 @@ pub fn scores_at(found: &Evaluation, choices: &[Choice]) -> Vec<Choice> {
     choices.iter().map(scored).collect()
 }
 
-/// Images of a chosen render.
+/// Images of a render that the page shows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
-    /// The render.
+    /// Chosen render, with its scores.
     pub choice: Choice,
     /// Names and data URIs of the images: original, compressed, difference and, if there is one, photograph.
     pub images: Vec<(&'static str, String)>,
-    /// Pixels across and down, as shown.
+    /// Width and height of the shown images, pixels.
     pub size: (u32, u32),
-    /// Pixels of the render, each way, that one shown pixel stands for.
+    /// Number of pixels of the render, along each axis, that one shown pixel stands for.
     pub shrunk: u32,
-    /// Factor by which the difference was made brighter.
+    /// Factor by which the difference image is brightened.
     pub factor: u32,
 }
 
-/// Makes the images of a chosen render.
+/// Creates the images of a chosen render: original, compressed, brightened difference, and the photograph if there is
+/// one.
 ///
 /// # Errors
-/// A render without pixels, which PNG does not support.
+/// Fails if the render has no pixels, which PNG does not allow.
 pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
     let shrunk = shrinkage(&taken.original, MAX_PIXELS);
     let difference = difference(&taken.compressed, &taken.original);
@@ -132,29 +137,30 @@ pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
     Ok(ShownImage { choice: choice.clone(), images, size, shrunk, factor })
 }
 
-/// Returns an image as a PNG inside a data URI.
+/// Returns `image` as a data URI that contains a PNG file.
 ///
 /// # Errors
-/// An image without pixels.
+/// Fails if the image has no pixels.
 pub fn data_uri(image: &Image) -> Result<String> {
     let bytes = image_bytes(image, ImageFormat::Png)
         .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
     Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
 }
 
-/// Returns |a − b| per channel, of values clamped to [0, 1].
+/// Returns the absolute difference |a − b| of two images, channel by channel; values are first clamped to [0, 1].
 pub(super) fn difference(a: &Image, b: &Image) -> Image {
     let shown = |v: f32| v.clamp(0.0, 1.0);
     let data = a.data.iter().zip(&b.data).map(|(&a, &b)| (shown(a) - shown(b)).abs()).collect();
     Image { width: a.width, height: a.height, data }
 }
 
-/// Returns the image `factor` times as bright.
+/// Returns `image` with all values multiplied by `factor`.
 pub(super) fn brighter(image: &Image, factor: u32) -> Image {
     Image { data: image.data.iter().map(|v| v * factor as f32).collect(), ..*image }
 }
 
-/// Returns the largest power of two, up to [`MAX_FACTOR`], that clips at most 1 − [`UNCLIPPED`] of the values.
+/// Returns the largest power of two, at most [`MAX_FACTOR`], by which the difference image can be multiplied so that at
+/// most the fraction 1 − [`UNCLIPPED`] of its values exceeds 1.
 fn brightening(difference: &Image) -> u32 {
     let mut values = difference.data.clone();
     if values.is_empty() {
@@ -169,13 +175,15 @@ fn brightening(difference: &Image) -> u32 {
     factor
 }
 
-/// Returns the number of pixels each way that become one, so that at most `most` pixels are left.
+/// Returns the smallest factor by which `image` must be scaled down along each axis so that it has at most `most`
+/// pixels.
 pub(super) fn shrinkage(image: &Image, most: u64) -> u32 {
     let pixels = |by: u32| u64::from(image.width.div_ceil(by)) * u64::from(image.height.div_ceil(by));
     (1..).find(|&by| pixels(by) <= most).unwrap_or(1)
 }
 
-/// Averages squares of `by` pixels each way; squares at the far borders may be smaller.
+/// Scales an image down by averaging squares of `by` × `by` pixels; squares at the right and bottom borders may be
+/// smaller.
 pub(super) fn shrink(image: &Image, by: u32) -> Image {
     if by == 1 {
         return image.clone();

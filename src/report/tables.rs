@@ -1,10 +1,10 @@
-//! Tables of the page as CSV.
+//! CSV tables that are written beside the report page.
 
 use super::failure::FailureMode;
 use crate::files::csv::{known, table};
 use crate::journal::records::StageRecord;
 
-/// Returns one line per failure mode.
+/// Returns a CSV table with one line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     let names = [
         "failure_mode",
@@ -43,7 +43,7 @@ pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     table(&names, modes.iter().map(row))
 }
 
-/// Returns one line per stage of the run.
+/// Returns a CSV table with one line per stage of the run.
 pub(super) fn stages(stages: &[StageRecord]) -> String {
     let row = |of: &StageRecord| {
         vec![

@@ -1,7 +1,6 @@
 //! Curves of a sweep: quality against Gaussians, bytes, time and memory.
 //!
-//! Data in: a [`TradeOff`]. Data out: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with
-//! charts.
+//! Input: a [`TradeOff`]. Output: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
@@ -10,16 +9,16 @@ use crate::evaluation::method::Method;
 use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
 
-/// File name of the page in the folder of a sweep.
+/// File name of the page that the command `sweep` writes.
 pub const PAGE: &str = "sweep.html";
 
-/// Title of a chart, and its SVG.
+/// Chart: its title, and its `<svg>` element.
 pub type Chart = (String, String);
 
-/// Function that returns a coordinate of a point, if it is known.
+/// Function that returns one coordinate of a point in a chart; `None` if it is not known.
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
-/// Returns the page of a sweep.
+/// Returns the HTML of the page that the command `sweep` writes.
 pub fn page(found: &TradeOff) -> String {
     let mut files = vec!["sweep.json", "sweep.csv"];
     files.extend((!found.knobs.is_empty()).then_some("knobs.csv"));
@@ -34,7 +33,7 @@ pub fn page(found: &TradeOff) -> String {
     document(&format!("{} – what quality costs", file_name(&found.path)), &body, &[])
 }
 
-/// Returns a description of the sweep, the charts and the notes.
+/// Returns an HTML section with a description of the sweep, its charts and its notes.
 pub(super) fn section(found: &TradeOff) -> String {
     let runs = if found.runs > 1 { format!("; times are medians of {} runs", found.runs) } else { String::new() };
     let paired = curves(found).iter().any(|curve| curve.paired);
@@ -54,7 +53,7 @@ pub(super) fn section(found: &TradeOff) -> String {
     out + "</div>\n" + &list(&found.notes)
 }
 
-/// Returns a chart of the sizes that a search for a quality tried, with the quality of each.
+/// Returns the HTML of a chart of the numbers of Gaussians that a search for a quality tried, with the quality of each.
 pub(super) fn search(goal: &GoalSummary) -> String {
     let mut tried: Vec<(f64, f64)> = goal.tried.iter().map(|&(size, quality)| (size as f64, quality)).collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -74,7 +73,8 @@ pub(super) fn search(goal: &GoalSummary) -> String {
     format!("<div class=\"charts\">\n{}</div>\n", figure_of(&title, &plot.svg()))
 }
 
-/// Returns all charts of a sweep: a series per method in the order of its points, and a chart per varied parameter.
+/// Returns all charts of a sweep: quality against size, time and memory with a series per method, and a chart for each
+/// varied parameter.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let curves = curves(found);
     let kept = |point: &TradeOffPoint| Some(100.0 * found.fraction(point));
@@ -106,8 +106,8 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of error against run time for the values of one parameter, beside the same method without
-/// refinement at that size.
+/// Returns the chart of error against run time for the values of one parameter, with the result of the same method
+/// without refinement at the same number of Gaussians.
 fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
@@ -135,10 +135,10 @@ fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     (title.clone(), Plot { title, x, y, series }.svg())
 }
 
-/// Label of the axis of [`error`].
+/// Axis label of the values that [`error`] returns.
 const ERROR: &str = "root mean square error";
 
-/// Returns the root mean square error of colors from 0 to 1 that corresponds to the mean PSNR.
+/// Returns the root mean square error, of colors in [0, 1], that corresponds to the mean PSNR of `point`.
 fn error(point: &TradeOffPoint) -> f64 {
     10f64.powf(-point.psnr / 20.0)
 }
@@ -151,16 +151,16 @@ fn log(label: &str) -> ChartAxis {
     ChartAxis { label: label.to_owned(), log: true, from_zero: false }
 }
 
-/// Points of a method.
+/// Measurements of one method in a sweep.
 struct MethodCurve<'a> {
     name: &'a str,
-    /// Points by increasing count.
+    /// Measurements by increasing number of Gaussians.
     points: Vec<&'a TradeOffPoint>,
-    /// Whether the method before it is the same with refinement.
+    /// Whether the method listed before this one is the same method with refinement.
     paired: bool,
 }
 
-/// Groups the points by method. A method that occurs with and without refinement comes first, as a pair.
+/// Groups the measurements by method. A method measured with and without refinement comes first, as a pair.
 fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
     let mut curves: Vec<MethodCurve<'_>> = Vec::new();
     for point in &found.points {

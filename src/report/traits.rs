@@ -1,9 +1,9 @@
 //! Kinds of Gaussian that compression is known to hurt.
 //!
-//! In: the original's frames and statistics. Out: a set of [`Traits`] for every Gaussian. The kinds are the failure
-//! cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. The paper gives no
-//! thresholds; the thresholds here are this project's.
-//! Memory: where colors vary, one frame of colors and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
+//! Input: the original's frames and statistics. Output: the [`Traits`] (membership in each kind) of every Gaussian. The
+//! kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. The
+//! paper gives no thresholds; the thresholds here are this project's. Memory: where colors vary, one frame of colors
+//! and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
 
 use rayon::prelude::*;
 
@@ -17,44 +17,47 @@ use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORED_BYTES, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Least D of a fast Gaussian, as a share of the scene extent per frame: one pixel per frame in a render that is as
-/// wide as the scene and has 500 pixels across.
+/// Minimum trajectory magnitude D of a fast Gaussian, as a fraction of the scene extent per frame: one pixel per frame
+/// in a render that shows the scene over 500 pixels.
 pub const FAST: f64 = 2e-3;
-/// Least relative change of distance of non-rigid motion: the root mean square over time, for half of the neighbors.
+/// Minimum relative change of the distance between neighbors that counts as non-rigid motion: root mean square over
+/// time, exceeded for half of the neighbors.
 pub const NON_RIGID: f64 = 0.05;
-/// Least distance in relative changes, as a share of the extent: closer neighbors may change places invisibly.
+/// Minimum distance by which a change of distance is divided, as a fraction of the scene extent; closer neighbors may
+/// change places invisibly.
 const NEAREST: f64 = 1e-3;
-/// Number of neighbors whose distance is followed.
+/// Number of nearest neighbors of a Gaussian whose distances are measured over time.
 pub const NEIGHBORS: usize = 8;
-/// Least ratio of the longest to the second scale of a thin Gaussian.
+/// Minimum ratio of the largest to the middle scale of a thin Gaussian.
 pub const THIN: f64 = 5.0;
-/// Largest D of a still Gaussian, as a share of the extent per frame.
+/// Maximum trajectory magnitude D of a still Gaussian, as a fraction of the scene extent per frame.
 pub const STILL: f64 = 5e-4;
-/// Least standard deviation of the opacity over the life span for a change of appearance.
+/// Minimum standard deviation of the opacity over the life span (frames in which the Gaussian is alive) that counts as
+/// a change of appearance.
 pub const OPACITY_CHANGE: f64 = 0.05;
-/// Least standard deviation of the base color over the life span for a change of appearance, root mean square over the
-/// channels: five of 255 steps.
+/// Minimum standard deviation of the base color over the life span (frames in which the Gaussian is alive) that counts
+/// as a change of appearance: root mean square over the channels, colors in [0, 1]; five steps of 1/255.
 pub const COLOR_CHANGE: f64 = 0.02;
-/// Maximum number of frames at which distances and colors are sampled, evenly.
+/// Maximum number of frames, evenly spaced, at which distances and colors are measured.
 pub const SAMPLES: usize = 24;
 
-/// Kind of Gaussian.
+/// Kind of Gaussian that compression is known to damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GaussianKind {
-    /// Fast, and moving otherwise than its neighbors.
+    /// Fast, and moving differently from its neighbors.
     Motion,
-    /// Much longer than wide.
+    /// Much longer than wide: the largest scale is at least [`THIN`] times the middle one.
     Thin,
-    /// Still, and changing in opacity or color.
+    /// Hardly moving, but changing in opacity or color.
     Appearance,
 }
 
 impl GaussianKind {
-    /// Every kind, in the paper's order. Arrays by kind have this order.
+    /// Every kind of Gaussian, in the order of the paper. Arrays with a value per kind have this order.
     pub const ALL: [GaussianKind; 3] = [GaussianKind::Motion, GaussianKind::Thin, GaussianKind::Appearance];
 }
 
-/// Estimates the resources of [`traits`].
+/// Returns the resource estimate (memory, time, reads) of [`traits`].
 pub fn need(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
         ("rows", SCORED_BYTES),
@@ -73,10 +76,10 @@ pub fn need(work: &Workload) -> ResourceEstimate {
 /// Membership of one Gaussian in each kind, in the order of [`GaussianKind::ALL`].
 pub type Traits = [bool; 3];
 
-/// Finds the traits of every Gaussian. Gaussians that are never visible have none.
+/// Determines to which kinds every Gaussian belongs. A Gaussian that is never visible belongs to none.
 ///
 /// # Errors
-/// Frames that cannot be read.
+/// Fails if a frame cannot be read.
 pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<Traits>> {
     let (rows, extent) = (scored.rows()?, scored.reference.extent);
     let mut found = vec![[false; 3]; rows.len()];
@@ -101,7 +104,8 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     Ok(found)
 }
 
-/// Returns for each kind its share of the coverage, and the share of that coverage for which `is_lost` is true.
+/// Returns for each kind of Gaussian its contribution to renders as a fraction of that of all Gaussians, and the
+/// fraction of it that belongs to Gaussians for which `is_lost` is true.
 pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
@@ -120,16 +124,17 @@ fn is_thin(mut log_scale: [f32; 3]) -> bool {
     f64::from(log_scale[2]) - f64::from(log_scale[1]) >= THIN.ln()
 }
 
-/// Returns at most [`SAMPLES`] of `frames` frames, evenly from first to last.
+/// Returns at most [`SAMPLES`] of the indices from 0 to `frames` − 1, evenly spaced from first to last.
 fn samples(frames: usize) -> Vec<usize> {
     let count = frames.min(SAMPLES);
     (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
 }
 
-/// Measures the non-rigid motion around the Gaussians `ids`. Returns for each the lower median, over its nearest
-/// visible neighbors at the reference frame, of the root mean square change of distance relative to that distance (or
-/// to `nearest`, if that is more). A rigid motion, rotations included, gives 0. The median ignores neighbors that
-/// belong to another object.
+/// Measures the non-rigid motion around the Gaussians `ids`. For each Gaussian and each of its nearest visible
+/// neighbors at the reference frame, computes the change of their distance over time (root mean square), divided by the
+/// distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the lower median
+/// over its neighbors. A rigid motion, rotations included, gives 0. The median ignores neighbors that belong to another
+/// object.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -185,8 +190,8 @@ fn bending(
         .collect())
 }
 
-/// Returns the standard deviation of every Gaussian's base color over the sampled frames of its life span; empty where
-/// colors are constant.
+/// Returns the standard deviation of every Gaussian's base color over the sampled frames in which it is alive (opacity
+/// at least `alpha_min`), root mean square over the channels; empty if colors do not vary.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
@@ -227,7 +232,7 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::{BlockReader, Ids};
 
-    /// Gaussians that a function of (Gaussian, frame) sets.
+    /// Frame source for tests: the function sets the attributes of a Gaussian at a frame.
     struct Made<F>(SequenceInfo, F);
 
     impl<F: Fn(usize, usize, &mut Gaussians, usize) + Sync + Send> FrameSource for Made<F> {
@@ -256,7 +261,8 @@ mod tests {
         SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Attributes::all() }
     }
 
-    /// Bending of a 5 × 5 × 5 lattice that `place` moves.
+    /// Returns the non-rigid motion ([`bending`]) of each point of a 5 × 5 × 5 lattice whose points `place` moves as a
+    /// function of time.
     fn bent(place: impl Fn([f64; 3], f64) -> [f64; 3] + Sync + Send) -> Vec<f64> {
         let source = Made(info(125, 10), |id, frame, out: &mut Gaussians, row| {
             let at = [id % 5, id / 5 % 5, id / 25].map(|k| k as f64);

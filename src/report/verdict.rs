@@ -1,12 +1,12 @@
-//! Verdict of a report: two or three sentences.
+//! Verdict of a report in two or three sentences.
 
 use super::failure::{FailureMode, Verdict};
 use super::html::percent;
 use crate::evaluation::found::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
 
-/// Words of the verdict, with the least mean PSNR in dB for each. The root mean square error is below one step of 255
-/// from 50 dB on, below three at 40 dB, eight at 30 dB, sixteen at 24 dB.
+/// Words of the verdict, each with the minimum mean PSNR in dB from which it is used. The root mean square error is
+/// below 1/255 from 50 dB on, below 3/255 at 40 dB, 8/255 at 30 dB and 16/255 at 24 dB.
 const WORDS: [(f64, &str); 6] = [
     (PSNR_CAP_DB, "renders exactly as the original does"),
     (50.0, "differs from the original by less than a screen can show"),

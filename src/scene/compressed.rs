@@ -14,7 +14,7 @@ const TIME_TOLERANCE: f64 = 1e-6;
 /// opened with; their training iteration is ignored.
 ///
 /// # Errors
-/// Inputs that cannot be read; a model whose number or times of frames differ from the original's.
+/// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.
 pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;

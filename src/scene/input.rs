@@ -33,7 +33,7 @@ pub struct InputOptions {
     pub cameras: Option<PathBuf>,
     /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
-    /// Where the times of views come from if the camera file does not state them.
+    /// Origin of the times of views if the camera file does not state them.
     pub times: Times,
     /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,
@@ -73,7 +73,7 @@ impl InputOptions {
     /// it. Files that appear in an input folder would change the input.
     ///
     /// # Errors
-    /// [`Error::Usage`] if one of the folders is.
+    /// Fails with [`Error::Usage`] if one of the two folders is the input or lies inside it.
     pub(super) fn check_folders(&self) -> Result<()> {
         let Ok(input) = fs::canonicalize(&self.path) else { return Ok(()) };
         if !input.is_dir() {
@@ -121,7 +121,7 @@ pub struct OpenedInput {
 /// frames, which states none either, it is the training background of the model in whose folder the cameras are.
 ///
 /// # Errors
-/// A file that does not exist or that contains no cameras.
+/// Fails if the file does not exist or contains no cameras.
 pub fn load_cameras(
     options: &InputOptions,
     path: Option<&Path>,

@@ -48,11 +48,12 @@ pub struct Scene {
     /// Background color: red, green, blue in [0, 1]. Taken from the cameras, else from the input's training parameters,
     /// else from the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
-    /// How much passes over the scene keep in memory at a time.
+    /// Maximum amounts (frames, views, Gaussians) that passes over the scene keep in memory at a time.
     pub limits: Limits,
     /// Maximum number of full reads of the input, from the memory plan that set `limits`; `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// Measured speed of this machine for this scene, from which later stages estimate their time.
+    /// Measured speed of this machine for this scene, as a multiple of assumed times, from which later stages estimate
+    /// their time.
     pub pace: Throughput,
     /// Folder for temporary files during the run.
     pub scratch: PathBuf,
@@ -73,7 +74,7 @@ impl Scene {
     /// limits.
     ///
     /// # Errors
-    /// A camera at a time that is not the time of any frame.
+    /// Fails if a camera has a time that is not the time of any frame.
     pub fn new(path: PathBuf, input: Box<dyn InputModel>, rig: Rig, split: Option<Split>) -> Result<Scene> {
         let schedule = rig.schedule(&input.source().info().times, split)?;
         let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
@@ -105,7 +106,7 @@ impl Scene {
     /// Plans the memory of the stages that `needs` describes, and makes this scene keep to the limits of the plan.
     ///
     /// # Errors
-    /// A memory budget in which the stages do not fit under any limits.
+    /// Fails if the stages do not fit into the memory budget under any limits.
     pub fn keep_to(
         &mut self,
         budget: Budget,
@@ -130,7 +131,7 @@ impl Scene {
     /// takes.
     ///
     /// # Errors
-    /// A file that does not exist any more.
+    /// Fails if a file does not exist any more.
     pub fn whole(&self) -> Result<Reads> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;

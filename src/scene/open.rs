@@ -23,7 +23,8 @@ use crate::source::FrameSource;
 /// not state.
 ///
 /// # Errors
-/// Invalid input or cameras; cameras of a sequence with other frames; options that do not apply to the input.
+/// Fails if the input or the cameras are invalid, if the cameras belong to a sequence with other frames, or if an
+/// option does not apply to the input.
 pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     options.check_folders()?;
     if options.is_stream() {
@@ -91,7 +92,7 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
 /// `given` is the number of frames that the user gave; if there is none, a default is used and a note is added.
 ///
 /// # Errors
-/// A number of frames outside 1 to 1,000,000.
+/// Fails if the number of frames is not from 1 to 1,000,000.
 fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
     let frames = given.unwrap_or(DEFAULT_FRAMES);
     if !(1..=MAX_FRAMES).contains(&frames) {
@@ -117,7 +118,7 @@ fn check_frames(opened: OpenedInput, path: &Path) -> Result<OpenedInput> {
 /// Opens an input together with its cameras.
 ///
 /// # Errors
-/// Errors of [`open_input`]; a split without views.
+/// Fails as [`open_input`] does, and if the split has no views.
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     from_input(open_input(options)?, options)
 }
@@ -126,7 +127,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 /// virtual ones are placed by the Gaussians of the first frame.
 ///
 /// # Errors
-/// Cameras of another scene; a split without views.
+/// Fails if the cameras belong to another scene, or if the split has no views.
 pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> {
     let OpenedInput { input, rig, mut notes } = check_frames(opened, &options.path)?;
     // A stream's number of frames is unknown when its run is planned, so a stream never counts as a scene without
@@ -185,8 +186,8 @@ fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     Ok(cameras::surrounding_rig(&positions, &weights))
 }
 
-/// Returns a virtual camera rig around the first frame's robust box (which leaves out the outermost 1% of positions on
-/// each side).
+/// Returns a virtual camera rig (cameras placed by the program) around the robust box of the first frame, which leaves
+/// out the outermost 1% of the positions on each side.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     let (middle, extent) = first_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.middle, found.extent()));
     Ok(cameras::virtual_rig(middle, extent))

@@ -21,7 +21,7 @@ impl Photographs {
     /// Creates the list from pairs of a view and the path of its photograph; all of them lie in `folder`.
     ///
     /// # Errors
-    /// Two views with the same photograph.
+    /// Fails if two views have the same photograph, or with the first error in `found`.
     fn from_files(folder: &Path, found: impl Iterator<Item = Result<(FrameView, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
         let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();
@@ -48,7 +48,7 @@ impl Photographs {
     /// folders `cam…`, frame).
     ///
     /// # Errors
-    /// A folder that cannot be read; no photograph of any view; two views with the same photograph.
+    /// Fails if the folder cannot be read, if no view has a photograph, or if two views have the same photograph.
     pub fn find(
         folder: &Path,
         rig: &Rig,
@@ -87,7 +87,7 @@ impl Photographs {
     /// show whether the photographs have changed, without reading them.
     ///
     /// # Errors
-    /// A file that does not exist any more.
+    /// Fails if a file does not exist any more.
     pub fn stamps(&self, pictures: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
         let mut files = Vec::with_capacity(pictures.len());
         for picture in pictures {
@@ -101,7 +101,7 @@ impl Photographs {
     /// Reads the photograph of the view `picture`, taken by `camera`. Transparent pixels are blended with `background`.
     ///
     /// # Errors
-    /// A view without a photograph; a file that is not an image of the camera's size.
+    /// Fails if the view has no photograph, or if the file is not an image of the camera's size.
     pub fn read(&self, picture: FrameView, camera: &Camera, background: [f32; 3]) -> Result<Image> {
         let file = self.files.get(&(picture.frame, picture.view));
         let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", picture.name())))?;

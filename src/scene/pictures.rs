@@ -24,8 +24,8 @@ pub enum ViewSet {
 /// times of the frames.
 ///
 /// # Errors
-/// A view at a time that is not the time of any frame; a split without views; two cameras with the same frame and view
-/// number, which happens only if each split numbers its views on its own.
+/// Fails if a view has a time that is not the time of any frame, if the split has no views, or if two cameras have the
+/// same frame and view number, which happens only if each split numbers its views on its own.
 pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<FrameView>> {
     let mut found = Vec::new();
     for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
@@ -63,7 +63,7 @@ pub fn no_picture(rig: &Rig) -> Error {
 /// Returns the view with the number `view` at frame `frame`, among the views that `part` selects.
 ///
 /// # Errors
-/// Errors of [`pictures`]; a frame that the sequence does not have; a view number that the frame does not have.
+/// Fails as [`pictures`] does, and if the sequence has no such frame or the frame has no such view number.
 pub fn picture(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view: u32) -> Result<FrameView> {
     if frame >= frame_times.len() {
         let last = frame_times.len().saturating_sub(1);
@@ -123,7 +123,7 @@ const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 /// Returns the background color for renders: `asked`, the color that the user gave, or else that of the scene.
 ///
 /// # Errors
-/// A color with a component outside 0 to 1.
+/// Fails if a component of the color is not from 0 to 1.
 pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     match asked {
         Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {
@@ -133,8 +133,8 @@ pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     }
 }
 
-/// Estimates the memory and time of the stage `stage`, which renders all views of `models` models and holds `pixel`
-/// bytes per pixel of each render.
+/// Returns the resource estimate (memory, time, reads) of the stage `stage`, which renders all views of `models` models
+/// and holds `pixel` bytes per pixel of each render.
 pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> ResourceEstimate {
     let pictures = work.threads.min(limits.pictures_together as u64);
     ResourceEstimate {

@@ -23,8 +23,8 @@ const STANDARD_INPUT: &str = "standard input";
 /// Opens standard input as a stream of frames.
 ///
 /// # Errors
-/// A terminal; data that is not a frame stream; options that apply to models only, or that need an input which can be
-/// read again.
+/// Fails if standard input is a terminal or is not a frame stream, or if an option applies to models only or needs an
+/// input that can be read again.
 pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     if options.work.is_some() {
         return Err(Error::usage(
@@ -46,7 +46,8 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 /// cameras.
 ///
 /// # Errors
-/// An invalid stream; a memory budget too small for the frames of one block (the frames in a tile of the container).
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
+/// of the container).
 pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
     let stream = open_stream(options)?;
@@ -59,7 +60,8 @@ pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> 
 /// Packs a stream of frames into a temporary container file and opens this file.
 ///
 /// # Errors
-/// As [`link_stream`].
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
+/// of the container).
 fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
     let mut quota = room_to_pack(options, stream.header())?;
     ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
@@ -74,7 +76,8 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 /// Receives a stream of frames and links their Gaussians into tracks; for streams for which [`is_linked`] holds.
 ///
 /// # Errors
-/// An invalid stream; a memory budget too small for the frames of one block (the frames in a tile of the container).
+/// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
+/// of the container).
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
@@ -93,7 +96,7 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 /// Returns how many frames of a stream can be packed within the memory budget, as a quota that counts arriving frames.
 ///
 /// # Errors
-/// A memory budget too small for the frames of one block (the frames in a tile of the container).
+/// Fails if the memory budget is too small for one block of frames (the frames in a tile of the container).
 pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frame_block(header);
     let held = (block + PREFETCH_FRAMES) as u64;
@@ -139,7 +142,7 @@ impl FrameQuota {
     /// Counts `frames` frames that have arrived.
     ///
     /// # Errors
-    /// More frames than fit into the memory budget.
+    /// Fails if more frames have arrived than fit into the memory budget.
     pub fn admit(&mut self, frames: usize) -> Result<()> {
         self.arrived += frames as u64;
         if self.arrived <= self.most {

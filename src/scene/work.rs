@@ -35,7 +35,7 @@ impl Scene {
     /// too.
     ///
     /// # Errors
-    /// A file that cannot be read; errors of the cache folder.
+    /// Fails if a file or the cache folder cannot be read.
     pub fn digest_of(&self, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
         cached_digest(&self.work, options, input)
     }
@@ -51,7 +51,7 @@ impl Scene {
 /// the keys of all entries depend. If `options` name no folder, returns a cache that stores nothing, and no digest.
 ///
 /// # Errors
-/// A file that cannot be read; errors of the cache folder.
+/// Fails if a file or the cache folder cannot be read.
 pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
     let Some(asked) = &options.work else { return Ok((Cache::none(), None)) };
     let instructions = render::instructions();

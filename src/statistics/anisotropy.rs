@@ -18,7 +18,7 @@ const MAX_LOG_RATIO: f64 = 700.0;
 /// flagged row gets 0.
 ///
 /// # Panics
-/// If `rows` and `log_scale` differ in the number of Gaussians.
+/// Panics if `rows` and `log_scale` differ in the number of Gaussians.
 pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Anisotropy, extent: f64) {
     assert_eq!(rows.len(), log_scale.len(), "one row per Gaussian");
     let floor = (SCALE_FLOOR * extent).ln();

@@ -45,7 +45,7 @@ impl StatisticsRows {
     /// Writes `rows` to an unnamed temporary file in `folder`, and frees their memory.
     ///
     /// # Errors
-    /// A file that cannot be created or written.
+    /// Fails if the file cannot be created or written.
     pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<StatisticsRows> {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {

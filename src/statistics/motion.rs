@@ -19,11 +19,11 @@ use std::mem::size_of;
 use crate::model::AttributeValues;
 use crate::recipe;
 
-/// History bit: the Gaussian was alive in the previous frame.
+/// Bit in the history of a Gaussian: it was alive in the previous frame.
 const ALIVE: u8 = 1;
-/// History bit: the Gaussian was alive in the frame before the previous one.
+/// Bit in the history of a Gaussian: it was alive in the frame before the previous one.
 const ALIVE_BEFORE: u8 = 2;
-/// History bit: the Gaussian was alive in some frame before the previous one.
+/// Bit in the history of a Gaussian: it was alive in some frame before the previous one.
 const BORN_BEFORE: u8 = 4;
 
 /// Sums over the frames so far from which the trajectory magnitude D and the curvature κ of a block of Gaussians
@@ -31,20 +31,20 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Used only if motion is counted within runs of visible frames (`MotionParams::Runs`): number of frames directly before the
-    /// current one that have the same opacities as the frame before them, so that the same Gaussians are alive. `steps`,
-    /// `turns` and `history` do not count these frames yet.
+    /// Number of frames directly before the current one that have the same opacities as the frame before them, so that
+    /// the same Gaussians are alive. `steps`, `turns` and `history` do not count these frames yet. Used only by
+    /// `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,
     before: AttributeValues,
     sum_step2: Vec<f64>,
     sum_turn: Vec<f64>,
-    /// `Literal` only: length of the turn about the last frame in which the Gaussian was alive. It is added to
-    /// `sum_turn` only if the Gaussian is alive in a later frame.
+    /// Length of the turn (second difference of the position) about the last frame in which the Gaussian was alive. It
+    /// is added to `sum_turn` only if the Gaussian is alive in a later frame. Used only by `MotionParams::Literal`.
     pending: Vec<f64>,
-    /// `Runs` only: number of steps summed in `sum_step2`; `turns` is the number of turns summed in `sum_turn`.
-    /// `Literal` divides by numbers that follow from the life span instead.
+    /// Number of steps summed in `sum_step2`; `turns` is the number of turns summed in `sum_turn`. Used only by
+    /// `MotionParams::Runs`; `MotionParams::Literal` divides by numbers that follow from the life span instead.
     steps: Vec<u32>,
     turns: Vec<u32>,
     history: Vec<u8>,
@@ -95,8 +95,9 @@ impl MotionSums {
         self.frames += 1;
     }
 
-    /// Adds a frame by the definition `Runs`. `EVEN` states that both time steps have the mean duration, so that no
-    /// division is needed; divisions would take longer than the rest of the loop.
+    /// Adds a frame by the definition `Runs` of motion, in which only steps between consecutive frames of the life span
+    /// count. `EVEN` states that both time steps have the mean duration, so that no division is needed; divisions would
+    /// take longer than the rest of the loop.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,

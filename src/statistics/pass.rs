@@ -39,7 +39,7 @@ pub struct ScanResult {
 /// (two readers in a pipeline).
 ///
 /// # Errors
-/// Frames that cannot be read.
+/// Fails if a frame cannot be read.
 pub fn scan(source: &dyn FrameSource, schedule: &ViewSchedule, plan: &ScanPlan) -> Result<ScanResult> {
     scan_blocks(source, schedule, plan, 0..scan_units(source.info()), &Events::IGNORED)
 }
@@ -110,7 +110,7 @@ impl<'a> RunningScan<'a> {
     /// it.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if a frame cannot be read.
     pub fn add(&mut self, source: &dyn FrameSource, cameras: &[Vec<&Camera>]) -> Result<()> {
         let info = source.info();
         let first = self.alive_per_frame.len();
@@ -145,7 +145,7 @@ impl<'a> RunningScan<'a> {
     /// Returns the result after the last frame. `plan` is the plan for the complete sequence.
     ///
     /// # Panics
-    /// If `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
+    /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
     pub fn finish(self, plan: &ScanPlan) -> ScanResult {
         let blocks = self.blocks.into_iter().map(|block| {
             let found = block.finish_by(plan);

@@ -43,9 +43,9 @@ impl ScanPlan {
     /// h; evenly spaced frames give exactly the formula without h. [`MotionParams::Literal`] ignores time stamps.
     ///
     /// # Errors
-    /// [`Error::Usage`] for time stamps that do not increase, for two time stamps so close that their distance vanishes
-    /// beside the mean step, and for more than 2³² (frame, view) pairs. An internal error if `schedule` has another
-    /// number of frames.
+    /// Fails with [`Error::Usage`] if time stamps do not increase, if two are so close that their distance vanishes
+    /// beside the mean step, or if there are more than 2³² (frame, view) pairs. Fails with an internal error if
+    /// `schedule` has another number of frames.
     pub fn new(scan: &ScanParams, times: &[f64], schedule: &ViewSchedule) -> Result<Self> {
         if let Some(t) =
             (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))

@@ -70,7 +70,7 @@ pub struct CoverageScale {
 /// unit.
 ///
 /// # Panics
-/// If the arrays of `planes` and `sums` differ in length.
+/// Panics if the arrays of `planes` and `sums` differ in length.
 pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let view = ScanView::new(camera);
     #[cfg(target_arch = "x86_64")]
@@ -172,7 +172,7 @@ impl<const N: usize> ProjectedBlock<N> {
         );
     }
 
-    /// Projects the centers of the Gaussians: computes depth z and slopes x/z, y/z in camera space.
+    /// Computes the depth z and the slopes x/z and y/z, in camera space, of the centers of the Gaussians (px, py, pz).
     #[inline(always)]
     fn project_centers(&mut self, view: &ScanView, [px, py, pz]: [&[f32; N]; 3]) {
         let ScanView { rotation: [w0, w1, w2], translation: t, near, .. } = view;

@@ -93,7 +93,8 @@ impl<'a> BlockScan<'a> {
     /// `changed` contains it.
     ///
     /// # Panics
-    /// If frames are not added in order, or an attribute does not have one value for each Gaussian of the block.
+    /// Panics if frames are not added in order, or if an attribute does not have one value for each Gaussian of the
+    /// block.
     pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Attributes) {
         assert_eq!(t, self.next_frame, "frames are scanned in order");
         self.next_frame += 1;
@@ -196,7 +197,8 @@ impl<'a> BlockScan<'a> {
     /// sequence.
     ///
     /// # Panics
-    /// If frames are missing, or if `plan` differs from the plan with which this scan began in more than the frames that were not known then.
+    /// Panics if frames are missing, or if `plan` differs from the plan with which this scan began in more than the
+    /// frames that were not known then.
     pub fn finish_by(mut self, plan: &ScanPlan) -> BlockStatistics {
         self.life.count_repeats();
         self.motion.count_steady_frames();

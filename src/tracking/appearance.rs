@@ -7,14 +7,14 @@ use crate::model::{AttributeValues, Gaussians, SH_C0};
 /// Largest magnitude of the natural log of a scale. Larger ones are clamped to this value, so that squares of scales
 /// stay finite in f32.
 const MAX_LOG_SCALE: f32 = 30.0;
-/// Difference in size (as a natural log) that costs 1. The next three constants are such differences in shape, opacity
-/// and color.
+/// Difference in size of two Gaussians, as a natural log of the ratio, that adds 1 to the cost of linking them. The
+/// next three constants are the corresponding differences in shape, opacity and color.
 const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
 const COLOR_UNIT: f32 = 0.1;
-/// Parameters r (distance) and q (appearance) of the cost in the [module documentation](super) by which two Gaussians
-/// are near-duplicates.
+/// Parameters of the test by which two Gaussians are near-duplicates: `REACH` is the distance, in sizes of the smaller
+/// Gaussian, that adds 1 to the cost; `STRICTNESS` is the factor of the difference in appearance.
 const DUPLICATE_REACH: f32 = 0.25;
 const DUPLICATE_STRICTNESS: f32 = 4.0;
 
@@ -77,8 +77,8 @@ impl ComparedAppearance {
         self.color.iter().sum()
     }
 
-    /// Returns the difference A in size, shape, opacity and color, as the [module documentation](super) defines it. A
-    /// is symmetric.
+    /// Returns the difference in appearance A: the sum of the squared differences in size, shape, opacity and color,
+    /// each in the unit that costs 1 ([`SIZE_UNIT`] and the like). A is symmetric.
     pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.difference_without_opacity(other) + opacity * opacity
@@ -91,8 +91,8 @@ impl ComparedAppearance {
     }
 
     /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A between Gaussians a and b: positions x, sizes s,
-    /// difference in appearance A without opacity. `reach` is r, `strictness` is q. If the distance term alone exceeds
-    /// 1, returns only this term.
+    /// difference A in size, shape and color. `reach` is r, `strictness` is q. If the distance term alone exceeds 1,
+    /// returns only this term.
     pub(super) fn distance_cost(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
         let unit = reach * self.size.min(other.size);
         let distance = squared_distance(&self.position, &other.position) / (unit * unit);
@@ -100,7 +100,8 @@ impl ComparedAppearance {
         if distance > 1.0 { distance } else { distance + strictness * self.difference_without_opacity(other) }
     }
 
-    /// Returns the difference A in size, shape and color (A of the [module documentation](super) without opacity).
+    /// Returns the difference in appearance without opacity: the sum of the squared differences in size, shape and
+    /// color, each in the unit that costs 1.
     fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size

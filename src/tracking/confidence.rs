@@ -17,8 +17,8 @@ pub(super) struct LinkConfidence {
     expected_wrong: f64,
     /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
-    /// For every track, how well a rival link would do: the cost of the track's link plus that of the rival link,
-    /// divided by their cost with the Gaussians exchanged. The largest ratio over all rivals; 0 without a rival.
+    /// For every track, how well the best rival of its link would do: (cost of the link + cost of the rival link) /
+    /// (their cost with the Gaussians exchanged). Holds the largest ratio over all rivals; 0 without a rival.
     ratios: Vec<f32>,
 }
 
@@ -27,8 +27,8 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Adds the links made in a round of linking. `candidates_by_track` holds, for the tracks that took part, the
-    /// Gaussians that might have continued them.
+    /// Adds the links made in a round of linking (rounds have increasing limits of cost). `candidates_by_track` holds,
+    /// for the tracks that took part, the Gaussians that might have continued them.
     pub(super) fn add_round(
         &mut self,
         links: &Links,

@@ -10,8 +10,8 @@ const MAX_COMPARED: usize = 4096;
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
 /// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
-/// Largest difference that may come from rounding by the program that wrote the frames. A distance is given in sizes of
-/// a Gaussian, another difference in units of A. Smaller differences count as 0.
+/// Largest difference that may come from rounding by the program that wrote the frames. A distance is in sizes of a
+/// Gaussian; a difference in appearance is in the units of link costs. Smaller differences count as 0.
 const NEGLIGIBLE: f64 = 1e-3;
 
 /// Differences between the Gaussians of two frames at the same index, and between unrelated ones. All are medians.
@@ -22,10 +22,11 @@ pub struct OrderDifference {
     /// Distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the second), in
     /// units of the smaller Gaussian's size.
     pub apart: f64,
-    /// Difference in size, shape, opacity and base color between Gaussians at the same index: A of the [module
-    /// documentation](super).
+    /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between Gaussians at
+    /// the same index.
     pub unlike: f64,
-    /// Difference A between unrelated Gaussians, paired as for `apart`.
+    /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between unrelated
+    /// Gaussians, paired as for `apart`.
     pub strangers: f64,
     /// Whether equal indices in the two frames denote the same Gaussian: `moved` is at most half of `apart`, and
     /// `unlike` is at most half of `strangers`.

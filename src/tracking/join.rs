@@ -1,5 +1,5 @@
-//! Joining of tracks that belong to one Gaussian: a track that ends, and a similar one that begins where and when it
-//! ends (rule 6 of the [module documentation](super)).
+//! Joining of tracks that belong to one Gaussian: a track that ends, and a similar one that begins where and when the
+//! first one ends.
 
 use std::mem::size_of;
 
@@ -11,11 +11,13 @@ use super::linker::Linker;
 use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round};
 use crate::model::{AttributeValues, Gaussians};
 
-/// Join rules, with parameters r (distance) and q (appearance) of rule 6: `ALIKE` for tracks that may be one Gaussian;
-/// `CLOSE`, which is stricter, for tracks that look the same.
+/// Rules for joining two tracks: `ALIKE` for tracks that may be one Gaussian; `CLOSE`, which is stricter, for tracks
+/// that look the same. `reach` scales the distance and `strictness` the difference in appearance in the cost of a pair
+/// of tracks, which may be at most 1.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, includes_missing: true };
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true };
-/// Largest ratio of the sizes of joined tracks: √2, as a natural log. The grid finds no other sizes.
+/// Largest ratio of the sizes of joined tracks, as a natural log: ln √2. The grid that finds similar Gaussians finds no
+/// other sizes.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
 /// Largest number of frames in which two tracks may both be present and still be joined. Frames in which only one of
 /// them is present are subtracted. A Gaussian may fade out as one track while it fades in as the other.
@@ -45,7 +47,8 @@ struct TrackPair {
     track: u32,
     earlier: u32,
     cost: f32,
-    /// Number of frames in which both tracks were present, less the later frames in which only one was; at least 0.
+    /// Number of frames in which both tracks were present, less the number of later frames in which only one was; at
+    /// least 0.
     shared_frames: u8,
     /// Whether the two tracks satisfied the rule `CLOSE` in every frame in which both were present.
     are_close: bool,
@@ -69,7 +72,7 @@ impl Joiner {
         + 6 * size_of::<u32>()
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
-    /// Takes note of the frame that `linker` has linked last; to be called after every frame.
+    /// Updates the pairs of tracks by the frame that `linker` has linked last; to be called after every frame.
     pub fn see(&mut self, linker: &Linker) {
         let tracks = linker.open_tracks();
         let born = self.0[0].predecessor.len();
@@ -225,8 +228,8 @@ impl JoinedTracks {
     }
 }
 
-/// Returns the cost of joining two tracks by `rule`, from the appearances of both; opacity does not count. Infinite if
-/// one is more than √2 times as large as the other.
+/// Returns the cost of joining two tracks by `rule`, from the appearances of both; the tracks may be joined if it is at
+/// most 1. Opacity does not count. Infinite if one Gaussian is more than √2 times as large as the other.
 fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MAX_LN_SIZE_RATIO {
         return f32::INFINITY;

@@ -13,8 +13,9 @@ use crate::model::Gaussians;
 
 /// Maximum number of consecutive frames in which a track may have no Gaussian before it ends.
 pub const GAP: u32 = 3;
-/// Parameters r (distance) and q (appearance) of rule 3 of the [module documentation](super), by which a Gaussian
-/// succeeds a track: it looks like the missing track and is in its place.
+/// Parameters of the test whether a Gaussian takes the place of a track that has no Gaussian in this frame: distance
+/// from the expected position, in sizes of the Gaussian, that costs 1; and factor of the difference in appearance. The
+/// Gaussian passes with a cost of at most 1.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
 const MIN_FOR_CUT: usize = 16;

@@ -12,7 +12,8 @@ pub(super) fn rms_size(state: &Gaussians, i: usize) -> f64 {
     (squares.iter().sum::<f64>() / 3.0).sqrt()
 }
 
-/// Slow linker of frames by the rules 1 to 4 of the [module documentation](super), without detection of cuts.
+/// Slow linker of frames, for comparison with [`super::Linker`]. Links every frame by the same rules, but does not
+/// detect cuts (frames that show something else).
 #[derive(Default)]
 pub(super) struct SlowLinker {
     tracks: Vec<SlowTrack>,
@@ -71,8 +72,7 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     }
 }
 
-/// Returns the difference in size, shape and color between two Gaussians (A of the [module documentation](super)
-/// without opacity).
+/// Returns the difference in size, shape and color between two Gaussians, in the units of link costs.
 fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
     let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
@@ -80,15 +80,15 @@ fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     size * size + shape / 0.25f64.powi(2) + color / 0.1f64.powi(2)
 }
 
-/// Returns whether two Gaussians are near each other and look the same except for opacity.
+/// Returns whether two Gaussians are near-duplicates: near each other and alike except for opacity.
 fn is_near_duplicate(a: &SeenGaussian, b: &SeenGaussian) -> bool {
     let distance: f64 = (0..3).map(|c| (b.position[c] - a.position[c]).powi(2)).sum();
     distance / (0.25 * a.size.min(b.size)).powi(2) + 4.0 * difference(a, b) <= 1.0
 }
 
 impl SlowTrack {
-    /// Returns the cost of linking the track to the Gaussian `b` with the parameters `r` (distance) and `q`
-    /// (appearance).
+    /// Returns the cost of linking the track to the Gaussian `b`. `r` scales the distance from the expected position,
+    /// `q` the difference in appearance. A link is possible if the cost is at most 1.
     fn cost(&self, b: &SeenGaussian, r: f64, q: f64) -> f64 {
         let v = self.velocity.unwrap_or_default();
         let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -264,9 +264,10 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
 /// frames in which both were present, whether the two are close, and whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks by rule 6 of the [module documentation](super) with the parameters (r, q), and returns for every track
-/// the number of its joined track. `in_doubt` are tracks that began because a link was probably wrong. `succeeded`
-/// holds (frame, track) for every track that is missing in the frame although a Gaussian like it is in its place.
+/// Joins tracks of one Gaussian (one track ends where and when a similar one begins), and returns for every track the
+/// number of its joined track. `r` scales the distance and `q` the difference in appearance in the cost of a pair.
+/// `in_doubt` are tracks that began because a link was probably wrong. `succeeded` holds (frame, track) for every track
+/// that is missing in the frame although a Gaussian like it is in its place.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,

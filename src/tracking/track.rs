@@ -5,7 +5,8 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track.
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Largest amount by which speed lengthens a track's unit of distance, in sizes of its Gaussian.
+/// Largest amount by which the speed of a track lengthens the unit of distance in the cost of its links, in sizes of
+/// its Gaussian.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
@@ -18,9 +19,9 @@ pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round of linking: `reach` is r (distance) and `strictness` is q (appearance) of the cost in the
-/// [module documentation](super). `includes_missing` states whether tracks without a Gaussian in the previous frame
-/// take part.
+/// Parameters of a round of linking: `reach` scales the distance and `strictness` the difference in appearance in the
+/// cost of a link, which may be at most 1. `includes_missing` states whether tracks without a Gaussian in the previous
+/// frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
@@ -63,15 +64,15 @@ impl OpenTrack {
         std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
     }
 
-    /// Returns the unit of distance of link costs, scene units: the Gaussian's size plus an amount that grows with its
-    /// speed (u in the [module documentation](super)).
+    /// Returns the unit of distance in the cost of a link, scene units: the Gaussian's size, plus an amount that grows
+    /// with its speed and is at most [`MAX_SPEED_UNITS`] sizes.
     fn distance_unit(&self) -> f32 {
         let speed = self.velocity.unwrap_or_default().iter().map(|v| v * v).sum::<f32>().sqrt();
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost of linking the track to a Gaussian of this appearance; above 1 a link is impossible. If the
-    /// distance term alone exceeds 1, returns only this term.
+    /// Returns the cost of linking the track to a Gaussian of this appearance; if it is above 1, a link is impossible.
+    /// If the distance term alone exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
@@ -126,7 +127,7 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds a Gaussian if its cost is at most 1 and is among the least so far.
+    /// Adds the Gaussian if its cost is at most 1 and among the lowest costs so far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

@@ -1,4 +1,5 @@
-//! README and user documentation: commands parse, links lead to files, generated pages are up to date, and the README is short.
+//! Tests of README and user documentation: commands parse, links lead to files, generated pages are up to date, and the
+//! README is short.
 //!
 //! `SPLATSIEVE_WRITE_DOCS=1` writes the generated pages, `docs/cli.md` and `docs/parameters.md`, instead of comparing them.
 

@@ -1,6 +1,6 @@
-//! Durability of results: a result is written through to disk (`fsync`) before it gets its name (`rename`), and the
-//! rename is made durable afterwards. The test checks the order of the system calls, which a preloaded library records;
-//! the order decides what survives a power failure.
+//! Test of the durability of results: a result is written through to disk (`fsync`) before it gets its name (`rename`),
+//! and the rename is made durable afterwards. The test checks the order of the system calls, which a preloaded library
+//! records; the order decides what survives a power failure.
 #![cfg(all(target_os = "linux", target_env = "gnu"))]
 
 use std::fs;

@@ -1,5 +1,6 @@
-//! Very long and very wide sequences, as files and as streams of unknown length (EXTREMES 42). A memory limit holds for
-//! as many frames as fit, and a run refuses more frames than that with a message that names the limit.
+//! Very long and very wide sequences, as files and as streams of unknown length (case 42 of the table in
+//! `tests/extremes/main.rs`). A memory limit holds for as many frames as fit, and a run refuses more frames than that
+//! with a message that names the limit.
 //!
 //! `SPLATSIEVE_PROGRAM` may name an optimized program to run in place of the one built with this test.
 
@@ -109,14 +110,14 @@ fn million_gaussians_in_two_frames_fit() {
     check_file_and_stream(LongSequence { gaussians: 1_000_000, frames: 2 }, 700);
 }
 
-/// Case 42 of EXTREMES: many frames.
+/// Case 42 of the table in `tests/extremes/main.rs`: many frames.
 #[test]
 #[ignore = "slow: minutes unless optimized"]
 fn slow_a_million_frames_of_ten_gaussians_fit_64_mib() {
     check_file_and_stream(LongSequence { gaussians: 10, frames: 1_000_000 }, 64);
 }
 
-/// Case 42 of EXTREMES: many Gaussians.
+/// Case 42 of the table in `tests/extremes/main.rs`: many Gaussians.
 #[test]
 #[ignore = "slow: minutes unless optimized"]
 fn slow_ten_million_gaussians_in_two_frames_fit() {

@@ -302,7 +302,8 @@ fn scale_script_reports_cost_of_every_size() {
     assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
 }
 
-/// The bar of a sweep is drawn above the bars of its runs. No bar is longer than the terminal or remains at the end.
+/// Checks that the bar of a sweep is drawn above the bars of its runs, and that no bar is longer than the terminal or
+/// remains at the end.
 #[test]
 #[ignore = "needs Python"]
 fn bars_fit_the_terminal_and_leave_no_line_behind() {

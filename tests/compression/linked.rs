@@ -20,7 +20,7 @@ fn uniform(seed: u64) -> f32 {
     (hash_id(seed) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Writes Gaussian `i` at a frame to row `at` of `out`; each Gaussian moves on its own circle.
+/// Writes Gaussian `i` at frame `frame` to row `at` of `out`; each Gaussian moves on its own circle.
 fn write_row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     let value = |k: u64| uniform(64 * i as u64 + k);
     let angle = 0.05 * frame as f32 + 6.0 * value(0);
@@ -245,8 +245,8 @@ fn varying_frame(count: usize, t: usize) -> Gaussians {
     out.pick(&order)
 }
 
-/// Computes in f64 the definition in the documentation of `steady` for one track: the mean of rotation, scales, opacity
-/// logit and colors, each with its variation divided by its bound.
+/// Computes in f64, for one track, what makes an attribute constant along it (`src/models/linked/steady.rs`): the mean
+/// of rotation, scales, opacity logit and colors, each with its variation divided by its bound.
 fn mean_and_variation(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let values = |column: &dyn Fn(&Gaussians) -> Vec<f32>| -> Vec<Vec<f64>> {
         frames.iter().map(|frame| column(frame).into_iter().map(f64::from).collect()).collect()

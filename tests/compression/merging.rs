@@ -1,5 +1,5 @@
-//! Clusters and proxies of complete models against a plain implementation of method.md, section 5: neighbors by
-//! comparing all pairs, tests by their formulas, leaders one after the other.
+//! Tests that compare clusters and proxies of complete models with a plain implementation of method.md, section 5:
+//! neighbors by comparing all pairs, tests by their formulas, leaders one after the other.
 
 use std::path::{Path, PathBuf};
 
@@ -62,7 +62,8 @@ fn covariance(state: &Gaussians, i: usize) -> DMat3 {
     axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
 }
 
-/// Returns whether two nodes with these states pass tests 1 and 2.
+/// Returns whether two nodes (Gaussians or merged groups) with these states pass tests 1 (place and size) and 2 (color)
+/// of merging.
 fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
     let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
@@ -89,7 +90,7 @@ fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergePara
         && (color(i) - color(j)).length() <= merge.max_color_difference
 }
 
-/// Returns whether two Gaussians pass test 3.
+/// Returns whether two Gaussians pass test 3 (motion) of merging.
 fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
     let merge = &recipe.merge;
     let unit = merge.length_unit.in_scene_units(all_frames.extent);

@@ -1,5 +1,5 @@
-//! Normalization, scores, thresholds and survivors against a plain implementation of method.md, sections 2 to 4: sorted
-//! values for percentiles, loops for sums, one sort per stage.
+//! Tests that compare normalization, scores, thresholds and survivors with a plain implementation of method.md,
+//! sections 2 to 4: sorted values for percentiles, loops for sums, one sort per stage.
 
 use crate::scene::{by_formula, scene, tiny};
 use splatsieve::model::Rows;

@@ -1,4 +1,4 @@
-//! Frame states and statistics of trained models against PyTorch in float64.
+//! Tests that compare frame states and statistics of trained models with PyTorch in float64.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::Path;

@@ -77,15 +77,18 @@ const RUST_DEBUG_TEXT: [&str; 11] =
 /// Bytes that may be allocated for each byte read, in addition to the limit of the entry.
 pub(crate) const PER_BYTE: usize = 512;
 
-/// Memory limit of most readers for any input.
+/// Memory limit, in bytes, of most readers for any input.
 const SMALL_BYTES: usize = 32 << 20;
-/// JSON is read through a buffer, and one string of at most a megabyte is kept at a time.
+/// Memory limit of the readers of JSON, in bytes. They read through a buffer and keep one string of at most a megabyte
+/// at a time.
 const JSON_BYTES: usize = 4 << 20;
-/// Memory given to the reader of pickles, plus space for messages.
+/// Memory limit of the reader of pickles, in bytes, plus space for messages.
 const PICKLE_BYTES: usize = (1 << 20) + (64 << 10);
-/// A tile may hold 256 MiB (format/SPEC.md), decoded next to its encoded bytes.
+/// Memory limit of the reader of containers, in bytes. A tile may hold 256 MiB (format/SPEC.md), decoded next to its
+/// encoded bytes.
 const CONTAINER_BYTES: usize = 640 << 20;
-/// An archive may decode to 64 MiB plus 512 times its own bytes (format/ARCHIVE.md).
+/// Memory limit of the reader of archives, in bytes. An archive may decode to 64 MiB plus 512 times its own bytes
+/// (format/ARCHIVE.md).
 const ARCHIVE_BYTES: usize = 256 << 20;
 
 /// List of all readers of user-supplied bytes.

@@ -1,6 +1,6 @@
-//! Damaged inputs of every format are read or refused in plain words, within a stated memory, and never cause a panic.
-//! The inputs are those of `make.py` and findings of the fuzz targets (`fuzz`), as they are, cut short, and with
-//! changed bytes; they are the same in every run.
+//! Tests that damaged inputs of every format are read or refused in plain words, within a stated memory, and never
+//! cause a panic. The inputs are those of `make.py` and findings of the fuzz targets (`fuzz`), as they are, cut short,
+//! and with changed bytes; they are the same in every run.
 
 mod entries;
 mod memory;
@@ -16,7 +16,7 @@ use splatsieve::model::hash_id;
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;
 
-/// Lock for one test at a time, because memory is counted for the whole process.
+/// Lock that lets one test run at a time, because memory is counted for the whole process.
 static COUNTED: Mutex<()> = Mutex::new(());
 
 /// Number of cut and of changed copies of each saved input.

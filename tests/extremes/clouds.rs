@@ -13,7 +13,7 @@ fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {
     summary["terms"].as_array().unwrap().iter().map(|term| term[key].as_f64().unwrap()).collect()
 }
 
-/// Case 1.
+/// Case 1 of the table in `main.rs`.
 #[test]
 fn no_gaussians_give_a_valid_empty_output() {
     let workplace = Workplace::new();
@@ -29,7 +29,7 @@ fn no_gaussians_give_a_valid_empty_output() {
     }
 }
 
-/// Case 2.
+/// Case 2 of the table in `main.rs`.
 #[test]
 fn one_gaussian_is_kept_byte_for_byte() {
     let workplace = Workplace::new();
@@ -40,7 +40,7 @@ fn one_gaussian_is_kept_byte_for_byte() {
     }
 }
 
-/// Case 3.
+/// Case 3 of the table in `main.rs`.
 #[test]
 fn one_frame_is_static_and_noted() {
     let workplace = Workplace::new();
@@ -56,7 +56,7 @@ fn one_frame_is_static_and_noted() {
     assert!(rows["life"].iter().all(|&frames| frames == 1.0));
 }
 
-/// Case 6.
+/// Case 6 of the table in `main.rs`.
 #[test]
 fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     let workplace = Workplace::new();
@@ -79,7 +79,7 @@ fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     }
 }
 
-/// Case 7.
+/// Case 7 of the table in `main.rs`.
 #[test]
 fn static_neighbors_merge_and_dynamic_scores_are_off() {
     let workplace = Workplace::new();
@@ -103,7 +103,7 @@ fn static_neighbors_merge_and_dynamic_scores_are_off() {
     assert!(frames.iter().all(|frame| frame.rows == frames[0].rows));
 }
 
-/// Case 8.
+/// Case 8 of the table in `main.rs`.
 #[test]
 fn all_movers_are_kept_at_around_one_percent() {
     for movers in [1, 2, 3] {
@@ -125,7 +125,7 @@ fn all_movers_are_kept_at_around_one_percent() {
     }
 }
 
-/// Case 9.
+/// Case 9 of the table in `main.rs`.
 #[test]
 fn invisible_gaussians_are_prunable_without_nan() {
     for logit in [-100.0, -30.0] {
@@ -164,7 +164,7 @@ fn gaussians_like_their_background_use_the_contrast_floor() {
     }
 }
 
-/// Case 10.
+/// Case 10 of the table in `main.rs`.
 #[test]
 fn solid_gaussians_have_no_variance_and_finite_logits() {
     let workplace = Workplace::new();
@@ -184,7 +184,7 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     }
 }
 
-/// Case 18.
+/// Case 18 of the table in `main.rs`.
 #[test]
 fn nonfinite_gaussians_are_refused_dropped_or_kept() {
     let edits: [(&str, Edit); 5] = [
@@ -227,7 +227,7 @@ fn nonfinite_gaussians_are_refused_dropped_or_kept() {
     }
 }
 
-/// Case 28.
+/// Case 28 of the table in `main.rs`.
 #[test]
 fn without_cameras_a_virtual_rig_is_used_and_noted() {
     let workplace = Workplace::new();
@@ -239,7 +239,7 @@ fn without_cameras_a_virtual_rig_is_used_and_noted() {
     assert_eq!(summary["flags"]["never_in_view"], 0);
 }
 
-/// Case 40.
+/// Case 40 of the table in `main.rs`.
 #[test]
 fn without_cameras_survivors_ignore_the_length_unit() {
     let kept = |power: i32| {
@@ -263,7 +263,7 @@ fn without_cameras_survivors_ignore_the_length_unit() {
     }
 }
 
-/// Case 31: three copies, opacity by rule.
+/// Case 31 of the table in `main.rs`: three copies, opacity by rule.
 #[test]
 fn duplicates_merge_to_one_with_the_named_opacity_rule() {
     let workplace = Workplace::new();
@@ -288,7 +288,7 @@ fn duplicates_merge_to_one_with_the_named_opacity_rule() {
     }
 }
 
-/// Case 31: any number of copies.
+/// Case 31 of the table in `main.rs`: any number of copies.
 #[test]
 fn any_number_of_duplicates_merges_to_one() {
     for count in [34, 100, 5000] {
@@ -299,7 +299,7 @@ fn any_number_of_duplicates_merges_to_one() {
     }
 }
 
-/// Case 43.
+/// Case 43 of the table in `main.rs`.
 #[test]
 fn frames_with_unequal_counts_are_named() {
     let workplace = Workplace::new();

@@ -36,7 +36,7 @@ fn shift_along_x(cloud: &mut Gaussians, i: usize, by: f64) {
     cloud.position.plane_mut(0)[i] += by as f32;
 }
 
-/// Cases 13, 17 and 38; each is checked next to a pair without the difference, which merges.
+/// Cases 13, 17 and 38 of the table in `main.rs`; each is checked next to a pair without the difference, which merges.
 #[test]
 fn different_motion_or_life_never_merges() {
     const T: usize = 12;
@@ -65,7 +65,8 @@ fn different_motion_or_life_never_merges() {
     }
 }
 
-/// Case 19: any number of Gaussians that differ only in the signs of zeros, in 200 ways, are duplicates.
+/// Case 19 of the table in `main.rs`: any number of Gaussians that differ only in the signs of zeros, in 200 ways, are
+/// duplicates.
 #[test]
 fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     const N: usize = 200;
@@ -85,7 +86,7 @@ fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     assert!(map[..N].iter().all(|&place| place == map[0]), "{map:?}");
 }
 
-/// Case 35: coefficients of the same direction, one of which gives black.
+/// Case 35 of the table in `main.rs`: coefficients of the same direction, one of which gives black.
 #[test]
 fn different_colors_never_merge() {
     let colored =
@@ -113,10 +114,10 @@ fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, Pl
     (scales, DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()), rows)
 }
 
-/// Lengths are in scene units, and pairs may merge at a distance of one unit with any differences.
+/// Options with lengths in scene units, by which pairs may merge at a distance of one unit with any differences.
 const WIDE: &str = "--set length_unit=scene --set passes=1,1e9,-1,-1";
 
-/// Case 21, for needles along every axis and with any order of axes.
+/// Case 21 of the table in `main.rs`, for needles along every axis and with any order of axes.
 #[test]
 fn needle_keeps_its_smallest_scale_through_a_ply() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
@@ -138,8 +139,8 @@ fn needle_keeps_its_smallest_scale_through_a_ply() {
     }
 }
 
-/// Case 22: pancakes side by side in their common plane, of any orientation and flatness. Rotations in f32 limit the
-/// flatness: their error of 1e-7 moves a point at a distance of 0.02 by 2e-9.
+/// Case 22 of the table in `main.rs`: pancakes side by side in their common plane, of any orientation and flatness.
+/// Rotations in f32 limit the flatness: their error of 1e-7 moves a point at a distance of 0.02 by 2e-9.
 #[test]
 fn coplanar_pancakes_stay_flat() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
@@ -164,7 +165,8 @@ fn coplanar_pancakes_stay_flat() {
     }
 }
 
-/// Case 23: two balls along a diagonal have a covariance with equal diagonal entries, and the diagonal is its axis.
+/// Case 23 of the table in `main.rs`: two balls along a diagonal have a covariance with equal diagonal entries, and the
+/// diagonal is its axis.
 #[test]
 fn covariance_with_equal_diagonal_has_correct_axes() {
     for direction in [[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]] {
@@ -189,7 +191,7 @@ fn covariance_with_equal_diagonal_has_correct_axes() {
     }
 }
 
-/// Case 24: a zero quaternion merges like the identity with the same scales, and is counted.
+/// Case 24 of the table in `main.rs`: a zero quaternion merges like the identity with the same scales, and is counted.
 #[test]
 fn zero_quaternion_is_the_identity_and_flagged() {
     let score = |turn: [f32; 4]| {
@@ -221,7 +223,8 @@ fn zero_quaternion_is_the_identity_and_flagged() {
     }
 }
 
-/// Case 20: two balls half a standard deviation apart merge, and two balls three apart do not, at any size.
+/// Case 20 of the table in `main.rs`: two balls half a standard deviation apart merge, and two balls three apart do
+/// not, at any size.
 #[test]
 fn merging_distance_scales_with_size_from_1e_minus_12_to_1e6() {
     for size in [1e-12, 1e-9, 1e-6, 1e-3, 1e3, 1e6f64] {
@@ -245,7 +248,8 @@ fn merging_distance_scales_with_size_from_1e_minus_12_to_1e6() {
     }
 }
 
-/// Cases 20 and 27: sizes from points to the whole sky, in front of, around and behind the camera.
+/// Cases 20 and 27 of the table in `main.rs`: sizes from points to the whole sky, in front of, around and behind the
+/// camera.
 #[test]
 fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     let workplace = Workplace::new();
@@ -284,7 +288,7 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     }
 }
 
-/// Cases 29 and 30.
+/// Cases 29 and 30 of the table in `main.rs`.
 #[test]
 fn hidden_go_first_and_giant_background_merges_with_none() {
     let workplace = Workplace::new();
@@ -331,7 +335,8 @@ fn hidden_go_first_and_giant_background_merges_with_none() {
     }
 }
 
-/// Case 32. For ten million points see `ten_million_points_in_one_voxel_cost_bounded_time`, which runs only by name.
+/// Case 32 of the table in `main.rs`. For ten million points see `ten_million_points_in_one_voxel_cost_bounded_time`,
+/// which runs only by name.
 #[test]
 fn crowded_voxel_is_truncated_and_noted() {
     const N: usize = 30_000;
@@ -349,7 +354,7 @@ fn crowded_voxel_is_truncated_and_noted() {
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 
-/// Case 33: balls along a line, ordered by size, in which each is the leader of the next.
+/// Case 33 of the table in `main.rs`: balls along a line, ordered by size, in which each is the leader of the next.
 #[test]
 fn sorted_chain_merges_by_the_sequential_rule() {
     const N: usize = 4000;
@@ -378,7 +383,8 @@ fn sorted_chain_merges_by_the_sequential_rule() {
     assert_eq!(summary["merge"]["passes"][0]["sequential"], true, "{}", summary["merge"]);
 }
 
-/// Case 36: behind the camera C and Vis are 0. The weights are opacity × area, and equal if those are 0 too.
+/// Case 36 of the table in `main.rs`: behind the camera C and Vis are 0. The weights are opacity × area, and equal if
+/// those are 0 too.
 #[test]
 fn unseen_gaussians_merge_by_opacity_times_area() {
     for (logits, weight) in [([2.0f32, -1.0], None), ([-200.0, -200.0], Some(0.5))] {

@@ -33,7 +33,7 @@ fn statistic(rows: &Rows, name: &str, i: usize) -> f64 {
     rows[name][i]
 }
 
-/// Case 4.
+/// Case 4 of the table in `main.rs`.
 #[test]
 fn two_frames_have_one_step_and_no_curvature() {
     let rows = move_along_x(30, 2, RUNS, |i, t| (i * t) as f64 * 0.25, |_, _| ALIVE);
@@ -46,9 +46,9 @@ fn two_frames_have_one_step_and_no_curvature() {
     }
 }
 
-/// Case 5, for a range of periods and phases. D holds to a relative error of 1e-6, and κ to 1e-6 of the amplitude:
-/// rounding positions to f32 leaves that error in second differences of 4e-5. Against the second differences of the
-/// rounded positions κ holds to a relative error of 1e-6.
+/// Case 5 of the table in `main.rs`, for a range of periods and phases. D holds to a relative error of 1e-6, and κ to
+/// 1e-6 of the amplitude: rounding positions to f32 leaves that error in second differences of 4e-5. Against the second
+/// differences of the rounded positions κ holds to a relative error of 1e-6.
 #[test]
 #[ignore = "needs time"]
 fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
@@ -75,7 +75,7 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
     }
 }
 
-/// Case 11, for opacities up to the largest f32 below 1, stored once and in every frame.
+/// Case 11 of the table in `main.rs`, for opacities up to the largest f32 below 1, stored once and in every frame.
 #[test]
 #[ignore = "needs time"]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
@@ -90,7 +90,7 @@ fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     }
 }
 
-/// Case 12, for a range of distances.
+/// Case 12 of the table in `main.rs`, for a range of distances.
 #[test]
 fn teleport_while_dead_changes_no_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
@@ -110,7 +110,7 @@ fn teleport_while_dead_changes_no_motion() {
     }
 }
 
-/// Case 13, for a range of distances; `merging.rs` checks that the pair never merges.
+/// Case 13 of the table in `main.rs`, for a range of distances; `merging.rs` checks that the pair never merges.
 #[test]
 fn teleport_while_alive_is_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
@@ -121,7 +121,7 @@ fn teleport_while_alive_is_motion() {
     }
 }
 
-/// Case 14, for every first frame of the life.
+/// Case 14 of the table in `main.rs`, for every first frame of the life.
 #[test]
 fn lives_of_1_2_3_frames_have_0_0_1_curvature_terms() {
     // Gaussian 3·b + l − 1 is alive for l frames from frame b on.
@@ -136,7 +136,7 @@ fn lives_of_1_2_3_frames_have_0_0_1_curvature_terms() {
     }
 }
 
-/// Case 15, for every pattern without two adjacent alive frames.
+/// Case 15 of the table in `main.rs`, for every pattern without two adjacent alive frames.
 #[test]
 fn alternating_lives_have_no_interior_triples() {
     let life = |i: usize, t: usize| if t % (2 + i / 2) == i % 2 { ALIVE } else { DEAD };
@@ -147,7 +147,7 @@ fn alternating_lives_have_no_interior_triples() {
     }
 }
 
-/// Case 16, for death at any frame, also at the end of the sequence.
+/// Case 16 of the table in `main.rs`, for death at any frame, also at the end of the sequence.
 #[test]
 fn curvature_at_the_last_alive_frame_is_discarded() {
     // Straight until death, then far away: only a second difference centered on the last alive frame would see the
@@ -161,7 +161,7 @@ fn curvature_at_the_last_alive_frame_is_discarded() {
     }
 }
 
-/// Case 19: subnormal numbers are values like any other.
+/// Case 19 of the table in `main.rs`: subnormal numbers are values like any other.
 #[test]
 fn subnormals_move_as_values_and_minus_0_is_0() {
     let step = |i: usize| f64::from(f32::from_bits(1)) * (i + 1) as f64;
@@ -183,8 +183,8 @@ fn subnormals_move_as_values_and_minus_0_is_0() {
     assert!(plus == minus, "the sign of 0 shows");
 }
 
-/// Case 25, for a range of offsets: resting Gaussians whose floats jitter have no motion and are counted; moving
-/// Gaussians have the motion of their rounded positions.
+/// Case 25 of the table in `main.rs`, for a range of offsets: resting Gaussians whose floats jitter have no motion and
+/// are counted; moving Gaussians have the motion of their rounded positions.
 #[test]
 fn far_from_the_origin_float_noise_is_snapped_and_counted() {
     const RESTING: usize = 30;

@@ -37,7 +37,7 @@ fn refused(bytes: &[u8], parts: &[&str]) {
     }
 }
 
-/// Case 41.
+/// Case 41 of the table in `main.rs`.
 #[test]
 fn nonincreasing_time_stamps_are_named() {
     for (stamp, expected) in [
@@ -54,7 +54,7 @@ fn nonincreasing_time_stamps_are_named() {
     }
 }
 
-/// Case 43.
+/// Case 43 of the table in `main.rs`.
 #[test]
 fn frames_of_another_size_or_attributes_are_named() {
     // (length that frame 3 claims, number of Gaussians that the message computes from it)

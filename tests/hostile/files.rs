@@ -1,5 +1,5 @@
-//! Binary inputs that announce more than they hold: PLY files, frame streams, containers, archives and arrays; and files
-//! of other kinds than regular ones in their place.
+//! Tests of binary inputs that announce more than they hold: PLY files, frame streams, containers, archives and arrays;
+//! and files of other kinds than regular ones in their place.
 //!
 //! Large inputs are sparse files: they take no space on disk and no memory of the test process.
 

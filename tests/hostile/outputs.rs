@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use super::runner::{Folder, Outcome, Random, SMALL_MEMORY, is_optimized, program, seed};
 
-/// Gaussians of the smallest input.
+/// Number of Gaussians of the smallest input.
 const COUNT: usize = 40;
 /// First line of the lock file in a workspace of the program, defined in `src/files/atomic/workspace.rs`.
 const LOCK_LINE: &str = "workspace of a splatsieve run\n";

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use splatsieve::model::{Camera, Gaussians};
 
-/// Folder names of the models.
+/// Folder names of the trained models.
 pub(crate) const NAMES: [&str; 3] = ["deform2", "room2_dynerf", "room2_big"];
 
 /// Returns the folder of trained models: `SPLATSIEVE_DATA`, or else `../shared/data`. Panics if it is missing.

@@ -1,4 +1,4 @@
-//! `demo` as a user runs it.
+//! Tests of the command `demo` as a user runs it.
 
 use std::fs;
 

@@ -1,4 +1,4 @@
-//! Pages for people: the player, reports and the demo.
+//! Tests of HTML pages: the player, reports and the demo.
 
 #[path = "../browser/mod.rs"]
 mod browser;

@@ -1,4 +1,5 @@
-//! The page that `view` writes: its bytes, and in a real browser its images against the program's own rasterizer.
+//! Tests of the page that `view` writes: its bytes, and its images in a real browser compared with the program's own
+//! rasterizer.
 #![cfg(unix)]
 
 use std::fs;
@@ -13,7 +14,8 @@ use serde_json::{Value, json};
 use splatsieve::render::render;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
-/// Least PSNR of the page's images against the rasterizer, dB. 35 dB are promised; 52 to 61 dB were measured.
+/// Minimum PSNR of the page's images against renders of the rasterizer, dB. 35 dB are promised; 52 to 61 dB were
+/// measured.
 const LEAST_DB: f64 = 50.0;
 
 fn opened(path: &Path, cameras: &Path) -> Scene {
@@ -21,7 +23,8 @@ fn opened(path: &Path, cameras: &Path) -> Scene {
     open_scene(&options).unwrap()
 }
 
-/// Obeys `hash` and waits until the image is drawn.
+/// Sets the fragment of the page's address to `hash`, which selects what the page shows, and waits until the image is
+/// drawn.
 fn go(page: &mut Browser, hash: &str) {
     page.value(&format!(
         "new Promise(done => {{ addEventListener('hashchange', () => splatsieve.settled().then(done), {{ once: true }}); \
@@ -30,14 +33,14 @@ fn go(page: &mut Browser, hash: &str) {
     assert_eq!(page.value("document.getElementById('status').textContent"), json!(""));
 }
 
-/// Returns the canvas: width, height, bytes.
+/// Returns width, height and bytes of the image that the page has drawn.
 fn pixels(page: &mut Browser) -> (u32, u32, Vec<u8>) {
     let found = page.value("splatsieve.pixels()");
     let number = |name: &str| found[name].as_u64().unwrap() as u32;
     (number("width"), number("height"), STANDARD.decode(found["rgb"].as_str().unwrap()).unwrap())
 }
 
-/// Returns the PSNR of the page's image of `view` at `frame` against the rasterizer, dB.
+/// Returns the PSNR of the page's image of view `view` at frame `frame` against the render of the rasterizer, dB.
 fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usize) -> f64 {
     go(page, &format!("show={show}&camera={view}&frame={frame}&paused&exact"));
     let (width, height, found) = pixels(page);
@@ -219,7 +222,7 @@ fn it_plays_seeks_turns_and_jumps_and_names_are_text() {
     assert_eq!(complaints(&page, None), Vec::<String>::new());
 }
 
-/// Returns the heights and widths of the visible controls: buttons and selects.
+/// JavaScript expression for the heights and widths of the visible controls: buttons and selects.
 const CONTROLS: &str = "[...document.querySelectorAll('#controls button, #controls select')].filter(e => e.offsetHeight)\
                         .map(e => [e.offsetHeight, e.offsetWidth, e.getAttribute('aria-label')])";
 

@@ -1,4 +1,4 @@
-//! `report` as a user runs it. `report_browser` tests the page in a browser.
+//! Tests of the command `report` as a user runs it. `report_browser` tests the page in a browser.
 
 use std::fs;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! The report in a real browser: its sliders, animations, layout and accessibility.
+//! Tests of the report page in a real browser: its sliders, animations, layout and accessibility.
 #![cfg(unix)]
 
 use std::fs;
@@ -7,7 +7,7 @@ use crate::browser::{self, Browser};
 use crate::scene::Workplace;
 use serde_json::json;
 
-/// Returns the border between the left and the right image of the first slider, percent of its width.
+/// JavaScript expression for the border between the left and the right image of the first slider, percent of its width.
 const CUT: &str = "(() => {
     const clip = getComputedStyle(document.querySelector('.slider img.right')).clipPath;
     return parseFloat(clip.match(/inset\\(.* ([\\d.]+)%\\)/)[1]);
@@ -192,7 +192,7 @@ fn report_and_player_have_no_serious_accessibility_violation() {
     assert!(violations.iter().any(|rule| rule.starts_with("image-alt")), "{violations:?}");
 }
 
-/// Returns the pairs of words of one chart that overlap, and the words that reach beyond their chart.
+/// JavaScript expression for the pairs of words of one chart that overlap, and the words that reach beyond their chart.
 const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
     const outer = svg.getBoundingClientRect();
     const words = [...svg.querySelectorAll('text')].map(text => [text.textContent, text.getBoundingClientRect()]);

@@ -1,4 +1,5 @@
-//! PSNR, SSIM and FLIP against independent implementations; `scripts/record_metrics.py` made the fixtures.
+//! Tests that compare PSNR, SSIM and FLIP with independent implementations; `scripts/record_metrics.py` made the
+//! fixtures.
 
 use std::fs::{self, File};
 use std::path::Path;

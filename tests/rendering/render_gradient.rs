@@ -1,4 +1,5 @@
-//! Gradients of the rasterizer against differences of the f64 oracle, closed forms, and invariants.
+//! Tests that compare gradients of the rasterizer with differences of the f64 oracle (slow reference), closed forms and
+//! invariants.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! The rasterizer against other computations: closed forms, a slow f64 oracle, and invariants.
+//! Tests that compare the rasterizer with other computations: closed forms, a slow f64 oracle, and invariants.
 
 use std::num::NonZeroU32;
 

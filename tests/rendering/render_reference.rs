@@ -1,4 +1,4 @@
-//! The rasterizer against renders of trained models made by a port of the original rasterizer.
+//! Tests that compare the rasterizer with renders of trained models made by a port of the original rasterizer.
 
 use crate::models;
 use splatsieve::render;

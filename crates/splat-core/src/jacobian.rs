@@ -19,8 +19,8 @@ fn attribute_index(column: Attributes) -> usize {
 }
 
 impl Jacobian {
-    /// Maximum number of bytes per Gaussian: full matrices for position and rotation, one factor for each other
-    /// attribute.
+    /// Maximum number of bytes per Gaussian that a Jacobian takes: full matrices for position and rotation, one factor
+    /// for each other attribute.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
     /// Returns the derivative of the single attribute `which`. It has no planes (width 0) if state and stored values

@@ -30,10 +30,10 @@ struct JacobianGroup {
 
 impl Field {
     /// Computes the derivative ∂state/∂raw at `time`, for the attributes `want` of a block of Gaussians. The state is
-    /// the attributes at that time; `raw` are the stored ones.
+    /// the attributes at that time: the stored ones `raw` plus the delta that the field predicts.
     ///
     /// `raw` must contain positions, and rotations if `want` contains them. A derivative that is not finite becomes 0;
-    /// for a position this concerns only ∂delta/∂position, not the identity.
+    /// for a position, whose derivative is I + ∂delta/∂position, this concerns only ∂delta/∂position.
     ///
     /// If the field has a mask (option `static_mlp` or `empty_voxel`), masks and deltas count as constant: the position
     /// at `time` then changes by the mask times the change of the stored position.

@@ -97,7 +97,7 @@ pub struct Tap {
 pub(super) struct PreparedPlanes {
     /// Products of the samples of the three planes without time, `[rows, width]`.
     product: Vec<f32>,
-    /// Where to interpolate on the lines of the three planes with time, `[rows, levels, 3]` for x, y, z.
+    /// Positions for interpolation on the lines of the three planes with time, `[rows, levels, 3]` for x, y, z.
     taps: Vec<Tap>,
 }
 

@@ -150,7 +150,8 @@ impl Scene {
         }
     }
 
-    /// Compares the first `frames` frames by every method of reading. Returns errors of the reader.
+    /// Compares the first `frames` frames of this scene with those of `reader`, read by every method of reading.
+    /// Returns errors of the reader.
     pub(crate) fn compare(&self, reader: &Reader, frames: usize) -> gseq::Result<()> {
         assert_eq!(*reader.layout(), self.layout);
         assert_eq!(reader.times(), &self.times[..frames]);

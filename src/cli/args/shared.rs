@@ -56,9 +56,9 @@ pub(in crate::cli) struct Trained {
 /// Handling of zero quaternions of a .splatv.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum ZeroRotationArg {
-    /// Remove these Gaussians
+    /// Remove Gaussians with a zero quaternion
     Drop,
-    /// Keep them with the identity rotation
+    /// Keep Gaussians with a zero quaternion, with the identity rotation
     Identity,
 }
 

@@ -9,7 +9,7 @@ use super::motion::{
     BRIGHT, CLOTH_WIDTH, DemoGaussian, DemoMotion, GONE, GaussianRandom, HALF_LIFE, color, facing_y, spread, still,
 };
 
-/// Body of the test scene.
+/// Body of the test scene: a group of Gaussians that form one object and share one property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DemoBody {
     /// Floor and three walls with a checkered texture. Still; each tile has one color, so its Gaussians can merge.
@@ -78,10 +78,10 @@ impl DemoBody {
     }
 }
 
-/// Ranges of the bodies' Gaussians.
+/// Ids of the Gaussians of each body (object of the test scene).
 #[derive(Debug, Clone)]
 pub(super) struct BodyLayout {
-    /// First id of each body, then the count.
+    /// First id of each body's Gaussians, then the number of Gaussians of the scene.
     starts: [usize; DemoBody::ALL.len() + 1],
 }
 
@@ -101,7 +101,7 @@ impl BodyLayout {
         self.starts[at]..self.starts[at + 1]
     }
 
-    /// Returns Gaussian `id`, less than the count.
+    /// Returns the constants and the motion of Gaussian `id`, which must be less than the number of Gaussians.
     pub(super) fn part(&self, id: usize) -> DemoGaussian {
         let body = DemoBody::ALL[self.starts.partition_point(|&start| start <= id) - 1];
         let members = self.members(body);
@@ -134,7 +134,7 @@ impl BodyLayout {
 }
 
 fn wall(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
-    /// Height of the walls and width of the room.
+    /// Height of the walls and width of the room in scene units, and area of one wall in square scene units.
     const HIGH: f64 = 2.5;
     const WIDE: f64 = 4.0;
     const WALL: f64 = HIGH * WIDE;

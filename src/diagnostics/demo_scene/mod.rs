@@ -32,7 +32,7 @@ const SH_DEGREE: usize = 1;
 
 /// Number of cameras of [`Scene::rig`].
 const CAMERAS: u32 = 6;
-/// Camera of the test view: an inner one, so that its view lies between training views.
+/// Index of the camera whose view is the test view. It is an inner one, so that its view lies between training views.
 const HELD_OUT: u32 = 2;
 
 /// The test scene: a room 4 units wide, 4 deep and 2.5 high, z up, open toward −y.
@@ -55,9 +55,9 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Usual number of Gaussians.
+    /// Default number of Gaussians of the generated scene.
     pub const COUNT: usize = 6000;
-    /// Usual number of frames.
+    /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
     /// Returns the scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.

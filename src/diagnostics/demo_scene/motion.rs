@@ -19,7 +19,7 @@ pub(super) struct DemoGaussian {
     pub(super) sh: [f32; 12],
 }
 
-/// Values of one Gaussian that vary, at one time.
+/// Attributes of one Gaussian that vary over time, at one time.
 pub(super) struct Moved {
     pub(super) position: DVec3,
     pub(super) rotation: DQuat,
@@ -33,7 +33,7 @@ pub(super) enum DemoMotion {
     Still,
     /// Circles and spins with the egg. `position` and `rotation` are relative to the egg.
     Egg,
-    /// Displacement along y by a wave, `along` from 0 (held) to 1 (free).
+    /// Displacement along y by a wave; `along` is 0 at the edge where the cloth is held and 1 at its free edge.
     Wave { along: f64 },
     /// The opacity logit changes at this rate per unit of time.
     Fade { rate: f64 },
@@ -50,29 +50,29 @@ pub(super) enum DemoMotion {
 
 /// Width of the cloth along x, scene units.
 pub(super) const CLOTH_WIDTH: f64 = 1.2;
-/// Amplitude at the free edge of the cloth, scene units.
+/// Amplitude of the wave at the free edge of the cloth, scene units.
 const SWING: f64 = 0.18;
-/// Waves along the cloth.
+/// Number of wavelengths along the cloth.
 const WAVES: f64 = 1.5;
-/// Waves that pass in the sequence.
+/// Number of periods of the cloth's wave in the sequence.
 const PASSES: f64 = 2.0;
-/// Logit at which a spark or a fading Gaussian counts as invisible; 0.01, the usual alpha_min, is −4.6.
+/// Opacity logit at which a spark or a fading Gaussian counts as invisible; 0.01, the usual alpha_min, is −4.6.
 pub(super) const GONE: f64 = -6.0;
-/// Logit of the sparks at their peak.
+/// Opacity logit of the sparks at their peak.
 pub(super) const BRIGHT: f64 = 3.0;
-/// Half life span of a spark. With 1/16 it is visible for an eighth of the sequence.
+/// Half life span of a spark, as a fraction of the sequence. With 1/16 it is visible for an eighth of the sequence.
 pub(super) const HALF_LIFE: f64 = 1.0 / 16.0;
 const GRAVITY: f64 = 12.0;
-/// Radius of the ball, and height of its center above that at the top of a bounce, scene units.
+/// Radius of the ball, and how far its center rises in a bounce, scene units.
 pub(super) const BALL_RADIUS: f64 = 0.34;
 const BOUNCE: f64 = 0.9;
-/// Bounces of the ball in the sequence.
+/// Number of bounces of the ball in the sequence.
 const BOUNCES: f64 = 3.0;
-/// Double steps of the figure in the sequence.
+/// Number of double steps (one with each leg) of the figure in the sequence.
 const STEPS: f64 = 6.0;
 
 impl DemoGaussian {
-    /// Returns the varying values at `time`.
+    /// Returns the attributes that vary over time, at `time` in [0, 1].
     pub(super) fn at(&self, time: f64) -> Moved {
         let DemoGaussian { mut position, mut rotation, mut opacity_logit, .. } = *self;
         match self.motion {
@@ -127,24 +127,25 @@ impl DemoGaussian {
 pub(super) struct GaussianRandom(pub(super) u64);
 
 impl GaussianRandom {
-    /// Returns number `channel`, from 0 to 1.
+    /// Returns the Gaussian's random number with the index `channel`, in [0, 1].
     pub(super) fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
         (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
     }
 
-    /// Returns number `channel`, from −1 to 1.
+    /// Returns the Gaussian's random number with the index `channel`, in [−1, 1].
     pub(super) fn signed(self, channel: u64) -> f64 {
         2.0 * self.unit(channel) - 1.0
     }
 
-    /// Returns number `channel`, from `low` to `high`.
+    /// Returns the Gaussian's random number with the index `channel`, in [`low`, `high`].
     pub(super) fn between(self, channel: u64, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit(channel)
     }
 }
 
-/// Channels of [`GaussianRandom`] that every body uses. The channels of a single body start at 0.
+/// First of the channels (indices of random numbers in [`GaussianRandom`]) that the Gaussians of all bodies use. The
+/// channels of a single body start at 0.
 const TINT: u64 = 100;
 const SHEEN: u64 = 200;
 
@@ -176,7 +177,7 @@ pub(super) fn spread(k: usize) -> DVec2 {
     DVec2::new((0.5 + k / PLASTIC).fract(), (0.5 + k / (PLASTIC * PLASTIC)).fract())
 }
 
-/// Returns the rotation of the thin axis z to ∓y.
+/// Returns the rotation that turns z, the thin axis of a flat Gaussian, to −y, so that the Gaussian faces along y.
 pub(super) fn facing_y() -> DQuat {
     DQuat::from_rotation_x(FRAC_PI_2)
 }

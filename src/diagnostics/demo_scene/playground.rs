@@ -17,9 +17,10 @@ use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Number of cameras of [`Playground::rig`].
 const CAMERAS: u32 = 12;
-/// Views that are used only for testing. None is at an end of the arc, so each lies between training views.
+/// Indices of the views that are used only for testing. None is at an end of the arc, so each lies between training
+/// views.
 const TEST_VIEWS: [u32; 3] = [2, 5, 9];
-/// Size of the renders, pixels.
+/// Width and height of the renders, pixels.
 const RENDER: (u32, u32) = (320, 240);
 /// Radius of the ground and of the sky, scene units. The cameras are inside.
 const HORIZON: f64 = 8.0;
@@ -37,7 +38,7 @@ const SAIL: f64 = 1.15;
 const POLE: DVec3 = DVec3::new(0.75, 1.1, 0.0);
 const POLE_HEIGHT: f64 = 2.5;
 
-/// Objects of the scene, in the order of their Gaussians, with their parts of a thousand Gaussians.
+/// Objects of the scene in the order of their Gaussians, each with its share in thousandths of all Gaussians.
 const SHARES: [(PlaygroundObject, usize); 11] = [
     (PlaygroundObject::Sky, 40),
     (PlaygroundObject::Ground, 330),
@@ -68,7 +69,7 @@ enum PlaygroundObject {
     Figure,
 }
 
-/// The scene, z up, with its cameras on the side of −y.
+/// Generated scene of a playground, z up, with its cameras on the side of −y.
 ///
 /// With more Gaussians the surfaces consist of smaller ones; with more frames the same motion is sampled more finely.
 ///
@@ -86,9 +87,9 @@ pub struct Playground {
 }
 
 impl Playground {
-    /// Usual number of Gaussians.
+    /// Default number of Gaussians of the generated scene.
     pub const COUNT: usize = 20_000;
-    /// Usual number of frames.
+    /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
     /// Returns the scene as `count` Gaussians at `frames` times from 0 up to, but without, 1.
@@ -119,7 +120,7 @@ impl Playground {
         }
     }
 
-    /// Returns Gaussian `id`, less than the count.
+    /// Returns the constants and the motion of Gaussian `id`, which must be less than the number of Gaussians.
     fn part(&self, id: usize) -> DemoGaussian {
         let dice = GaussianRandom(id as u64);
         let (mut start, mut share) = (0, 0);
@@ -145,17 +146,17 @@ impl FrameSource for Playground {
     }
 }
 
-/// A point of a surface.
+/// Point of a surface at which a Gaussian is placed.
 struct SurfacePoint {
     position: DVec3,
     normal: DVec3,
     rgb: [f64; 3],
-    /// Part of the surface that its Gaussian covers.
+    /// Area of the surface that the Gaussian covers, square scene units.
     area: f64,
     motion: DemoMotion,
 }
 
-/// Returns Gaussian `k` of the `n` of an object.
+/// Returns Gaussian `k` of the `n` Gaussians of `object`. `dice` is the source of its random numbers.
 fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     let point = match object {
         PlaygroundObject::Sky => sky(k, n),
@@ -182,7 +183,8 @@ fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) 
     DemoGaussian { motion: point.motion, ..made }
 }
 
-/// Returns point `k` of `n` on the unit sphere, evenly spread; the area of each is 2τ/n.
+/// Returns point `k` of a sequence of points that are evenly spread on the unit sphere; each of n points stands for the
+/// area 2τ/n.
 fn on_sphere(k: usize) -> DVec3 {
     let DVec2 { x: turn, y: height } = spread(k);
     let z = 2.0 * height - 1.0;
@@ -202,8 +204,8 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
 }
 
 fn ground(k: usize, n: usize) -> SurfacePoint {
-    /// Exponent of the distance from the center as a function of a uniform number. 0.5 spreads the Gaussians evenly; more
-    /// places fewer, larger ones outside.
+    /// Exponent by which a uniform number in [0, 1] becomes a distance from the center. 0.5 spreads the Gaussians
+    /// evenly; a larger exponent places fewer and larger ones outside.
     const DENSITY: f64 = 0.8;
     let DVec2 { x: turn, y: part } = spread(k);
     let radius = HORIZON * part.powf(DENSITY);
@@ -220,7 +222,8 @@ fn ground(k: usize, n: usize) -> SurfacePoint {
     SurfacePoint { position, normal: DVec3::Z, rgb, area, motion: DemoMotion::Still }
 }
 
-/// Returns the side of a cone without its ends, from `low` to `high` in radius, standing on `foot`.
+/// Returns point `k` of `n` on the side of a cone without its end faces, standing on `foot`. Its radius changes from
+/// `low` at the foot to `high` at the top.
 fn cone(k: usize, n: usize, foot: DVec3, [low, high]: [f64; 2], height: f64) -> SurfacePoint {
     let DVec2 { x: turn, y: up } = spread(k);
     let (sin, cos) = (TAU * turn).sin_cos();
@@ -234,7 +237,7 @@ fn cone(k: usize, n: usize, foot: DVec3, [low, high]: [f64; 2], height: f64) -> 
     }
 }
 
-/// Feet of the trees.
+/// Positions of the feet of the trees, scene units.
 const TREES: [DVec3; 2] = [DVec3::new(2.7, 1.6, 0.0), DVec3::new(-3.0, 2.2, 0.0)];
 
 fn trunk(k: usize, n: usize) -> SurfacePoint {
@@ -284,7 +287,7 @@ fn cap(k: usize, n: usize) -> SurfacePoint {
     }
 }
 
-/// Returns a point of the four sails, which turn once in the sequence.
+/// Returns point `k` of `n` on the four sails, which turn once in the sequence.
 fn sails(k: usize, n: usize) -> SurfacePoint {
     const WIDTH: f64 = 0.3;
     let (sail, k, n) = (k % 4, k / 4, n.div_ceil(4));
@@ -352,7 +355,7 @@ struct Limb {
     joint: DVec3,
     swing: f64,
     rgb: [f64; 3],
-    /// Parts of a hundred Gaussians of the figure.
+    /// Share of the Gaussians of the figure in hundredths.
     share: usize,
 }
 

@@ -11,7 +11,7 @@ fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
     out
 }
 
-/// Returns a body at every frame.
+/// Returns the Gaussians of a body (object of the scene) at every frame.
 fn film(scene: &Scene, body: DemoBody) -> Vec<Gaussians> {
     let members = scene.members(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()

@@ -45,7 +45,8 @@ use judge::Judge;
 /// Group of settings that a diagram varies, called a knob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Knob {
-    /// Settings of the first ranking by renders: the number of views, and the strides of pixels, views and frames.
+    /// Settings of the first ranking by renders, before the pruning rounds: the number of views, and the strides of
+    /// pixels, views and frames.
     Look,
     /// Settings of the pruning rounds (rank, remove the lowest, repeat): views per round, and the fraction of the
     /// Gaussians that a round keeps.

@@ -43,7 +43,8 @@ struct TriedRanking {
     kept: Vec<u32>,
 }
 
-/// Recipe of one setting, and the position of the setting on its curve.
+/// Recipe of one setting. `value` is the value of the varied parameter, `step` its step size h (errors grow with a
+/// power of h).
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -110,8 +111,9 @@ impl Bench<'_> {
         self.repeats.measure(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// Measures the rankings of `variants` as one curve, which ends at the finest setting. `finest`: contributions
-    /// measured with the finest setting, at position (`value`, `step`) of the curve. `own`: value of the recipe itself.
+    /// Measures the rankings of `variants` as one curve, which ends at the finest setting. `finest`: value and step
+    /// size of the finest setting, the contributions measured with it, and their cost. `own`: value of the parameter in
+    /// the recipe.
     fn pass_curve(
         &self,
         name: &str,
@@ -184,8 +186,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Ranks the Gaussians in pruning rounds with the settings `select`, and measures the cost. (`value`, `step`):
-    /// position of this setting on its curve.
+    /// Ranks the Gaussians in pruning rounds with the settings `select`, and measures the cost. `value` is the value of
+    /// the varied parameter, `step` its step size h (errors grow with a power of h).
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {

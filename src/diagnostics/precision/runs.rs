@@ -31,7 +31,7 @@ const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 /// Maximum number of frames at which the results of complete runs are compared with the whole model.
 const FRAMES_COMPARED: usize = 12;
 
-/// Text for the results: what the results of complete runs are compared with.
+/// Text for the results that says with what the results of complete runs are compared.
 const WHOLE: &str = "renders of the whole model: every held-out view of up to 12 frames";
 
 impl Bench<'_> {
@@ -151,8 +151,8 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Runs the whole program with `recipe` and measures quality and cost. (`value`, `step`): position of this setting
-    /// on its curve.
+    /// Runs the whole program with `recipe` and measures quality and cost. `value` is the value of the varied
+    /// parameter, `step` its step size h (errors grow with a power of h).
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
@@ -167,7 +167,7 @@ impl Bench<'_> {
     }
 
     /// Runs the whole program with `recipe` and compares the digest of the result with `expected`, the digest of the
-    /// first run, which is set if it is `None`. `value`: position of this setting on its curve.
+    /// first run, which is set if it is `None`. `value`: value of the varied parameter.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

@@ -21,10 +21,10 @@ use crate::statistics::{BlockScan, NEEDED, ScanPlan};
 const GAUSSIANS: usize = 64;
 /// Maximum number of different frames that are played, spaced evenly over all frames of the scene.
 const MOST_FRAMES: usize = 240;
-/// Lengths of the played sequences, in frames.
+/// Lengths, in frames, of the sequences that playing the frames forward and backward gives.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
-/// Text for the results: what the sums are compared with.
+/// Text for the results that says with what the sums are compared.
 const AGAINST: &str = "f64, compensated";
 
 /// Sum of numbers of type `T` that are added one after the other.

@@ -230,7 +230,7 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     Ok(worst)
 }
 
-/// Returns one Gaussian at frame `t` that alternately moves by +3 and −3.
+/// Returns one Gaussian at frame `t` that alternately moves by +3 and −3 scene units along x.
 fn zigzag(t: usize, alive: bool) -> Gaussians {
     let mut frame = resting(1);
     frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);

@@ -23,12 +23,12 @@ pub const MARKER: &str = "summary.json";
 /// are not summaries of this program and are not read.
 const MAX_SUMMARY: u64 = 16 << 20;
 
-/// What a summary declares about the files of its result.
+/// Content of a summary as far as it concerns the ownership of files.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
     /// There is no summary with a list of files, or the summary is one of another program.
     Unknown,
-    /// The summary was written by this program and lists these files.
+    /// The summary was written by this program and lists the files of its result, which are contained here.
     Listed(BTreeSet<String>),
 }
 

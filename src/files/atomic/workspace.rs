@@ -40,8 +40,8 @@ pub(super) const REPLACED: &str = "replaced";
 pub(super) const DISCARDED: &str = "discarded";
 /// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
-/// Names of entries that must not be deleted with their workspace. The next run with the same output completes or
-/// reverts what they stand for.
+/// Names of the entries of a workspace that must not be deleted with it: an earlier output folder, and a journal. The
+/// next run with the same output restores the earlier folder, or completes or reverts the moves in the journal.
 const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
 /// Paths of the workspaces (hidden output folders) of this process, with the identity of each folder. A thread that

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use super::assemble::ListedImage;
 use crate::model::Split;
 
-/// Beginning of the folder names.
+/// Beginning of the names of the folders `colmap_K`, each of which holds the COLMAP data of one frame.
 const PREFIX: &str = "colmap_";
 
 /// Returns the folder of the COLMAP reconstruction (`sparse/0`) in the first of the folders `colmap_K` in `path`.

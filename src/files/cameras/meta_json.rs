@@ -86,7 +86,7 @@ impl<T> KeyedValues<T> {
     }
 }
 
-/// Values of the four keys by frame and camera, of one file.
+/// Values of the four [`KEYS`] of one camera file, by frame and camera.
 #[derive(Debug)]
 struct Tables {
     intrinsics: KeyedValues<[f64; 4]>,

@@ -224,7 +224,8 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Returns whether no value that the reader needs of `column` changes within the frame block.
+    /// Returns whether the values of `column`, for all Gaussians that the reader needs, are constant within the frame
+    /// block.
     fn is_constant(&self, column: u32, frame_block: u32) -> Result<bool> {
         for run in &self.runs {
             let at = TileId { column, gaussian_block: run.gaussian_block, frame_block };

@@ -16,10 +16,10 @@ use crate::files::defects::Defects;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ZeroRotation {
-    /// The rows are left out, because no player draws them.
+    /// Rows with quaternion 0 are left out, because no player draws them.
     #[default]
     Drop,
-    /// The rows are kept with the identity as rotation, as SpacetimeGaussians does in training.
+    /// Rows with quaternion 0 are kept with the identity as rotation, as SpacetimeGaussians does in training.
     Identity,
 }
 

@@ -172,7 +172,7 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Visits node `id`, which is the child `part` of the node called `name`.
+    /// Adds the tensors at and below node `id`, which is the child `part` of the node called `name`.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {

@@ -247,7 +247,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         Timing::Continuous
     }
 
-    /// Leaves camera times unchanged, since the network was trained with them.
+    /// Returns [`Clock::Given`]: camera times are used unchanged, because the network was trained with them.
     fn clock(&self) -> Clock {
         Clock::Given
     }

@@ -207,7 +207,7 @@ struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared differences of log scales and of unit quaternions, summed over frames.
+    /// Squared differences between target and proxy in log scales and in unit quaternions, summed over frames.
     off: f64,
 }
 

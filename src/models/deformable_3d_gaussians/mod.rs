@@ -175,7 +175,8 @@ impl NetworkMotionModel for DeformableMotion {
         Network::BYTES_PER_GAUSSIAN
     }
 
-    /// Returns the CPU seconds per state, measured by `benches/families.rs`, as a function of the size of the network.
+    /// Returns the CPU seconds per state (one Gaussian at one frame), measured by `benches/families.rs`, as a function
+    /// of the size of the network.
     fn seconds_per_state(&self) -> f64 {
         1e-6 + 2e-11 * self.network.multiplications() as f64
     }

@@ -57,8 +57,8 @@ impl InputModel for ModelFolder {
         Ok(self.size()?.whole())
     }
 
-    /// Does not count `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has
-    /// them.
+    /// Returns the size in bytes of the files that a renderer opens, divided into parts. Does not count
+    /// `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has them.
     fn size(&self) -> Result<Size> {
         let paths = self.paths();
         size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)

@@ -24,12 +24,14 @@ pub(in crate::models) enum RowElement {
 }
 
 impl RowElement {
-    /// Returns the meaning of `count` values that are components of an attribute, beginning with component `skipped`.
+    /// Returns the meaning of `count` consecutive values in a tensor's row: the components of the attribute `column`,
+    /// beginning with component `skipped`.
     pub(in crate::models) fn all_of(column: Attributes, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Returns the meaning of `count` values that are parameters in [`StoredParams::own`], from index `first` on.
+    /// Returns the meaning of `count` consecutive values in a tensor's row: the parameters in [`StoredParams::own`],
+    /// from index `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }

@@ -10,7 +10,8 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::render::{BYTES_PER_VISIBLE, STRIP_BYTES};
 use crate::tracking::{Joiner, Linker};
 
-/// Maximum bytes of frames that are packed into a container, or unpacked from one, together; at least one frame is.
+/// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
+/// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
 /// Bytes of memory per Gaussian of a frame for the list of its rows, and for a copy of this list for sorting.
 const BYTES_PER_ROW: u64 = 16;

@@ -50,11 +50,11 @@ pub struct LinkedFrames {
     notes: Vec<String>,
     /// Owner of the container's file; deletes the file when it is dropped.
     _scratch: ScratchFile,
-    /// Where the frames came from; `None` if from PLY files of the user.
+    /// Origin of the frames; `None` for PLY files of the user.
     origin: Option<Origin>,
 }
 
-/// Where frames came from that were first unpacked to temporary PLY files, such as those of a container or a stream.
+/// Origin of frames that were first unpacked to temporary PLY files, such as those of a container or a stream.
 struct Origin {
     /// Owner of the temporary PLY files of the frames; deletes them when it is dropped.
     _folder: ScratchFolder,

@@ -360,7 +360,8 @@ struct FrameBlock<'a> {
     files: &'a [Ply],
     /// For each frame of the block the rows of its Gaussians, sorted by track.
     rows: &'a [Vec<TrackedRow>],
-    /// For each track its last frame and row before this block, or its first ones if it begins later.
+    /// For each track the frame and row of its last Gaussian before this block; if the track begins later, those of its
+    /// first Gaussian.
     held: &'a [TrackPosition],
 }
 

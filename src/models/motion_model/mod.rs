@@ -186,7 +186,8 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
-    /// Returns `None`: no frames are decoded together, so blocks of Gaussians are read one by one.
+    /// Returns a reader that computes the Gaussians block by block. A model computes each frame on its own, so a reader
+    /// of all Gaussians has no decoded frames to keep in memory.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
@@ -274,7 +275,7 @@ impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
     }
 }
 
-/// Evaluation of blocks of Gaussians in parallel.
+/// Computes frame states from stored parameters, a block of Gaussians at a time.
 impl<L: MotionModel> Deformation for MotionModelFrames<L> {
     fn stored(&self) -> &StoredParams {
         &self.raw

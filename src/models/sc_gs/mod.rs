@@ -391,7 +391,7 @@ impl NetworkMotionModel for NodeMotion {
         self.nodes.as_ref().map_or(0, |sparse| MAX_CACHE_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
     }
 
-    /// Returns the CPU seconds per state, measured by `benches/families.rs`.
+    /// Returns the CPU seconds per state (one Gaussian at one frame), measured by `benches/families.rs`.
     fn seconds_per_state(&self) -> f64 {
         match &self.nodes {
             Some(_) => 2e-7,

@@ -21,8 +21,8 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Factor of widths beyond which the temporal windows of a member and the proxy count as different. They also do if
-/// their centers differ by more than half of the proxy's width.
+/// Maximum ratio between the widths of the temporal windows of a member and of the proxy. With a larger ratio, or with
+/// centers further apart than half of the proxy's width, the windows count as different.
 const MAX_WIDTH_RATIO: f64 = 1.5;
 /// A temporal window, whose maximum is 1, is ignored at times where its value is below this.
 const MIN_WINDOW: f64 = 0.05;

@@ -1,4 +1,5 @@
-//! Every failure mode is flagged in a scene with that damage, and in no scene with another damage.
+//! Tests that every failure mode is flagged in a scene with the corresponding damage, and in no scene with another
+//! damage.
 
 use glam::DVec3;
 
@@ -15,7 +16,7 @@ use crate::recipe::Recipe;
 use crate::report::traits::{shares, traits};
 use crate::source::FrameSource;
 
-/// Test scene with its scores and traits.
+/// Test scene with its scores and the kinds of its Gaussians.
 struct Looked {
     made: Scene,
     scored: Scored,
@@ -38,7 +39,7 @@ fn looked() -> Looked {
 }
 
 impl Looked {
-    /// Returns the share of the visible members of a body that have a trait.
+    /// Returns the fraction of the visible Gaussians of a body (object of the test scene) that belong to a kind.
     fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
         let members: Vec<usize> = self.made.members(body).filter(|&i| rows.c[i] > 0.0).collect();
@@ -46,7 +47,7 @@ impl Looked {
         with as f64 / members.len().max(1) as f64
     }
 
-    /// Returns the verdicts on a result without the Gaussians `lost`.
+    /// Returns the failure modes that are found in a result without the Gaussians for which `lost` is true.
     fn without(&self, lost: impl Fn(usize) -> bool) -> [FailureMode; 3] {
         let rig = self.made.rig();
         let all: Vec<u32> = (0..self.traits.len() as u32).collect();

@@ -54,7 +54,7 @@ impl<'a> BlockScans<'a> {
     /// Reads the frames `frames` of a block with `reader` and adds them to the block's scan.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if a frame cannot be read.
     pub(crate) fn add(
         &self,
         (scan, state): &mut (BlockScan<'a>, Gaussians),
@@ -87,7 +87,7 @@ impl<'a> BlockScans<'a> {
     /// Scans all frames of block `block`. Returns its rows and the largest |coordinate| of its positions.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if a frame cannot be read.
     pub(crate) fn block(&self, block: usize) -> Result<(Rows, f32)> {
         let mut scan = self.begin(block);
         let mut reader = self.source.open(Ids::Range(self.range(block)))?;

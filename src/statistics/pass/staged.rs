@@ -44,7 +44,7 @@ struct StagedResult {
 /// Scans all blocks of `scan`. Returns for each, in order, its rows and the largest |coordinate| of its positions.
 ///
 /// # Errors
-/// Frames that cannot be read: the error of the lowest-numbered block that failed.
+/// Fails if a frame cannot be read, with the error of the lowest-numbered block that failed.
 pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(Rows, f32)>> {
     let blocks = scan.blocks();
     let lanes = rayon::current_num_threads().min(blocks);

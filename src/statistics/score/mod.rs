@@ -26,10 +26,9 @@ pub struct Scores {
     pub dynamic_score: Vec<f64>,
     /// Score S = w_s·S_static + w_d·S_dynamic, by which Gaussians are ranked.
     pub score: Vec<f64>,
-    /// Normalized static score norm(S_static), which stage 2 of the selection (the OR rule) compares with a threshold.
+    /// Normalized static score norm(S_static), which the second stage of the selection compares with a threshold.
     pub static_norm: Vec<f64>,
-    /// Normalized dynamic score norm(S_dynamic), which stage 2 of the selection (the OR rule) compares with a
-    /// threshold.
+    /// Normalized dynamic score norm(S_dynamic), which the second stage of the selection compares with a threshold.
     pub dynamic_norm: Vec<f64>,
     /// Normalization of every term of the scores: first the terms of S_static, then those of S_dynamic, then S_static
     /// and S_dynamic themselves. Terms of weight 0 are not computed and are missing.

@@ -6,7 +6,7 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
 /// Render of one view by the oracle, the slow f64 reference.
 pub struct OracleRender {
-    /// Colors of the pixels, `[height · width]`.
+    /// Colors of the pixels row by row, `height · width` of them: red, green and blue.
     pub rgb: Vec<[f64; 3]>,
     /// Whether a comparison at the pixel was within a fraction of 1e-4 of its threshold, so that f32 may decide
     /// differently.

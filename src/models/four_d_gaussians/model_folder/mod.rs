@@ -273,7 +273,7 @@ impl FrameSource for ModelFolder {
     }
 }
 
-/// Evaluation of blocks of Gaussians in parallel.
+/// Computes frame states from stored parameters, a block of Gaussians at a time.
 impl Deformation for ModelFolder {
     fn stored(&self) -> &StoredParams {
         &self.canonical
