@@ -338,6 +338,8 @@ pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
         OutputKindArg::Splatv => OutputKind::Splatv,
         OutputKindArg::FourDgs => OutputKind::FourDgs,
         OutputKindArg::Spz => OutputKind::Spz,
+        OutputKindArg::Sog => OutputKind::Sog,
+        OutputKindArg::SogSequence => OutputKind::SogSequence,
     }
 }
 

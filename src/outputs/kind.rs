@@ -27,6 +27,10 @@ pub enum OutputKind {
     FourDgs,
     /// A `.spz` file: one frame, strongly compressed.
     Spz,
+    /// A `.sog` file: one frame, as images for web players.
+    Sog,
+    /// A folder with one `.sog` file per frame.
+    SogSequence,
 }
 
 impl OutputKind {
@@ -51,8 +55,10 @@ impl OutputKind {
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
+             NAME.sog       one frame, the smallest for web viewers\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
-             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz",
+             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|sog|\
+             sog-sequence",
             path.shown(),
             path.shown()
         )))
@@ -66,13 +72,14 @@ impl OutputKind {
             "splatv" => Some(OutputKind::Splatv),
             "4dgs" => Some(OutputKind::FourDgs),
             "spz" => Some(OutputKind::Spz),
+            "sog" => Some(OutputKind::Sog),
             _ => None,
         }
     }
 
     /// Returns whether this kind of output is a folder rather than a file.
     pub fn is_folder(self) -> bool {
-        matches!(self, OutputKind::Model | OutputKind::PlySequence)
+        matches!(self, OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence)
     }
 
     /// Returns whether this kind of output stores every frame, unlike a model from which frames are computed.
@@ -83,11 +90,15 @@ impl OutputKind {
     /// Checks that this kind of output can hold `frames` frames. Messages name `path`.
     ///
     /// # Errors
-    /// Fails for a `.spz` file if the number of frames is not 1.
+    /// Fails for a `.spz` or a `.sog` file if the number of frames is not 1.
     pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
         match self {
             OutputKind::Spz if frames != 1 => Err(Error::usage(format!(
                 "{}: {frames} frames do not fit one .spz\n  write a .splatv, a .4dgs or a .gseq",
+                path.shown()
+            ))),
+            OutputKind::Sog if frames != 1 => Err(Error::usage(format!(
+                "{}: {frames} frames do not fit one .sog\n  write --as sog-sequence, a .splatv, a .4dgs or a .gseq",
                 path.shown()
             ))),
             _ => Ok(()),
@@ -140,7 +151,7 @@ mod tests {
     #[test]
     fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
-        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.sog"] {
+        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.glb"] {
             let message = refused(name).expect(name);
             for part in [name, "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"] {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");
