@@ -76,3 +76,6 @@ pub(crate) struct PaletteEntry {
     codebook: Vec<Option<f32>>,
     files: [String; 2],
 }
+
+#[cfg(test)]
+mod tests;

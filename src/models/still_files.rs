@@ -1,4 +1,4 @@
-//! Files of web viewers that hold one frame each (`.sog`): a single file, or a folder with one file per frame.
+//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file, or a folder with one file per frame.
 //!
 //! The files are decoded into PLY files in a temporary folder and opened there like PLY frames, so every command that
 //! reads PLY frames reads them too.
@@ -14,10 +14,16 @@ use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::ScratchFolder;
+use crate::files::compressed_ply::{self, read_compressed_ply};
 use crate::files::digest::hash_file;
+use crate::files::glb;
+use crate::files::glb::read::read_glb;
 use crate::files::ply::write::write_inria;
 use crate::files::ply_frames::{FrameFiles, PlyFrames};
 use crate::files::sog::read::read_sog;
+use crate::files::splat::read_splat;
+use crate::files::spz;
+use crate::files::spz::read::read_spz;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
 use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
@@ -38,15 +44,47 @@ struct StillFormat {
 }
 
 /// All formats of this module.
-const FORMATS: [StillFormat; 1] = [StillFormat {
-    ending: ".sog",
-    kind: "SOG frames",
-    recognizes: |found| match found.is_folder {
-        true => found.path.join("meta.json").is_file() && found.path.join("quats.webp").is_file(),
-        false => has_ending(found.path, ".sog"),
+const FORMATS: [StillFormat; 5] = [
+    StillFormat {
+        ending: ".sog",
+        kind: "SOG frames",
+        recognizes: |found| match found.is_folder {
+            true => found.path.join("meta.json").is_file() && found.path.join("quats.webp").is_file(),
+            false => has_ending(found.path, ".sog"),
+        },
+        read: read_sog,
     },
-    read: read_sog,
-}];
+    StillFormat {
+        ending: ".spz",
+        kind: "SPZ frames",
+        recognizes: |found| found.is_file_of(&spz::MAGIC.to_le_bytes(), "spz"),
+        read: read_spz,
+    },
+    StillFormat {
+        ending: ".splat",
+        kind: "splat frames",
+        recognizes: |found| !found.is_folder && has_ending(found.path, ".splat"),
+        read: read_splat,
+    },
+    StillFormat {
+        ending: ".glb",
+        kind: "glTF frames",
+        recognizes: |found| found.is_file_of(&glb::MAGIC.to_le_bytes(), "glb"),
+        read: read_glb,
+    },
+    StillFormat {
+        ending: ".compressed.ply",
+        kind: "compressed PLY frames",
+        recognizes: |found| has_packed_positions(found),
+        read: read_compressed_ply,
+    },
+];
+
+/// Returns whether the file is a PLY whose header has an element `chunk` first or a packed property near its start.
+fn has_packed_positions(found: &FoundInput) -> bool {
+    let has = |text: &str| found.head.windows(text.len()).any(|part| part == text.as_bytes());
+    !found.is_folder && found.head.starts_with(b"ply") && (has("\nelement chunk ") || has(compressed_ply::MARKER))
+}
 
 /// File of a web viewer, or a folder of such files.
 pub(super) const ENTRY: ModelFormat = ModelFormat {

@@ -10,9 +10,10 @@ use gseq::Compression;
 
 use crate::compressed_model::{CompressedModel, TrajectoryDelta};
 use crate::error::{Error, Result, ShowPath};
+use crate::files::glb::write::write_glb;
 use crate::files::ply::write::write_inria;
 use crate::files::sog::write::{SogErrors, drawn, write_sog};
-use crate::files::spz::write_spz;
+use crate::files::spz::{SpzVersion, write_spz};
 use crate::limits::Limits;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
@@ -164,12 +165,17 @@ pub fn write_sequence(
     match kind {
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
-        OutputKind::Spz => {
-            let off = write_spz(&gather_all(source, 0, Attributes::all())?, path)?;
+        OutputKind::Spz | OutputKind::Spz4 => {
+            let version = if kind == OutputKind::Spz { SpzVersion::V3 } else { SpzVersion::V4 };
+            let off = write_spz(&gather_all(source, 0, Attributes::all())?, version, path)?;
             return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
         OutputKind::Sog => {
             return Ok(vec![write_sog(&gather_all(source, 0, Attributes::all())?, path)?.note()]);
+        }
+        OutputKind::Glb => {
+            write_glb(&gather_all(source, 0, Attributes::all())?, path)?;
+            return Ok(Vec::new());
         }
         OutputKind::SogSequence => return write_sog_sequence(source, path, held, events),
         OutputKind::Gseq => {

@@ -184,7 +184,7 @@ fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
                 path,
                 format!("meta.json, means, axis {axis}"),
                 expected,
-                format!("{min} to {max}"),
+                format!("{min:.3e} to {max:.3e}"),
             ));
         }
     }
