@@ -235,7 +235,7 @@ pub(super) enum OutputKindArg {
     FourDgs,
     /// One frame, for web viewers (.spz)
     Spz,
-    /// One frame, the smallest for web viewers (.sog)
+    /// One frame as images, for web viewers (.sog)
     Sog,
     /// One frame, uncompressed, for viewers of glTF (.glb)
     Glb,

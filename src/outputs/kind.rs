@@ -60,7 +60,7 @@ impl OutputKind {
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
-             NAME.sog       one frame, the smallest for web viewers\n  \
+             NAME.sog       one frame as images, for web viewers\n  \
              NAME.glb       one frame, for viewers of glTF\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
              or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|sog|glb|\
