@@ -205,9 +205,10 @@ fn three_js_reads_our_files() {
                 assert!((a - b).abs() <= 2.0 * relative * largest, "{name}, {i}: {a}, expected {b}");
             }
             let rgb = original.sh.row::<3>(i).map(|dc| 255.0 * color(dc).clamp(0.0, 1.0));
+            // Half a step of a .spz is 0.94, and the loader rounds down to bytes.
             for c in 0..3 {
                 assert!(
-                    (colors[4 * i + c] - rgb[c]).abs() <= 1.01,
+                    (colors[4 * i + c] - rgb[c]).abs() <= 1.95,
                     "{name}, {i}: {:?}, {rgb:?}",
                     &colors[4 * i..][..4]
                 );

@@ -106,7 +106,7 @@ fn frames_of_other_players_are_read_from_a_folder() {
     let said = workplace.done("info frames");
     assert!(said.contains("SPZ frames") && said.contains('3'), "{said}");
     fs::remove_file(workplace.path("frames/f_1.spz")).unwrap();
-    workplace.done("convert frames/f_0.spz frames/f_4.spz");
+    workplace.done("convert frames/f_0.spz frames/f_5.spz");
     workplace.refused(1, "info frames", &["--allow-gaps"]);
     assert!(workplace.done("info frames --allow-gaps").contains("SPZ frames"));
 }
