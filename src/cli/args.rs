@@ -109,17 +109,28 @@ impl CommandArgs {
     }
 }
 
+/// Format of an output.
+#[derive(Debug, Args)]
+pub(super) struct OutputFormat {
+    /// Format of the output [default: by its name]
+    #[arg(long = "as", value_enum, value_name = "FORMAT")]
+    pub(super) kind: Option<OutputKindArg>,
+    /// Version of a .spz: 3 opens in most viewers, 4 also in the PlayCanvas engine [default: 3]
+    #[arg(long, value_name = "3|4", hide_short_help = true, value_parser = clap::value_parser!(u8).range(3..=4))]
+    pub(super) spz_version: Option<u8>,
+}
+
 /// Arguments of `compress`.
 #[derive(Debug, Args)]
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs or .spz
+    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz,
+    /// .sog or .glb
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
-    /// Format of the output [default: by its name]
-    #[arg(long = "as", value_enum, value_name = "FORMAT")]
-    pub(super) kind: Option<OutputKindArg>,
+    #[command(flatten)]
+    pub(super) format: OutputFormat,
     /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR
     /// of the result against the original, which costs about 0.5 dB; at most 50dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
@@ -224,6 +235,12 @@ pub(super) enum OutputKindArg {
     FourDgs,
     /// One frame, for web viewers (.spz)
     Spz,
+    /// One frame as images, for web viewers (.sog)
+    Sog,
+    /// One frame, uncompressed, for viewers of glTF (.glb)
+    Glb,
+    /// Folder with one .sog per frame, for the flip book of PlayCanvas
+    SogSequence,
 }
 
 /// Arguments of `score`.
@@ -436,8 +453,8 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a
-    /// model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog or .glb; a folder (the model in an archive, a PLY per frame of a
+    /// sequence, or a model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// The output, as other commands name it
@@ -452,9 +469,8 @@ pub(super) struct Convert {
     pub(super) output_option: Option<PathBuf>,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Format of the output [default: by its name]
-    #[arg(long = "as", value_name = "FORMAT", value_enum)]
-    pub(super) kind: Option<OutputKindArg>,
+    #[command(flatten)]
+    pub(super) format: OutputFormat,
     /// Maximum error of an attribute in a .gseq: `position=1e-3` in the attribute's unit (scene units, components of
     /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent;
     /// attributes that are not named keep every bit. Every value is checked as it is written, and the file states its

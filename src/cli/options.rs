@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::args::{
-    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, ImageKind, Input, Memory,
+    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, ImageKind, Input, Memory, OutputFormat,
     OutputKindArg, OutputSize, PrecisionArgs, Render, Rot4d, SplitArg, Sweep, TestScene, Trained, ViewArgs,
     ZeroRotationArg,
 };
@@ -16,7 +16,7 @@ use splatsieve::diagnostics::demo::DemoOptions;
 use splatsieve::diagnostics::precision::{Knob, PrecisionOptions};
 use splatsieve::diagnostics::sweep::SweepOptions;
 use splatsieve::diagnostics::test_scene::TestSceneOptions;
-use splatsieve::error::{Error, Result};
+use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation::EvaluateOptions;
 use splatsieve::evaluation::method::Method;
 use splatsieve::files::atomic::Replace;
@@ -42,7 +42,7 @@ use splatsieve::scene::{InputOptions, scratch_beside};
 /// is invalid.
 pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
-    let kind = args.kind.map(output_kind);
+    let kind = requested_kind(&args.format, &args.output)?;
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
@@ -328,8 +328,21 @@ pub(super) fn storing(args: &Convert) -> Storing {
     }
 }
 
+/// Returns the output format that the arguments name; `None`: by the name of the output.
+///
+/// # Errors
+/// Fails if a version of `.spz` is named for another output.
+pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Option<OutputKind>> {
+    let kind = format.kind.map(output_kind);
+    let Some(version) = format.spz_version else { return Ok(kind) };
+    if OutputKind::from_path(output, kind, OutputKind::Model) != OutputKind::Spz {
+        return Err(Error::usage(format!("--spz-version: expected an output NAME.spz, found {}", output.shown())));
+    }
+    Ok(if version == 4 { Some(OutputKind::Spz4) } else { kind })
+}
+
 /// Returns the output format that the argument names.
-pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
+fn output_kind(kind: OutputKindArg) -> OutputKind {
     match kind {
         OutputKindArg::Model => OutputKind::Model,
         OutputKindArg::Gseq => OutputKind::Gseq,
@@ -339,6 +352,9 @@ pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
         OutputKindArg::Splatv => OutputKind::Splatv,
         OutputKindArg::FourDgs => OutputKind::FourDgs,
         OutputKindArg::Spz => OutputKind::Spz,
+        OutputKindArg::Sog => OutputKind::Sog,
+        OutputKindArg::Glb => OutputKind::Glb,
+        OutputKindArg::SogSequence => OutputKind::SogSequence,
     }
 }
 

@@ -9,8 +9,8 @@ use super::args::{
 use super::help;
 use super::message::tell;
 use super::options::{
-    cache_request, compress_options, demo_options, evaluate_options, input_options, output_kind, precision_options,
-    render_options, result_page_options, storing, sweep_options, test_scene_options, video_options, view_options,
+    cache_request, compress_options, demo_options, evaluate_options, input_options, precision_options, render_options,
+    requested_kind, result_page_options, storing, sweep_options, test_scene_options, video_options, view_options,
 };
 use super::output::{self, print, print_as};
 use super::progress::Display;
@@ -194,7 +194,7 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let has_cache = args.kept.cache.is_some();
     let mut input = input_options(args.input, Some(args.cameras), output, events);
     input.work = cache_request(args.kept);
-    let kind = args.kind.map(output_kind);
+    let kind = requested_kind(&args.format, &path)?;
     let is_container = !is_stdout && convert::is_container(&path, kind);
     let refuse =
         |options: &str| Err(Error::usage(format!("{options}: expected an output NAME.gseq, found {}", path.shown())));

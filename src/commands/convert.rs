@@ -109,6 +109,7 @@ fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstim
         ("readers", work.input.reader),
         ("held", if fits { 0 } else { work.held(limits, Attributes::all()) }),
         ("fitted", if fits { FITTED_BYTES } else { 0 }),
+        ("encoded", kind.encoding_bytes(state_bytes)),
     ];
     let seconds =
         work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;

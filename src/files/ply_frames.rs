@@ -38,16 +38,7 @@ impl PlyFrames {
     /// Fails if the numbers of the frames have a gap, if an entry is named like a frame but is not a file, if the
     /// folder has no PLY files, if [`Ply::open`] fails for a file, or if frames differ in their properties.
     pub fn open(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        let (frames, others) = list_frames(folder)?;
-        if let Some(other) = others.first() {
-            let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
-            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS_HINT));
-        }
-        if let Some((missing, before, after)) = first_gap(&frames) {
-            let found = format!("{before}, then {after}");
-            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS_HINT));
-        }
-        Self::from_paths(folder, frames, options)
+        Self::from_paths(folder, FrameFiles::list(folder, is_named_like_frame)?.checked(folder, false)?, options)
     }
 
     /// Opens a folder like [`PlyFrames::open`], but accepts missing frames.
@@ -55,7 +46,7 @@ impl PlyFrames {
     /// # Errors
     /// Fails like [`PlyFrames::open`], except for gaps and entries that are not files.
     pub fn open_with_gaps(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        Self::from_paths(folder, list_frames(folder)?.0, options)
+        Self::from_paths(folder, FrameFiles::list(folder, is_named_like_frame)?.checked(folder, true)?, options)
     }
 
     /// Opens one PLY file as the only frame.
@@ -165,18 +156,50 @@ fn file_name(path: &Path) -> &OsStr {
 /// Hint for a sequence that is refused because frames are missing.
 const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the whole sequence";
 
-/// Lists the `.ply` entries of `folder` in natural order. Returns those that are files (the frames), and those that are
-/// not files.
-fn list_frames(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
-    let mut found = Vec::new();
-    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
-        let path = entry.map_err(Error::io("list", folder))?.path();
-        if is_named_like_frame(&path) {
-            found.push(path);
+/// Entries of a folder that are named like frames, in natural order.
+pub(crate) struct FrameFiles {
+    /// Entries that are files: the frames.
+    frames: Vec<PathBuf>,
+    /// Entries that are not files.
+    others: Vec<PathBuf>,
+}
+
+impl FrameFiles {
+    /// Lists the entries of `folder` for which `is_frame` returns true.
+    ///
+    /// # Errors
+    /// Fails if the folder cannot be listed.
+    pub(crate) fn list(folder: &Path, is_frame: impl Fn(&Path) -> bool) -> Result<FrameFiles> {
+        let mut found = Vec::new();
+        for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
+            let path = entry.map_err(Error::io("list", folder))?.path();
+            if is_frame(&path) {
+                found.push(path);
+            }
         }
+        found.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
+        let (frames, others) = found.into_iter().partition(|path| path.is_file());
+        Ok(FrameFiles { frames, others })
     }
-    found.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
-    Ok(found.into_iter().partition(|path| path.is_file()))
+
+    /// Returns the frames. Messages name `folder`.
+    ///
+    /// # Errors
+    /// Fails if the numbers of the frames have a gap or if an entry is not a file, unless `allow_gaps` is true.
+    pub(crate) fn checked(self, folder: &Path, allow_gaps: bool) -> Result<Vec<PathBuf>> {
+        if allow_gaps {
+            return Ok(self.frames);
+        }
+        if let Some(other) = self.others.first() {
+            let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
+            return Err(Error::input(other, "", "a file, as its name says", found).hint(ALLOW_GAPS_HINT));
+        }
+        if let Some((missing, before, after)) = first_gap(&self.frames) {
+            let found = format!("{before}, then {after}");
+            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS_HINT));
+        }
+        Ok(self.frames)
+    }
 }
 
 /// Finds the first gap in the frame numbers. Returns the expected name of the missing frame and the names before and

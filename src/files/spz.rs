@@ -1,5 +1,4 @@
-//! Writer of still scenes as `.spz`, version 3 of the format (nianticlabs/spz, `load-spz.cc`): a header of 16 bytes and
-//! the arrays below one after the other, all compressed by gzip.
+//! `.spz` files: one frame of Gaussians (nianticlabs/spz, `load-spz.cc`). Written are versions 3 and 4, read also 2.
 //!
 //! | array | bytes per Gaussian | value |
 //! |---|---|---|
@@ -10,8 +9,13 @@
 //! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; then sign and 9 bits of 511·√2·value each |
 //! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
-//! The maintained crate for this format is not used, because it depends on an asynchronous runtime; writing the format
-//! takes only the code below.
+//! Versions 2 and 3 are a header of 16 bytes and the arrays one after the other, all compressed by gzip. Version 4 is a
+//! header of 32 bytes, a table of the compressed and the original size of each array (u64 each), and each array as a zstd
+//! frame. Arrays of 0 bytes are left out.
+//!
+//! The maintained crate for this format is not used, because it depends on an asynchronous runtime.
+
+pub mod read;
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -19,12 +23,16 @@ use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 
-use super::accuracy::{Accuracy, RenderedAttributes};
+use super::accuracy::{Accuracy, RenderedAttributes, check_positions};
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Gaussians, color, opacity};
 
-const MAGIC: u32 = 0x5053_474e;
-const VERSION: u32 = 3;
+/// First word of a file, "NGSP", of a gzip file after decompression.
+pub const MAGIC: u32 = 0x5053_474e;
+/// Number of bytes of the header of version 4.
+const HEADER_BYTES_4: usize = 32;
+/// zstd compression level of version 4, the one of the format's own library.
+const ZSTD_LEVEL: i32 = 12;
 /// Largest magnitude of a stored position, in units of the last bit (24 bits, signed).
 const MAX_FIXED: f64 = 8_388_607.0;
 /// Maximum number of fractional bits of positions; more bits would only store rounding noise of f32.
@@ -32,70 +40,112 @@ const MAX_FRACTION_BITS: i32 = 20;
 /// Sign by which each SH coefficient above degree 0 is multiplied when the y and z axes are reversed.
 const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
+/// Version of the format that is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SpzVersion {
+    /// Version 3, gzip: read by most players.
+    V3,
+    /// Version 4, zstd: the only one that the PlayCanvas engine reads.
+    V4,
+}
+
 /// Writes the Gaussians `state` to an `.spz` file at `path`. Returns the largest error of a position in the file, in
 /// scene units.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
 /// if there are more Gaussians than the format can count, or if writing fails.
-pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
+pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
-    if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
-        let id = at % state.len();
-        return Err(Error::usage(format!(
-            "{}: the position of Gaussian {id} is not finite, which a .spz cannot store",
-            path.shown()
-        )));
-    }
+    check_positions(state, path, "a .spz")?;
     let count = u32::try_from(state.len())
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
     let bits = (MAX_FIXED / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MAX_FRACTION_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
     let position_error = check_accuracy(state, unit)?;
-    let file = File::create(path).map_err(Error::io("create", path))?;
-    // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
-    let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
-    let mut write = || -> std::io::Result<()> {
-        for word in [MAGIC, VERSION, count] {
-            out.write_all(&word.to_le_bytes())?;
-        }
-        out.write_all(&[state.sh_degree() as u8, bits as u8, 0, 0])?;
-        let rows = 0..state.len();
-        for row in rows.clone() {
-            let [x, y, z] = state.position.row::<3>(row).map(f64::from);
-            for value in [x, -y, -z] {
-                let fixed = fixed(value, unit);
-                out.write_all(&fixed.to_le_bytes()[..3])?;
-            }
-        }
-        for row in rows.clone() {
-            out.write_all(&[opacity_byte(state.opacity_logit.row::<1>(row)[0])])?;
-        }
-        for row in rows.clone() {
-            out.write_all(&state.sh.row::<3>(row).map(color_byte))?;
-        }
-        for row in rows.clone() {
-            out.write_all(&state.log_scale.row::<3>(row).map(scale_byte))?;
-        }
-        for row in rows.clone() {
-            let q = state.rotation.row::<4>(row).map(f64::from);
-            let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-            let [w, x, y, z] = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
-            out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())?;
-        }
-        for row in rows {
-            for (k, turned) in (1..state.sh.width() / 3).zip(AXIS_SIGNS) {
-                for c in 0..3 {
-                    out.write_all(&[sh_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
-                }
-            }
-        }
-        out.try_finish()?;
-        out.get_mut().flush()
+    let file = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
+    let head = |version: u32, streams: usize| {
+        let words: Vec<u8> = [MAGIC, version, count].into_iter().flat_map(u32::to_le_bytes).collect();
+        [&words[..], &[state.sh_degree() as u8, bits as u8, 0, streams as u8]].concat()
+    };
+    let write = || match version {
+        SpzVersion::V3 => write_gzip(&head(3, 0), state, unit, file),
+        SpzVersion::V4 => write_streams(&head, state, unit, file),
     };
     write().map_err(Error::io("write", path))?;
     Ok(position_error)
 }
+
+/// Writes the header `head` and the arrays, compressed together by gzip (version 3).
+fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> std::io::Result<()> {
+    // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
+    let mut out = GzBuilder::new().write(file, Compression::best());
+    out.write_all(head)?;
+    ARRAYS.iter().try_for_each(|write| write(state, unit, &mut out))?;
+    out.try_finish()?;
+    out.get_mut().flush()
+}
+
+/// Writes the header, the table and each array as a zstd frame (version 4). `head` returns the first 16 bytes of the
+/// header for a version and a number of arrays.
+fn write_streams(
+    head: &dyn Fn(u32, usize) -> Vec<u8>,
+    state: &Gaussians,
+    unit: f64,
+    mut file: impl Write,
+) -> std::io::Result<()> {
+    let (mut table, mut frames) = (Vec::new(), Vec::new());
+    for write in ARRAYS {
+        let mut array = Vec::new();
+        write(state, unit, &mut array)?;
+        if !array.is_empty() {
+            let frame = zstd::bulk::compress(&array, ZSTD_LEVEL)?;
+            table.extend([frame.len() as u64, array.len() as u64].into_iter().flat_map(u64::to_le_bytes));
+            frames.push(frame);
+        }
+    }
+    let mut header = head(4, frames.len());
+    header.extend((HEADER_BYTES_4 as u32).to_le_bytes());
+    header.resize(HEADER_BYTES_4, 0);
+    file.write_all(&header)?;
+    file.write_all(&table)?;
+    frames.iter().try_for_each(|frame| file.write_all(frame))?;
+    file.flush()
+}
+
+/// Function that writes one array of the Gaussians; positions are stored in units of the second argument.
+type WriteArray = fn(&Gaussians, f64, &mut dyn Write) -> std::io::Result<()>;
+
+/// Writers of the arrays in the order of the file.
+const ARRAYS: [WriteArray; 6] = [
+    |state, unit, out| {
+        (0..state.len()).try_for_each(|row| {
+            let [x, y, z] = state.position.row::<3>(row).map(f64::from);
+            [x, -y, -z].into_iter().try_for_each(|value| out.write_all(&fixed(value, unit).to_le_bytes()[..3]))
+        })
+    },
+    |state, _, out| {
+        let bytes = state.opacity_logit.plane(0).iter().map(|&logit| opacity_byte(logit));
+        bytes.into_iter().try_for_each(|byte| out.write_all(&[byte]))
+    },
+    |state, _, out| (0..state.len()).try_for_each(|row| out.write_all(&state.sh.row::<3>(row).map(color_byte))),
+    |state, _, out| (0..state.len()).try_for_each(|row| out.write_all(&state.log_scale.row::<3>(row).map(scale_byte))),
+    |state, _, out| {
+        (0..state.len()).try_for_each(|row| {
+            let q = state.rotation.row::<4>(row).map(f64::from);
+            let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let [w, x, y, z] = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
+            out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())
+        })
+    },
+    |state, _, out| {
+        (0..state.len()).try_for_each(|row| {
+            (1..state.sh.width() / 3).zip(AXIS_SIGNS).try_for_each(|(k, sign)| {
+                out.write_all(&[0, 1, 2].map(|c| sh_byte(k, sign * state.sh.plane(3 * k + c)[row])))
+            })
+        })
+    },
+];
 
 /// Measures the coding errors of an `.spz` file of `state` whose positions are stored in units of `unit`. Returns the
 /// largest error of a position in scene units.
@@ -236,7 +286,7 @@ mod tests {
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");
-        let position_error = write_spz(&state, &path).unwrap();
+        let position_error = write_spz(&state, SpzVersion::V3, &path).unwrap();
         for (row, (place, visible, color, scales, q, sh)) in read(&path).into_iter().enumerate() {
             let near = |found: &[f64], expected: &[f64], within: f64, what: &str| {
                 for (a, b) in found.iter().zip(expected) {
@@ -268,10 +318,10 @@ mod tests {
             }
         }
         let again = folder.path().join("b.spz");
-        write_spz(&state, &again).unwrap();
+        write_spz(&state, SpzVersion::V3, &again).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap());
         state.position.plane_mut(1)[7] = f32::NAN;
-        assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
+        assert!(write_spz(&state, SpzVersion::V3, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
     /// Evaluates a color in the same direction in the original and in the reversed coordinate system; the signs in

@@ -1,5 +1,7 @@
 //! The interface that every model format implements.
 
+use std::fs;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -10,6 +12,7 @@ use crate::archive::Content;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras::Clock;
+use crate::files::open::open_file;
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::limits::{Limits, ReadLimit};
@@ -336,17 +339,31 @@ pub(super) struct ModelFormat {
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
+/// Number of bytes at the start of a file by which its format is recognized; enough for the header of a `.compressed.ply`.
+const HEAD_BYTES: u64 = 512;
+
 /// Path to open, and what was found there.
 pub(super) struct FoundInput<'a> {
     pub(super) path: &'a Path,
     pub(super) is_folder: bool,
-    /// First 16 bytes of the file, if the path is a file.
+    /// First [`HEAD_BYTES`] bytes of the file, if the path is a file.
     pub(super) head: Vec<u8>,
     /// Maximum memory that may be used to recognize the format.
     pub(super) memory: ReadLimit,
 }
 
-impl FoundInput<'_> {
+impl<'a> FoundInput<'a> {
+    /// Reads the first bytes of `path` if it is a file.
+    pub(super) fn new(path: &'a Path, memory: ReadLimit) -> Result<FoundInput<'a>> {
+        let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
+        let mut head = Vec::new();
+        if !is_folder {
+            let file = open_file(path)?;
+            file.take(HEAD_BYTES).read_to_end(&mut head).map_err(Error::io("read", path))?;
+        }
+        Ok(FoundInput { path, is_folder, head, memory })
+    }
+
     /// Returns whether the file looks as if PyTorch's `torch.save` wrote it: a ZIP archive, but not an `.npz` of NumPy.
     pub(super) fn is_checkpoint(&self) -> bool {
         let is_npz = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));

@@ -23,12 +23,12 @@ mod sc_gs;
 pub mod size;
 mod spacetime_gaussians;
 mod static_3d_gaussians;
+mod still_files;
 pub mod stream;
 pub mod trajectories;
 mod unrecognized;
 
 use std::fs;
-use std::io::Read;
 use std::path::Path;
 
 pub use crate::files::splatv::rows::ZeroRotation;
@@ -39,13 +39,13 @@ pub use linked::LinkedFrames;
 pub use size::Size;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::open::open_file;
 use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Model formats that are read from files. The first entry that recognizes a path opens it.
-const MODEL_FORMATS: [ModelFormat; 14] = [
+const MODEL_FORMATS: [ModelFormat; 15] = [
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
+    still_files::ENTRY,
     sc_gs::ENTRY,
     deformable_3d_gaussians::ENTRY,
     native_4d_gaussians::ENTRY,
@@ -76,16 +76,11 @@ pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
 /// # Errors
 /// Fails if the path does not exist, has no known format, or holds a damaged file.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
-    let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
-    let mut head = Vec::new();
-    if !is_folder {
-        let file = open_file(path)?;
-        file.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
-    }
+    let found = FoundInput::new(path, options.memory)?;
+    let is_folder = found.is_folder;
     if is_folder {
         refuse_inside_a_model(path)?;
     }
-    let found = FoundInput { path, is_folder, head, memory: options.memory };
     match MODEL_FORMATS.iter().find(|entry| (entry.recognizes)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None if is_folder => Err(unrecognized::unrecognized_folder(path)),

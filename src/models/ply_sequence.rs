@@ -52,7 +52,7 @@ pub(super) const FILE: ModelFormat = ModelFormat {
 };
 
 /// Opens `frames` as they are if the same index means the same Gaussian in all of them; else links the frames.
-fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
         _ if frames.paths().len() == 1 => FrameOrder::Assumed,

@@ -10,8 +10,10 @@ use gseq::Compression;
 
 use crate::compressed_model::{CompressedModel, TrajectoryDelta};
 use crate::error::{Error, Result, ShowPath};
+use crate::files::glb::write::write_glb;
 use crate::files::ply::write::write_inria;
-use crate::files::spz::write_spz;
+use crate::files::sog::write::{SogErrors, drawn, write_sog};
+use crate::files::spz::{SpzVersion, write_spz};
 use crate::limits::Limits;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
@@ -163,10 +165,19 @@ pub fn write_sequence(
     match kind {
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
-        OutputKind::Spz => {
-            let off = write_spz(&gather_all(source, 0, Attributes::all())?, path)?;
+        OutputKind::Spz | OutputKind::Spz4 => {
+            let version = if kind == OutputKind::Spz { SpzVersion::V3 } else { SpzVersion::V4 };
+            let off = write_spz(&gather_all(source, 0, Attributes::all())?, version, path)?;
             return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
+        OutputKind::Sog => {
+            return Ok(vec![write_sog(&gather_all(source, 0, Attributes::all())?, path)?.note()]);
+        }
+        OutputKind::Glb => {
+            write_glb(&gather_all(source, 0, Attributes::all())?, path)?;
+            return Ok(Vec::new());
+        }
+        OutputKind::SogSequence => return write_sog_sequence(source, path, held, events),
         OutputKind::Gseq => {
             let progress = events.task("emit", "states", info.count as u64 * info.times.len() as u64);
             let compression = Compression::Zstd(ZSTD_LEVEL);
@@ -186,4 +197,19 @@ pub fn write_sequence(
         progress.advance(1);
     }
     Ok(Vec::new())
+}
+
+/// Writes every frame of `source` to a file `frame_0000.sog`, `frame_0001.sog`, … in the folder `path`, without the
+/// Gaussians that are not drawn in this frame. Returns a note with the largest errors of all frames.
+fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<Vec<String>> {
+    let frames = source.info().times.len();
+    let progress = events.task("emit", "frames", frames as u64);
+    let mut states = States::open(source, &ReadPlan::every().holding(held))?;
+    let mut errors = SogErrors::default();
+    for frame in 0..frames {
+        let state = drawn(states.at(frame)?);
+        errors = errors.max(write_sog(&state, &path.join(format!("frame_{frame:04}.sog")))?);
+        progress.advance(1);
+    }
+    Ok(vec![errors.note()])
 }

@@ -25,8 +25,17 @@ pub enum OutputKind {
     /// A `.4dgs` file: pieces of straight motion in windows of time.
     #[serde(rename = "4dgs")]
     FourDgs,
-    /// A `.spz` file: one frame, strongly compressed.
+    /// A `.spz` file of version 3: one frame, strongly compressed.
     Spz,
+    /// A `.spz` file of version 4.
+    #[serde(rename = "spz-4")]
+    Spz4,
+    /// A `.sog` file: one frame, as images for web players.
+    Sog,
+    /// A `.glb` file: one frame, uncompressed.
+    Glb,
+    /// A folder with one `.sog` file per frame.
+    SogSequence,
 }
 
 impl OutputKind {
@@ -51,8 +60,11 @@ impl OutputKind {
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
+             NAME.sog       one frame as images, for web viewers\n  \
+             NAME.glb       one frame, for viewers of glTF\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
-             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz",
+             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|sog|glb|\
+             sog-sequence",
             path.shown(),
             path.shown()
         )))
@@ -66,13 +78,15 @@ impl OutputKind {
             "splatv" => Some(OutputKind::Splatv),
             "4dgs" => Some(OutputKind::FourDgs),
             "spz" => Some(OutputKind::Spz),
+            "sog" => Some(OutputKind::Sog),
+            "glb" => Some(OutputKind::Glb),
             _ => None,
         }
     }
 
     /// Returns whether this kind of output is a folder rather than a file.
     pub fn is_folder(self) -> bool {
-        matches!(self, OutputKind::Model | OutputKind::PlySequence)
+        matches!(self, OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence)
     }
 
     /// Returns whether this kind of output stores every frame, unlike a model from which frames are computed.
@@ -80,16 +94,32 @@ impl OutputKind {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }
 
+    /// Returns the bytes of memory per Gaussian that encoding one frame takes besides the frame itself. `state_bytes`: bytes
+    /// of the attributes of one Gaussian.
+    pub fn encoding_bytes(self, state_bytes: u64) -> u64 {
+        match self {
+            // Six images of 4 bytes, compressed and not, the Morton order with its keys, and for the SH coefficients a
+            // copy in groups, the palette and the labels.
+            OutputKind::Sog | OutputKind::SogSequence => 100 + 3 * state_bytes,
+            OutputKind::Spz4 => state_bytes,
+            _ => 0,
+        }
+    }
+
     /// Checks that this kind of output can hold `frames` frames. Messages name `path`.
     ///
     /// # Errors
-    /// Fails for a `.spz` file if the number of frames is not 1.
+    /// Fails for a `.spz`, a `.sog` or a `.glb` file if the number of frames is not 1.
     pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
+        let too_many = |ending: &str, others: &str| {
+            let path = path.shown();
+            Err(Error::usage(format!("{path}: {frames} frames do not fit one .{ending}\n  write {others}")))
+        };
         match self {
-            OutputKind::Spz if frames != 1 => Err(Error::usage(format!(
-                "{}: {frames} frames do not fit one .spz\n  write a .splatv, a .4dgs or a .gseq",
-                path.shown()
-            ))),
+            _ if frames == 1 => Ok(()),
+            OutputKind::Spz | OutputKind::Spz4 => too_many("spz", "a .splatv, a .4dgs or a .gseq"),
+            OutputKind::Sog => too_many("sog", "--as sog-sequence, a .splatv, a .4dgs or a .gseq"),
+            OutputKind::Glb => too_many("glb", "a .splatv, a .4dgs or a .gseq"),
             _ => Ok(()),
         }
     }
@@ -140,7 +170,7 @@ mod tests {
     #[test]
     fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
-        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.sog"] {
+        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.fbx"] {
             let message = refused(name).expect(name);
             for part in [name, "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"] {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");

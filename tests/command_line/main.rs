@@ -8,6 +8,7 @@ mod inputs;
 mod long;
 mod memory;
 mod parts;
+mod players;
 mod resume;
 mod runs;
 #[path = "../scene/mod.rs"]
@@ -16,6 +17,7 @@ mod scripts;
 mod selfcheck;
 mod slurm;
 mod splatv;
+mod stills;
 mod stream_input;
 
 use std::process::{Command, Stdio};

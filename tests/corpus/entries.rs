@@ -92,7 +92,7 @@ const CONTAINER_BYTES: usize = 640 << 20;
 const ARCHIVE_BYTES: usize = 256 << 20;
 
 /// List of all readers of user-supplied bytes.
-pub(crate) const ENTRIES: [Entry; 18] = [
+pub(crate) const ENTRIES: [Entry; 23] = [
     Entry {
         name: "archive",
         corpus: "archive",
@@ -156,6 +156,41 @@ pub(crate) const ENTRIES: [Entry; 18] = [
         read: recover,
         repair_checksums: repair_container,
         most_bytes: CONTAINER_BYTES,
+    },
+    Entry {
+        name: "compressed_ply",
+        corpus: "compressed_ply",
+        read: |bytes, folder| still("a.compressed.ply", bytes, folder),
+        repair_checksums: |_| None,
+        most_bytes: SMALL_BYTES,
+    },
+    Entry {
+        name: "glb",
+        corpus: "glb",
+        read: |bytes, folder| still("a.glb", bytes, folder),
+        repair_checksums: |_| None,
+        most_bytes: SMALL_BYTES,
+    },
+    Entry {
+        name: "sog",
+        corpus: "sog",
+        read: |bytes, folder| still("a.sog", bytes, folder),
+        repair_checksums: repair_zip,
+        most_bytes: SMALL_BYTES,
+    },
+    Entry {
+        name: "splat",
+        corpus: "splat",
+        read: |bytes, folder| still("a.splat", bytes, folder),
+        repair_checksums: |_| None,
+        most_bytes: SMALL_BYTES,
+    },
+    Entry {
+        name: "spz",
+        corpus: "spz",
+        read: |bytes, folder| still("a.spz", bytes, folder),
+        repair_checksums: |_| None,
+        most_bytes: SMALL_BYTES,
     },
     Entry { name: "splatv", corpus: "splatv", read: splatv, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
     Entry { name: "stream", corpus: "stream", read: stream, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
@@ -309,6 +344,17 @@ fn params(bytes: &[u8], folder: &InputFolder) -> Outcome {
 
 fn splatv(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.splatv", bytes))
+}
+
+/// Reads a file of one frame within 8 MiB of memory: a small file may declare any number of Gaussians.
+fn still(name: &str, bytes: &[u8], folder: &InputFolder) -> Outcome {
+    let path = folder.write_file(name, bytes);
+    let options = OpenOptions {
+        memory: ReadLimit::new(8 << 20),
+        scratch: Some(folder.0.path().to_owned()),
+        ..OpenOptions::default()
+    };
+    read_first_and_last_frame(models::open(&path, &options)?.source())
 }
 
 fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {

@@ -7,6 +7,7 @@ Needs zstandard. PROGRAM packs the container, the stream and the archive; the sc
 descriptions of the formats, so that no code under test makes its own test data.
 """
 
+import gzip
 import io
 import json
 import math
@@ -834,6 +835,232 @@ def make_splatv():
     write("splatv", "zeros_only", file([entry], bytes(len(texture))))
 
 
+def make_spz():
+    degree = 1
+    rows = {"positions": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": 4, "harmonics": 9}
+    arrays = {name: bytes(DICE.randrange(256) for _ in range(COUNT * width)) for name, width in rows.items()}
+
+    def header(version, count=COUNT, degree=degree, bits=12, flags=0, streams=0):
+        return struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, streams)
+
+    def gzipped(version, data=None, **fields):
+        data = b"".join(arrays.values()) if data is None else data
+        return gzip.compress(header(version, **fields) + data, mtime=0)
+
+    def streams(sizes=None, offset=32, extension=b"", **fields):
+        frames = [zstandard.ZstdCompressor(level=3).compress(array) for array in arrays.values()]
+        sizes = sizes or [(len(frame), len(array)) for frame, array in zip(frames, arrays.values())]
+        table = b"".join(struct.pack("<QQ", *pair) for pair in sizes)
+        head = header(4, **({"streams": len(frames)} | fields)) + struct.pack("<I12x", offset) + extension
+        return head + table + b"".join(frames)
+
+    whole = streams()
+    damaged("spz", whole, [0, 4, 8, 12, 13, 14, 15, 16, 32, 40, 48, 32 + 96, 32 + 100, len(whole) - 3])
+    cut_rotations = arrays["rotations"][: 3 * COUNT]
+    for name, data in {
+        "version_3": gzipped(3),
+        "version_2": gzipped(2, b"".join((arrays | {"rotations": cut_rotations}).values())),
+        "version_1": gzipped(1),
+        "version_4_gzip": gzipped(4),
+        "gzip_cut": gzipped(3)[:-20],
+        "gzip_checksum": gzipped(3)[:-8] + bytes(8),
+        "gzip_short": gzipped(3, b"\0" * 50),
+        "gzip_more": gzipped(3, b"".join(arrays.values()) + bytes(5)),
+        "gzip_extension": gzipped(3, b"".join(arrays.values()) + struct.pack("<III", 0xADBE0003, 4, 1), flags=2),
+        "gzip_many": gzipped(3, count=0xFFFFFFFF),
+        "gzip_none": gzipped(3, b"", count=0),
+        "degree_5": gzipped(3, degree=5),
+        "degree_4": gzipped(3, b"\x80" * COUNT * (20 + 72), degree=4),
+        "bits_255": gzipped(3, bits=255),
+        "many": streams(count=1 << 31),
+        "streams_0": streams(streams=0),
+        "offset_0": streams(offset=0),
+        "offset_far": streams(offset=0xFFFFFFFF),
+        "extension": streams(offset=44, extension=struct.pack("<III", 0xADBE0002, 4, 0), flags=2),
+        "size_zero": streams(sizes=[(0, 54)] * 6),
+        "size_huge": streams(sizes=[(1 << 63, 54)] * 6),
+        "size_wrong": streams(sizes=[(60, 1 << 40)] * 6),
+        "raw_version_3": header(3) + b"".join(arrays.values()),
+    }.items():
+        write("spz", name, data)
+
+
+def make_splat():
+    def row():
+        return floats([*normal(3), *(math.exp(x) for x in normal(3, 0.5, -3))]) + bytes(DICE.randrange(256) for _ in range(8))
+
+    whole = b"".join(row() for _ in range(COUNT))
+    damaged("splat", whole, [0, 12, 24, 28])
+    write("splat", "nan", floats([math.nan] * 6) + bytes(8))
+    write("splat", "negative_scale", floats([0, 0, 0, -1, 0, 1e30]) + bytes(8))
+    write("splat", "zero_quaternion", floats([0, 0, 0, 1, 1, 1]) + bytes([9, 9, 9, 9, 128, 128, 128, 128]))
+
+
+def make_compressed_ply():
+    bounds = [f"{end}_{name}" for group in (["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"])
+              for end in ("min", "max") for name in group]
+    packed = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
+
+    def header(chunks=1, count=COUNT, rest=9, form="binary_little_endian", bounds=bounds, packed=packed, sh=COUNT):
+        lines = ["ply", f"format {form} 1.0", f"element chunk {chunks}", *(f"property float {name}" for name in bounds)]
+        lines += [f"element vertex {count}", *(f"property uint {name}" for name in packed)]
+        if rest:
+            lines += [f"element sh {sh}", *(f"property uchar f_rest_{k}" for k in range(rest))]
+        return "\n".join([*lines, "end_header", ""]).encode()
+
+    ranges = floats([-1, -2, -3, 1, 3, 5, -8, -7, -6, 0, 0, 1, 0, 0.5, -0.5, 1, 1, 1.5])
+    words = struct.pack(f"<{4 * COUNT}I", *(DICE.randrange(1 << 32) for _ in range(4 * COUNT)))
+    body = ranges + words + bytes(DICE.randrange(256) for _ in range(9 * COUNT))
+    whole = header() + body
+    damaged("compressed_ply", whole, [0, 4, 50, len(header()) - 3, len(header()) + 3, len(header()) + 75])
+    for name, data in {
+        "no_chunk": header(chunks=0) + body,
+        "many_chunks": header(chunks=1 << 60) + body,
+        "many": header(count=1 << 33) + body,
+        "no_sh": header(rest=0) + ranges + words,
+        "sh_10": header(rest=10) + body,
+        "sh_rows": header(sh=2) + body,
+        "no_colors": header(bounds=bounds[:12], rest=0) + ranges[:48] + words,
+        "no_min_x": header(bounds=["low_x", *bounds[1:]]) + body,
+        "no_scale": header(packed=[*packed[:2], "packed_size", packed[3]]) + body,
+        "ascii": header(form="ascii") + body,
+        "nan": header() + floats([math.nan] * 18) + words + bytes(9 * COUNT),
+    }.items():
+        write("compressed_ply", name, data)
+
+
+def make_glb():
+    extension = "KHR_gaussian_splatting"
+    columns = {"POSITION": (3, normal(3 * COUNT)), f"{extension}:ROTATION": (4, normal(4 * COUNT)),
+               f"{extension}:SCALE": (3, [math.exp(x) for x in normal(3 * COUNT, 0.5, -3)]),
+               f"{extension}:OPACITY": (1, [DICE.random() for _ in range(COUNT)])}
+    for degree in (0, 1):
+        columns |= {f"{extension}:SH_DEGREE_{degree}_COEF_{k}": (3, normal(3 * COUNT, 0.3)) for k in range(2 * degree + 1)}
+    binary, views, accessors = b"", [], []
+    for index, (width, values) in enumerate(columns.values()):
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": 4 * len(values)})
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width]
+        accessors.append({"bufferView": index, "componentType": 5126, "count": COUNT, "type": kind})
+        binary += floats(values)
+    primitive = {"attributes": {name: index for index, name in enumerate(columns)}, "mode": 0,
+                 "extensions": {extension: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}}
+    document = {"asset": {"version": "2.0"}, "extensionsUsed": [extension], "nodes": [{"mesh": 0}],
+                "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
+                "buffers": [{"byteLength": len(binary)}]}
+
+    def packed(document, binary=binary):
+        text = document if isinstance(document, bytes) else json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        whole = 28 + len(text) + len(binary)
+        return (struct.pack("<4sIII4s", b"glTF", 2, whole, len(text), b"JSON") + text
+                + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+
+    def edited(*path, value):
+        changed = json.loads(json.dumps(document))
+        at = changed
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = value
+        return packed(changed)
+
+    whole = packed(document)
+    start = len(whole) - len(binary)
+    damaged("glb", whole, [0, 4, 8, 12, 16, start - 8, start - 4, start + 3])
+    for name, data in {
+        "no_primitive": edited("meshes", 0, "primitives", value=[]),
+        "two_primitives": edited("meshes", 0, "primitives", value=[primitive, primitive]),
+        "kernel": edited("meshes", 0, "primitives", 0, "extensions", extension, value={"kernel": 3}),
+        "compressed": edited("meshes", 0, "primitives", 0, "attributes", value={}),
+        "turned": edited("nodes", 0, value={"mesh": 0, "rotation": [0, 0, 1, 0]}),
+        "moved": edited("nodes", 0, value={"mesh": 0, "translation": [0, 0, 1]}),
+        "child": edited("nodes", value=[{"mesh": 0}, {"children": [0, 9], "scale": [2, 2, 2]}]),
+        "count_many": edited("accessors", 0, "count", value=1 << 62),
+        "count_less": edited("accessors", 0, "count", value=2),
+        "count_none": edited("accessors", 0, "count", value=0),
+        "view_far": edited("bufferViews", 0, "byteOffset", value=(1 << 64) - 1),
+        "stride_0": edited("bufferViews", 0, "byteStride", value=0),
+        "stride_huge": edited("bufferViews", 0, "byteStride", value=1 << 63),
+        "stride_equal": edited("bufferViews", 0, "byteStride", value=12),
+        "rotation_bytes": edited("accessors", 1, "componentType", value=5120),
+        "scale_shorts": edited("accessors", 2, "componentType", value=5123),
+        "position_bytes": edited("accessors", 0, "componentType", value=5121),
+        "type": edited("accessors", 3, "type", value="VEC2"),
+        "no_view": edited("accessors", 0, "bufferView", value=-1),
+        "no_json": packed(b"[" * 400),
+        "no_text": packed(b""),
+        "nan": packed(document, b"\xff" * len(binary)),
+        "zeros_only": packed(document, bytes(len(binary))),
+        "long_text": whole[:12] + b"\xff\xff\xff\xff" + whole[16:],
+    }.items():
+        write("glb", name, data)
+
+
+def make_sog(program, ply):
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        (folder / "a.ply").write_bytes(ply)
+        subprocess.run([program, "--quiet", "convert", "a.ply", "a.sog"], check=True, cwd=folder)
+        whole = (folder / "a.sog").read_bytes()
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+
+    def packed(changed, method=zipfile.ZIP_STORED, **extra):
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", method) as archive:
+            for name, data in {**files, "meta.json": json.dumps(changed, separators=(",", ":")), **extra}.items():
+                archive.writestr(zipfile.ZipInfo(name), data, method)
+        return out.getvalue()
+
+    def edited(*path, value):
+        changed = json.loads(files["meta.json"])
+        at = changed
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = value
+        return packed(changed)
+
+    image = whole.index(b"RIFF")
+    damaged("sog", whole, [0, 8, 26, image, image + 12, image + 21, image + 24, image + 30, len(whole) - 12, len(whole) - 6])
+    huge = files["quats.webp"][:21] + b"\xff\xff\xff\x0f" + files["quats.webp"][25:]
+    for name, data in {
+        "deflated": packed(meta, zipfile.ZIP_DEFLATED),
+        "version_1": edited("version", value=1),
+        "version_text": edited("version", value="2"),
+        "count_0": edited("count", value=0),
+        "count_many": edited("count", value=1 << 40),
+        "count_more": edited("count", value=1000),
+        "count_text": edited("count", value="6"),
+        "no_means": packed({key: value for key, value in meta.items() if key != "means"}),
+        "mins_far": edited("means", "mins", value=[1e300] * 3),
+        "mins_two": edited("means", "mins", value=[0, 0]),
+        "path": edited("means", "files", value=["../../a.ply", "means_u.webp"]),
+        "codebook_empty": edited("scales", "codebook", value=[]),
+        "codebook_null": edited("scales", "codebook", value=[None] * 256),
+        "codebook_long": edited("sh0", "codebook", value=[0.5] * 300),
+        "codebook_short": edited("sh0", "codebook", value=[0.5]),
+        "bands": edited("shN", "bands", value=3),
+        "labels": edited("shN", "count", value=2),
+        "centroids": edited("shN", "files", value=["quats.webp", "quats.webp"]),
+        "no_image": edited("quats", "files", value=["none.webp"]),
+        "no_json": packed(meta, **{"meta.json": b"{" * 3000}),
+        "huge_image": packed(meta, **{"quats.webp": huge}),
+        "text_image": packed(meta, **{"sh0.webp": b"no image"}),
+        "empty_image": packed(meta, **{"means_u.webp": b""}),
+    }.items():
+        write("sog", name, data)
+
+
+def make_stills(program, ply):
+    # Independent of the random numbers used before.
+    DICE.seed(17)
+    make_spz()
+    make_splat()
+    make_compressed_ply()
+    make_sog(program, ply)
+    make_glb()
+
+
 def make_spacetime():
     """Writes point clouds of SpacetimeGaussians, whose loader counts properties by prefix."""
     lite = ["x", "y", "z", "trbf_center", "trbf_scale", "nx", "ny", "nz", *(f"motion_{k}" for k in range(9))]
@@ -871,6 +1098,7 @@ def main():
     make_colmap()
     make_frames(program, ply)
     make_families()
+    make_stills(program, ply)
 
 
 if __name__ == "__main__":

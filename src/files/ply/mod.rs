@@ -9,7 +9,7 @@
 //! [`THIN_LOG_SCALE`]); bytes after the last element. This reader does not refuse NaN values.
 
 mod ascii;
-mod header;
+pub(crate) mod header;
 mod layout;
 #[cfg(test)]
 pub(crate) mod tests;

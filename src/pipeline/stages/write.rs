@@ -14,6 +14,7 @@ use crate::files::atomic::{
     Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
 };
 use crate::files::names::name_of;
+use crate::files::sog::images::morton_order;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload, bytes_of_survivors};
@@ -23,6 +24,7 @@ use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
+use crate::passes::gather_all;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, Summary};
@@ -101,6 +103,10 @@ impl Stage for WriteStage {
         if let Some(Archived::Content(encoded)) = &run.archived {
             reorder(&mut map, &encoded.order);
         }
+        if self.kind == OutputKind::Sog {
+            let written = run.scene.input.reduced(&run.result)?;
+            reorder(&mut map, &morton_order(&gather_all(&*written, 0, Attributes::POSITION)?.position));
+        }
         let journal = std::mem::take(&mut run.journal);
         let input =
             run.input.take().ok_or_else(|| Error::internal("the input was not described before it was written"))?;
@@ -141,7 +147,7 @@ impl Stage for WriteStage {
     }
 }
 
-/// Replaces the output indices in `map` by indices in the archive, whose Gaussian `i` had the index `order[i]` before.
+/// Replaces the output indices in `map` by indices in the file, whose Gaussian `i` had the index `order[i]` before.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     let mut places = vec![0; order.len()];
     order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
@@ -209,6 +215,7 @@ impl WriteStage {
                 let rows = bytes_of_survivors(left, work.threads * (work.input.file + 2 * whole));
                 per_gaussian.push(("files", work.input.file + rows));
                 per_gaussian.push(("members", CLUSTERED));
+                per_gaussian.push(("encoded", bytes_of_survivors(left, self.kind.encoding_bytes(whole))));
             }
         }
         if self.kind == OutputKind::Model {

@@ -1,0 +1,201 @@
+//! Writer of `.glb` files.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use serde_json::{Map, Value, json};
+
+use super::{AXIS_SIGNS, BINARY, EXTENSION, JSON, MAGIC, VERSION, sh_attribute};
+use crate::TOOL;
+use crate::error::{Error, Result, ShowPath};
+use crate::files::accuracy::check_positions;
+use crate::model::{Gaussians, color, opacity};
+
+/// Component types of glTF accessors.
+const F32: u32 = 5126;
+const U8: u32 = 5121;
+
+/// Function that appends the value of one attribute of a Gaussian to a list of bytes.
+type WriteValue<'a> = Box<dyn Fn(usize, &mut Vec<u8>) + 'a>;
+
+/// Attribute of the primitive.
+struct Attribute<'a> {
+    name: String,
+    /// Type of the values in glTF's terms, such as `VEC3`.
+    kind: &'static str,
+    component: u32,
+    /// Number of bytes per Gaussian.
+    bytes: usize,
+    write: WriteValue<'a>,
+}
+
+/// Writes the Gaussians `state` to a `.glb` file at `path`, with f32 values.
+///
+/// # Errors
+/// Fails if an attribute is not finite, if the file would have 4 GiB or more, or if writing fails.
+pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
+    check_positions(state, path, "a .glb")?;
+    check_finite(state, path)?;
+    let attributes = attributes(state);
+    let count = state.len();
+    let (mut accessors, mut views, mut named, mut at) = (Vec::new(), Vec::new(), Map::new(), 0u64);
+    for (index, attribute) in attributes.iter().enumerate() {
+        let length = (attribute.bytes * count) as u64;
+        views.push(json!({ "buffer": 0, "byteOffset": at, "byteLength": length, "target": 34962 }));
+        let mut accessor = json!({ "bufferView": index, "componentType": attribute.component, "count": count, "type": attribute.kind });
+        if attribute.component == U8 {
+            accessor["normalized"] = json!(true);
+        }
+        if attribute.name == "POSITION" {
+            let [mins, maxs] = bounds(state);
+            (accessor["min"], accessor["max"]) = (json!(mins), json!(maxs));
+        }
+        accessors.push(accessor);
+        named.insert(attribute.name.clone(), json!(index));
+        at += length;
+    }
+    let extension = json!({ "kernel": "ellipse", "colorSpace": "srgb_rec709_display" });
+    let mut primitive = json!({ "attributes": named, "mode": 0 });
+    primitive["extensions"] = Value::Object(Map::from_iter([(EXTENSION.to_owned(), extension)]));
+    let document = json!({
+        "asset": { "version": "2.0", "generator": TOOL },
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{ "nodes": [0] }],
+        "nodes": [{ "mesh": 0 }],
+        "meshes": [{ "primitives": [primitive] }],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{ "byteLength": at }],
+    });
+    let mut text = document.to_string().into_bytes();
+    text.resize(text.len().next_multiple_of(4), b' ');
+    // Two headers of chunks follow the header of the file; every attribute has a multiple of four bytes.
+    let Ok(whole) = u32::try_from(12 + 8 + text.len() as u64 + 8 + at) else {
+        return Err(Error::usage(format!("{}: {count} Gaussians are too many for a .glb", path.shown())));
+    };
+    let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
+    let mut write = || -> std::io::Result<()> {
+        for word in [MAGIC, VERSION, whole, text.len() as u32, JSON] {
+            out.write_all(&word.to_le_bytes())?;
+        }
+        out.write_all(&text)?;
+        for word in [at as u32, BINARY] {
+            out.write_all(&word.to_le_bytes())?;
+        }
+        let mut bytes = Vec::new();
+        for attribute in &attributes {
+            for row in 0..count {
+                bytes.clear();
+                (attribute.write)(row, &mut bytes);
+                out.write_all(&bytes)?;
+            }
+        }
+        out.flush()
+    };
+    write().map_err(Error::io("write", path))
+}
+
+/// Returns the attributes of the primitive in the order of the file.
+fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
+    let f32s = |values: &[f32], out: &mut Vec<u8>| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
+    let attribute =
+        |name: String, kind, floats: usize, write| Attribute { name, kind, component: F32, bytes: 4 * floats, write };
+    let of_extension = |name: &str| format!("{EXTENSION}:{name}");
+    let mut all: Vec<Attribute> = vec![
+        attribute(
+            "POSITION".to_owned(),
+            "VEC3",
+            3,
+            Box::new(move |row, out: &mut Vec<u8>| f32s(&reversed(state.position.row::<3>(row)), out)),
+        ),
+        attribute(
+            of_extension("ROTATION"),
+            "VEC4",
+            4,
+            Box::new(move |row, out: &mut Vec<u8>| {
+                let q = state.rotation.row::<4>(row).map(f64::from);
+                let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let unit = if length > 0.0 { q.map(|x| (x / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
+                let [w, x, y, z] = unit;
+                f32s(&[-x, -y, z, w], out);
+            }),
+        ),
+        attribute(
+            of_extension("SCALE"),
+            "VEC3",
+            3,
+            Box::new(move |row, out: &mut Vec<u8>| {
+                f32s(&state.log_scale.row::<3>(row).map(|log| f64::from(log).exp() as f32), out);
+            }),
+        ),
+        attribute(
+            of_extension("OPACITY"),
+            "SCALAR",
+            1,
+            Box::new(move |row, out: &mut Vec<u8>| {
+                f32s(&[opacity(state.opacity_logit.row::<1>(row)[0]) as f32], out);
+            }),
+        ),
+    ];
+    for k in 0..state.sh.width() / 3 {
+        let sign = if k == 0 { 1.0 } else { AXIS_SIGNS[k - 1] };
+        let write: WriteValue = Box::new(move |row, out: &mut Vec<u8>| {
+            f32s(&[0, 1, 2].map(|c| sign * state.sh.plane(3 * k + c)[row]), out);
+        });
+        all.push(attribute(sh_attribute(k), "VEC3", 3, write));
+    }
+    all.push(Attribute {
+        name: "COLOR_0".to_owned(),
+        kind: "VEC4",
+        component: U8,
+        bytes: 4,
+        write: Box::new(move |row, out| {
+            let rgb = state.sh.row::<3>(row).map(|dc| byte(linear(color(dc).clamp(0.0, 1.0))));
+            out.extend(rgb);
+            out.push(byte(opacity(state.opacity_logit.row::<1>(row)[0])));
+        }),
+    });
+    all
+}
+
+/// Checks that scales and SH coefficients are finite. Positions are checked before.
+fn check_finite(state: &Gaussians, path: &Path) -> Result<()> {
+    let scale = state.log_scale.planes().iter().position(|log| !(f64::from(*log).exp() as f32).is_finite());
+    let sh = state.sh.planes().iter().position(|x| !x.is_finite());
+    let (at, what) = match (scale, sh) {
+        (Some(at), _) => (at, "a scale"),
+        (None, Some(at)) => (at, "an SH coefficient"),
+        (None, None) => return Ok(()),
+    };
+    let id = at % state.len();
+    Err(Error::usage(format!("{}: {what} of Gaussian {id} is not finite, which a .glb cannot store", path.shown())))
+}
+
+/// Returns the position in the axes of glTF.
+fn reversed([x, y, z]: [f32; 3]) -> [f32; 3] {
+    [-x, -y, z]
+}
+
+/// Returns the smallest and the largest coordinates in the axes of glTF; zeros without Gaussians.
+fn bounds(state: &Gaussians) -> [[f32; 3]; 2] {
+    let (mut mins, mut maxs) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+    for row in 0..state.len() {
+        let place = reversed(state.position.row(row));
+        for axis in 0..3 {
+            (mins[axis], maxs[axis]) = (mins[axis].min(place[axis]), maxs[axis].max(place[axis]));
+        }
+    }
+    if state.is_empty() { [[0.0; 3]; 2] } else { [mins, maxs] }
+}
+
+/// Returns the linear light of an sRGB value, both in [0, 1] (IEC 61966-2-1).
+fn linear(value: f64) -> f64 {
+    if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+}
+
+/// Returns the byte of a value in [0, 1].
+fn byte(value: f64) -> u8 {
+    (255.0 * value).round() as u8
+}

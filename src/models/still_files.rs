@@ -1,0 +1,273 @@
+//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file, or a folder with one file per frame.
+//!
+//! The files are decoded into PLY files in a temporary folder and opened there like PLY frames, so every command that
+//! reads PLY frames reads them too.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::ply_sequence::open_frames;
+use super::size::{Size, bytes_below, bytes_read_for};
+use crate::archive::Content;
+use crate::compressed_model::CompressedModel;
+use crate::error::{Error, Result, ShowPath};
+use crate::files::atomic::ScratchFolder;
+use crate::files::compressed_ply::{self, read_compressed_ply};
+use crate::files::digest::hash_file;
+use crate::files::glb;
+use crate::files::glb::read::read_glb;
+use crate::files::ply::write::write_inria;
+use crate::files::ply_frames::{FrameFiles, PlyFrames};
+use crate::files::sog::read::read_sog;
+use crate::files::splat::read_splat;
+use crate::files::spz;
+use crate::files::spz::read::read_spz;
+use crate::limits::{Limits, ReadLimit};
+use crate::model::Gaussians;
+use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
+use crate::source::FrameSource;
+
+/// File format that holds one frame.
+struct StillFormat {
+    /// Ending of file names, with its dot.
+    ending: &'static str,
+    /// Name of the format, shown to users.
+    kind: &'static str,
+    /// Returns whether a path that is no sequence has this format.
+    recognizes: fn(&FoundInput) -> bool,
+    /// Reads the Gaussians of a file.
+    read: fn(&Path, ReadLimit) -> Result<Gaussians>,
+}
+
+/// All formats of this module.
+const FORMATS: [StillFormat; 5] = [
+    StillFormat {
+        ending: ".sog",
+        kind: "SOG frames",
+        recognizes: |found| match found.is_folder {
+            true => found.path.join("meta.json").is_file() && found.path.join("quats.webp").is_file(),
+            false => has_ending(found.path, ".sog"),
+        },
+        read: read_sog,
+    },
+    StillFormat {
+        ending: ".spz",
+        kind: "SPZ frames",
+        recognizes: |found| found.is_file_of(&spz::MAGIC.to_le_bytes(), "spz"),
+        read: read_spz,
+    },
+    StillFormat {
+        ending: ".splat",
+        kind: "splat frames",
+        recognizes: |found| !found.is_folder && has_ending(found.path, ".splat"),
+        read: read_splat,
+    },
+    StillFormat {
+        ending: ".glb",
+        kind: "glTF frames",
+        recognizes: |found| found.is_file_of(&glb::MAGIC.to_le_bytes(), "glb"),
+        read: read_glb,
+    },
+    StillFormat {
+        ending: ".compressed.ply",
+        kind: "compressed PLY frames",
+        recognizes: |found| has_packed_positions(found),
+        read: read_compressed_ply,
+    },
+];
+
+/// Returns whether the file is a PLY whose header has an element `chunk` first or a packed property near its start.
+fn has_packed_positions(found: &FoundInput) -> bool {
+    let has = |text: &str| found.head.windows(text.len()).any(|part| part == text.as_bytes());
+    !found.is_folder && found.head.starts_with(b"ply") && (has("\nelement chunk ") || has(compressed_ply::MARKER))
+}
+
+/// File of a web viewer, or a folder of such files.
+pub(super) const ENTRY: ModelFormat = ModelFormat {
+    recognizes: |found| format_of(found).is_some(),
+    open: |path, options| {
+        let found = FoundInput::new(path, options.memory)?;
+        let format = format_of(&found).ok_or_else(|| Error::internal("the input has changed its format"))?;
+        Ok(Box::new(StillFiles::open(path, format, options)?))
+    },
+};
+
+/// Returns the format of a file or of the files of a folder; `None` for other inputs.
+fn format_of(found: &FoundInput) -> Option<&'static StillFormat> {
+    let holds_frames = |format: &StillFormat| {
+        let entries = fs::read_dir(found.path).ok().filter(|_| found.is_folder);
+        entries.is_some_and(|mut entries| {
+            entries.any(|entry| entry.is_ok_and(|entry| is_frame(&entry.path(), format.ending)))
+        })
+    };
+    FORMATS.iter().find(|format| (format.recognizes)(found) || holds_frames(format))
+}
+
+/// Returns whether the name of `path` ends in `ending`, in lower or upper case.
+fn has_ending(path: &Path, ending: &str) -> bool {
+    let name = path.file_name().unwrap_or_default().as_encoded_bytes();
+    name.len() > ending.len() && name[name.len() - ending.len()..].eq_ignore_ascii_case(ending.as_bytes())
+}
+
+/// Returns whether `path` is named like a frame of the format with the ending `ending`, and is not hidden.
+fn is_frame(path: &Path, ending: &str) -> bool {
+    has_ending(path, ending) && !path.file_name().unwrap_or_default().as_encoded_bytes().starts_with(b".")
+}
+
+/// Opened files, decoded into PLY files in a temporary folder.
+struct StillFiles {
+    /// Frames opened from the files in the folder `scratch`.
+    inner: Box<dyn InputModel>,
+    scratch: ScratchFolder,
+    paths: Vec<PathBuf>,
+    kind: &'static str,
+}
+
+impl StillFiles {
+    /// Decodes the file or the folder at `path` and opens the decoded frames.
+    fn open(path: &Path, format: &'static StillFormat, options: &OpenOptions) -> Result<StillFiles> {
+        options.refuse_for(path)?;
+        let is_sequence = path.is_dir() && !path.join("meta.json").is_file();
+        let paths = match is_sequence {
+            true => FrameFiles::list(path, |path| is_frame(path, format.ending))?.checked(path, options.allow_gaps)?,
+            false => vec![path.to_owned()],
+        };
+        let scratch = ScratchFolder::new(&options.scratch())?;
+        let mut first: Option<usize> = None;
+        for (frame, file) in paths.iter().enumerate() {
+            let gaussians = (format.read)(file, options.memory)?;
+            let expected = *first.get_or_insert(gaussians.sh_degree());
+            if gaussians.sh_degree() != expected {
+                let expected = format!("SH degree {expected}, as in {}", paths[0].shown());
+                return Err(Error::input(file, "", expected, gaussians.sh_degree().to_string())
+                    .hint("every frame must have the same SH degree"));
+            }
+            write_inria(&gaussians, &[], &scratch.path().join(format!("frame_{frame:05}.ply")))?;
+        }
+        let frames = PlyFrames::open(scratch.path(), &options.ply())?;
+        let inner = open_frames(frames, path, options)?;
+        Ok(StillFiles { inner, scratch, paths, kind: format.kind })
+    }
+}
+
+impl InputModel for StillFiles {
+    fn kind(&self) -> &'static str {
+        self.kind
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self.inner.source()
+    }
+
+    fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        for path in files_of(&self.paths)? {
+            hash.update(path.file_name().unwrap_or_default().as_encoded_bytes());
+            hash_file(&path, &mut hash)?;
+        }
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_read_for(files_of(&self.paths)?.iter().map(PathBuf::as_path))
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        let _ = kind;
+        Ok(Size::from_frames(bytes_below(path)?))
+    }
+
+    fn stored_bytes(&self) -> Result<u64> {
+        self.inner.stored_bytes()
+    }
+
+    fn residence(&self) -> MemoryProfile {
+        self.inner.residence()
+    }
+
+    fn hold_decoded(&self) {
+        self.inner.hold_decoded();
+    }
+
+    fn timing(&self) -> Timing {
+        self.inner.timing()
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
+        let StillFiles { inner, scratch, paths, kind } = *self;
+        Ok(Box::new(StillFiles { inner: inner.with_times(times)?, scratch, paths, kind }))
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.inner.notes()
+    }
+
+    fn own_output(&self) -> OutputKind {
+        self.inner.own_output()
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        self.inner.check_output(kind, path)
+    }
+
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
+        self.inner.content(reduction)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.decode_frames(content)
+    }
+
+    fn may_be_linked(&self) -> bool {
+        self.inner.may_be_linked()
+    }
+
+    fn has_explicit_frames(&self) -> bool {
+        self.inner.has_explicit_frames()
+    }
+
+    fn archives_as_frames(&self) -> bool {
+        self.inner.archives_as_frames()
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.reduced(reduction)
+    }
+
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+        events: &Events,
+    ) -> Result<Vec<String>> {
+        self.inner.write(reduction, kind, path, limits, events)
+    }
+}
+
+/// Returns `paths` with every folder replaced by the files in it, sorted by name.
+fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    for path in paths {
+        if !path.is_dir() {
+            files.push(path.clone());
+            continue;
+        }
+        let listed = fs::read_dir(path).map_err(Error::io("list", path))?;
+        let mut inside = Vec::new();
+        for entry in listed {
+            let file = entry.map_err(Error::io("list", path))?.path();
+            if file.is_file() {
+                inside.push(file);
+            }
+        }
+        inside.sort();
+        files.extend(inside);
+    }
+    Ok(files)
+}

@@ -1,0 +1,112 @@
+//! Tests of files of web viewers that hold one frame: `.sog`, `.spz`, `.splat`, `.compressed.ply`.
+
+use std::fs;
+
+use crate::scene::{Workplace, files, index_map};
+use serde_json::Value;
+use splatsieve::model::{Attributes, Gaussians};
+use splatsieve::models::{OpenOptions, open};
+use splatsieve::passes::gather_all;
+
+/// Writes a PLY of 40 Gaussians without any symmetry.
+fn write_ply(workplace: &Workplace, name: &str) -> Gaussians {
+    let mut made = Gaussians::zeros(40, 1);
+    let fill = |values: &mut [f32], middle: f32, width: f32| {
+        values.iter_mut().enumerate().for_each(|(k, x)| *x = middle + width * ((k as f32 * 0.618_034).fract() - 0.5));
+    };
+    fill(made.position.plane_mut(0), 5.0, 2.0);
+    fill(made.position.plane_mut(1), -1.0, 4.0);
+    fill(made.position.plane_mut(2), 0.5, 1.0);
+    fill(made.rotation.planes_mut(), 0.1, 1.0);
+    fill(made.log_scale.planes_mut(), -3.0, 1.0);
+    fill(made.opacity_logit.planes_mut(), 1.0, 3.0);
+    fill(made.sh.planes_mut(), 0.1, 1.0);
+    workplace.ply(name, &made);
+    made
+}
+
+fn psnr(workplace: &Workplace, line: &str) -> f64 {
+    let found: Value = serde_json::from_str(&workplace.done(&format!("evaluate {line} --json"))).unwrap();
+    found["psnr"].as_f64().unwrap()
+}
+
+#[test]
+fn a_still_is_written_read_and_compressed_as_sog() {
+    let workplace = Workplace::new();
+    write_ply(&workplace, "still.ply");
+    let said = workplace.done("convert still.ply still.sog");
+    assert!(said.contains("40 Gaussians"), "{said}");
+    let info: Value = serde_json::from_str(&workplace.done("info still.sog --json")).unwrap();
+    assert_eq!((&info["kind"], &info["gaussians"]), (&"SOG frames".into(), &40.into()), "{info}");
+    assert!(psnr(&workplace, "still.ply still.sog") > 35.0);
+    let options = "--count 20 --no-refine --prune-only";
+    for input in ["still.ply", "still.sog"] {
+        let summary = workplace.summary(&format!("{input} -o small.sog {options} --overwrite"));
+        assert_eq!(summary["gaussians"], 20, "{input}");
+    }
+    workplace.done("convert small.sog back.ply");
+    workplace.done(&format!("compress small.sog -o small.gsz --count 15 {}", "--no-refine --prune-only"));
+}
+
+#[test]
+fn the_index_map_follows_the_order_of_a_sog() {
+    let workplace = Workplace::new();
+    let made = write_ply(&workplace, "still.ply");
+    workplace.done("compress still.ply -o small.sog --count 20 --no-refine --prune-only --quiet");
+    let found = open(&workplace.path("small.sog"), &OpenOptions::default()).unwrap();
+    let found = gather_all(found.source(), 0, Attributes::POSITION).unwrap();
+    let map = index_map(&workplace.path("small.sog.index_map.npy"));
+    assert_eq!(map.iter().filter(|place| **place >= 0).count(), 20);
+    for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place >= 0) {
+        let [a, b] = [found.position.row::<3>(place as usize), made.position.row::<3>(id)];
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-3), "Gaussian {id}: {a:?}, expected {b:?}");
+    }
+}
+
+#[test]
+fn a_sequence_becomes_a_folder_of_numbered_sog_files() {
+    let workplace = Workplace::new();
+    workplace.refused(2, "convert {tiny} a.sog --cameras {tiny}", &["a.sog", "10 frames", "--as sog-sequence"]);
+    workplace.done("convert {tiny} book --cameras {tiny} --as sog-sequence");
+    let names: Vec<String> = files(&workplace.path("book")).keys().map(|name| name.display().to_string()).collect();
+    let frames: Vec<&String> = names.iter().filter(|name| name.ends_with(".sog")).collect();
+    assert_eq!((frames.len(), frames[0].as_str(), frames[9].as_str()), (10, "frame_0000.sog", "frame_0009.sog"));
+    assert!(psnr(&workplace, "{tiny} book --cameras {tiny}") > 30.0);
+    let summary = workplace.summary("{tiny} -o small --as sog-sequence --cameras {tiny} --ratio 0.5 --no-refine");
+    assert_eq!(summary["gaussians"], 150);
+    assert!(workplace.done("info small --json").contains("SOG frames"));
+}
+
+#[test]
+fn attributes_survive_every_format_within_a_step() {
+    let workplace = Workplace::new();
+    let made = write_ply(&workplace, "still.ply");
+    let mut places: Vec<[f32; 3]> = (0..made.len()).map(|i| made.position.row(i)).collect();
+    places.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    for name in ["a.sog", "a.spz"] {
+        workplace.done(&format!("convert still.ply {name}"));
+        let found = open(&workplace.path(name), &OpenOptions::default()).unwrap();
+        let found = gather_all(found.source(), 0, Attributes::all()).unwrap();
+        let mut read: Vec<[f32; 3]> = (0..found.len()).map(|i| found.position.row(i)).collect();
+        read.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        for (a, b) in read.iter().zip(&places) {
+            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4), "{name}: {a:?}, expected {b:?}");
+        }
+    }
+}
+
+#[test]
+fn frames_of_other_players_are_read_from_a_folder() {
+    let workplace = Workplace::new();
+    for frame in 0..3 {
+        write_ply(&workplace, "still.ply");
+        fs::create_dir_all(workplace.path("frames")).unwrap();
+        workplace.done(&format!("convert still.ply frames/f_{frame}.spz"));
+    }
+    let said = workplace.done("info frames");
+    assert!(said.contains("SPZ frames") && said.contains('3'), "{said}");
+    fs::remove_file(workplace.path("frames/f_1.spz")).unwrap();
+    workplace.done("convert frames/f_0.spz frames/f_5.spz");
+    workplace.refused(1, "info frames", &["--allow-gaps"]);
+    assert!(workplace.done("info frames --allow-gaps").contains("SPZ frames"));
+}
