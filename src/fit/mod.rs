@@ -1,15 +1,15 @@
 //! Fits of simple motions to the track of one Gaussian (its states at all frames), in the forms that compact formats
 //! store.
 //!
-//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic motions in soft windows
-//! of time. Both report their error.
+//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic or linear motions in soft
+//! windows of time. Both report their error.
 
 mod curved;
 mod least_squares;
 mod straight;
 mod track;
 
-pub use curved::{CubicTrack, curved};
+pub use curved::{CubicTrack, CurveForm, curved};
 pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, straight};
 pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
@@ -44,6 +44,8 @@ pub struct Misfit {
     pub states: u64,
     /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
     squares: f64,
+    /// Sum of squared differences between the opacities of fit and Gaussian.
+    opacity_squares: f64,
     /// Largest distance between positions, in units of the Gaussian's middle scale.
     pub position: f64,
     /// Largest difference between the opacities of fit and Gaussian.
@@ -55,6 +57,7 @@ impl Misfit {
     fn add(&mut self, position: f64, opacity: f64) {
         self.states += 1;
         self.squares += position * position;
+        self.opacity_squares += opacity * opacity;
         self.position = self.position.max(position);
         self.opacity = self.opacity.max(opacity.abs());
     }
@@ -64,6 +67,7 @@ impl Misfit {
         Misfit {
             states: self.states + other.states,
             squares: self.squares + other.squares,
+            opacity_squares: self.opacity_squares + other.opacity_squares,
             position: self.position.max(other.position),
             opacity: self.opacity.max(other.opacity),
         }
@@ -72,5 +76,10 @@ impl Misfit {
     /// Returns the root mean square distance between positions, in units of the Gaussian's middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
+    }
+
+    /// Returns the root mean square difference between the opacities of fit and Gaussian.
+    pub fn opacity_rms(&self) -> f64 {
+        (self.opacity_squares / self.states.max(1) as f64).sqrt()
     }
 }
