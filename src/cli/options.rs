@@ -338,6 +338,7 @@ pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
         OutputKindArg::Splatv => OutputKind::Splatv,
         OutputKindArg::FourDgs => OutputKind::FourDgs,
         OutputKindArg::Spz => OutputKind::Spz,
+        OutputKindArg::Ftgs => OutputKind::Ftgs,
     }
 }
 

@@ -99,7 +99,7 @@ pub fn convert(
 /// Returns the resource estimate of writing all frames once as `kind`, with curve fitting where the format needs it.
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let state_bytes = work.state(Attributes::all());
-    let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs);
+    let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs | OutputKind::Ftgs);
     let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * state_bytes;
     let mut fixed = work.writing();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));

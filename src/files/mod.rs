@@ -10,6 +10,7 @@ pub(crate) mod csv;
 pub mod defects;
 pub(crate) mod digest;
 pub mod frame_stream;
+pub mod ftgs;
 pub mod image;
 #[doc(hidden)]
 pub mod in_memory;

@@ -174,12 +174,7 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
 }
 
 /// Returns `count` + 1 overlapping curves for the visible time from `start` to `end`.
-fn overlapping_curves(
-    track: &FittedTrack,
-    form: CurveForm,
-    [start, end]: [f64; 2],
-    count: usize,
-) -> Vec<CubicTrack> {
+fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
     let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();

@@ -26,6 +26,7 @@ mod static_3d_gaussians;
 pub mod stream;
 pub mod trajectories;
 mod unrecognized;
+mod windowed;
 
 use std::fs;
 use std::io::Read;
@@ -43,7 +44,8 @@ use crate::files::open::open_file;
 use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Model formats that are read from files. The first entry that recognizes a path opens it.
-const MODEL_FORMATS: [ModelFormat; 14] = [
+const MODEL_FORMATS: [ModelFormat; 15] = [
+    windowed::FTGS,
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
     sc_gs::ENTRY,

@@ -19,6 +19,7 @@ use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, wr
 use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::kind::OutputKind;
+use crate::outputs::windows::write_fitted_windows;
 use crate::passes::{HeldFrames, States, WithDelta, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
@@ -162,6 +163,7 @@ pub fn write_sequence(
     let info = source.info();
     match kind {
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
+        OutputKind::Ftgs => return write_fitted_windows(source, kind, path, events),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
             let off = write_spz(&gather_all(source, 0, Attributes::all())?, path)?;

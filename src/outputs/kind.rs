@@ -27,6 +27,8 @@ pub enum OutputKind {
     FourDgs,
     /// A `.spz` file: one frame, strongly compressed.
     Spz,
+    /// A `.ftgs.ply` file: linear motion in Gaussian windows of time.
+    Ftgs,
 }
 
 impl OutputKind {
@@ -51,14 +53,19 @@ impl OutputKind {
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
+             NAME.ftgs.ply  linear motion in windows of time, for ftgs-player\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
-             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz",
+             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|ftgs",
             path.shown(),
             path.shown()
         )))
     }
 
     fn from_name(path: &Path) -> Option<OutputKind> {
+        // This ending has two parts, of which the second one alone means an ordinary PLY.
+        if path.file_name()?.to_str()?.to_ascii_lowercase().ends_with(".ftgs.ply") {
+            return Some(OutputKind::Ftgs);
+        }
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gseq" => Some(OutputKind::Gseq),
             "ply" => Some(OutputKind::Ply),
@@ -138,6 +145,13 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_double_ending_of_ftgs_is_no_plain_ply() {
+        let kind = |name: &str| OutputKind::from_path(Path::new(name), None, OutputKind::Model);
+        assert_eq!(["a/x.ftgs.ply", "x.Ftgs.PLY"].map(kind), [OutputKind::Ftgs; 2]);
+        assert_eq!(["x.ply", "ftgs.ply", "x.ftgs/x.ply"].map(kind), [OutputKind::Ply; 3]);
+    }
+
+    #[test]
     fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
         for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.sog"] {
@@ -146,7 +160,7 @@ mod tests {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");
             }
         }
-        for name in ["x", "x.gsz", "X.GSEQ", "x.ply", "small.v2", "run.2024", "out_0.3", ".hidden"] {
+        for name in ["x", "x.gsz", "X.GSEQ", "x.ply", "x.FTGS.ply", "small.v2", "run.2024", "out_0.3", ".hidden"] {
             assert_eq!(refused(name), None, "{name}");
         }
         assert!(check_folder_name(Path::new("page.html"), "report").unwrap_err().to_string().contains("folder"));

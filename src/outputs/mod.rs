@@ -13,3 +13,4 @@ pub mod frame_stream;
 pub mod index_map;
 pub mod kind;
 pub mod rows;
+pub mod windows;

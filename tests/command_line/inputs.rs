@@ -369,7 +369,7 @@ fn still_takes_any_cameras_or_a_virtual_rig() {
 #[test]
 fn convert_writes_every_kind_and_refuses_misfits() {
     let workplace = Workplace::new();
-    for output in ["a.splatv", "a.4dgs", "a.gseq", "frames --as ply-sequence", "model", "cloud.ply"] {
+    for output in ["a.splatv", "a.4dgs", "a.ftgs.ply", "a.gseq", "frames --as ply-sequence", "model", "cloud.ply"] {
         let said = workplace.done(&format!("convert {{tiny}} {output} --cameras {{tiny}}"));
         assert!(said.contains("300 Gaussians x 10 frames"), "{said}");
     }
@@ -379,6 +379,8 @@ fn convert_writes_every_kind_and_refuses_misfits() {
     };
     assert!(evaluate("evaluate {tiny} a.gseq --cameras {tiny} --json") > 90.0);
     let fitted = evaluate("evaluate {tiny} a.splatv --cameras {tiny} --json");
+    assert!(fitted > 25.0, "{fitted} dB");
+    let fitted = evaluate("evaluate {tiny} a.ftgs.ply --cameras {tiny} --json");
     assert!(fitted > 25.0, "{fitted} dB");
     assert_eq!(&fs::read(workplace.path("a.4dgs")).unwrap()[1..5], b"4DGS");
     workplace.refused(2, "convert {tiny} a.spz --cameras {tiny}", &["a.spz", "10 frames", ".splatv"]);
