@@ -74,7 +74,7 @@ impl PointCloudShape {
 }
 
 /// Returns `x` with two zero bits inserted between consecutive bits.
-fn spread(x: u64) -> u64 {
+pub(crate) fn spread(x: u64) -> u64 {
     let mut x = x & ((1 << CURVE_BITS) - 1);
     for (shift, mask) in [
         (32, 0x001f_0000_0000_ffff),

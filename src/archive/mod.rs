@@ -24,6 +24,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+pub(crate) use cloud::spread;
 pub use cloud::{ATTRIBUTES, CloudSteps};
 pub use field::{FieldSteps, Role, TensorSteps, rounded};
 pub use file::{ArchiveSize, HEAD, MAGIC, VERSION};

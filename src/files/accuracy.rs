@@ -15,7 +15,9 @@
 //! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
 //! change it. The distance of two positions is the largest of the differences along x, y and z.
 
-use crate::error::{Error, Result};
+use std::path::Path;
+
+use crate::error::{Error, Result, ShowPath};
 use crate::model::{AttributeValues, Gaussians, color, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
@@ -62,6 +64,19 @@ impl RenderedAttributes {
         scale.sort_unstable_by(f64::total_cmp);
         scale[1]
     }
+}
+
+/// Checks that all positions are finite. `kind` names the file `path` in the message, for example "a .spz".
+///
+/// # Errors
+/// Returns [`Error::Usage`] with the first Gaussian whose position is not finite.
+pub fn check_positions(state: &Gaussians, path: &Path, kind: &str) -> Result<()> {
+    let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) else { return Ok(()) };
+    let id = at % state.len();
+    Err(Error::usage(format!(
+        "{}: the position of Gaussian {id} is not finite, which {kind} cannot store",
+        path.shown()
+    )))
 }
 
 /// Error of one quantity of one Gaussian, with the maximum error allowed for it.

@@ -19,7 +19,7 @@ use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 
-use super::accuracy::{Accuracy, RenderedAttributes};
+use super::accuracy::{Accuracy, RenderedAttributes, check_positions};
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Gaussians, color, opacity};
 
@@ -40,13 +40,7 @@ const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1.,
 /// if there are more Gaussians than the format can count, or if writing fails.
 pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
-    if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
-        let id = at % state.len();
-        return Err(Error::usage(format!(
-            "{}: the position of Gaussian {id} is not finite, which a .spz cannot store",
-            path.shown()
-        )));
-    }
+    check_positions(state, path, "a .spz")?;
     let count = u32::try_from(state.len())
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
     let bits = (MAX_FIXED / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MAX_FRACTION_BITS)) as i32;

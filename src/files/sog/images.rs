@@ -1,0 +1,290 @@
+//! Attributes of Gaussians as images of bytes: pixel i, row by row from the top, belongs to the Gaussian at place i of
+//! the file.
+
+use rayon::prelude::*;
+
+use super::codebook::Codebook;
+use super::palette::Palette;
+use crate::archive::spread;
+use crate::files::webp::{MAX_SIDE, RgbaImage};
+use crate::model::{AttributeValues, logit};
+
+/// Largest value of a 16-bit number that is stored as a low and a high byte.
+const MAX_16_BIT: f64 = 65_535.0;
+/// Alpha of a rotation whose component w is left out; x, y and z follow.
+const FIRST_ROTATION_TAG: u8 = 252;
+/// Number of palette entries in one row of the image of the palette.
+const ENTRIES_PER_ROW: usize = 64;
+
+/// Number of columns and rows of the images of a file, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize {
+    /// Number of columns, a multiple of 4.
+    pub width: usize,
+    /// Number of rows, a multiple of 4.
+    pub height: usize,
+}
+
+impl ImageSize {
+    /// Returns the size of nearly square images with a pixel for each of `count` Gaussians, both sides multiples of 4;
+    /// `None` if such images would be larger than a WebP can be.
+    pub fn for_count(count: usize) -> Option<ImageSize> {
+        let width = 4 * ((count as f64).sqrt() / 4.0).ceil().max(1.0) as usize;
+        let height = 4 * count.div_ceil(width).div_ceil(4).max(1);
+        (width < MAX_SIDE && height < MAX_SIDE).then_some(ImageSize { width, height })
+    }
+
+    /// Creates an image of this size whose pixel i is `pixel` of `order[i]`; the other pixels are (0, 0, 0, 255).
+    pub fn image(self, order: &[u32], pixel: impl Fn(usize) -> [u8; 4]) -> RgbaImage {
+        let mut image = RgbaImage::new(self.width, self.height);
+        image.pixels.iter_mut().zip(order).for_each(|(to, &row)| *to = pixel(row as usize));
+        image
+    }
+}
+
+/// Range of the three components of a value that is stored with 16 bits, component by component.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Range3 {
+    /// Value that 0 stands for.
+    pub mins: [f64; 3],
+    /// Value that 65535 stands for.
+    pub maxs: [f64; 3],
+}
+
+impl Range3 {
+    /// Returns the range of the finite values among `values`, rows of three components; 0 to 0 without such values.
+    pub fn of_rows(values: impl Iterator<Item = [f64; 3]>) -> Range3 {
+        let (mut mins, mut maxs) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        for row in values {
+            for c in (0..3).filter(|&c| row[c].is_finite()) {
+                (mins[c], maxs[c]) = (mins[c].min(row[c]), maxs[c].max(row[c]));
+            }
+        }
+        for (min, max) in mins.iter_mut().zip(&mut maxs).filter(|(min, max)| min > max) {
+            (*min, *max) = (0.0, 0.0);
+        }
+        Range3 { mins, maxs }
+    }
+
+    /// Returns component `axis` with value `value` as the nearest 16-bit number.
+    pub fn encode(&self, axis: usize, value: f64) -> u16 {
+        let range = self.maxs[axis] - self.mins[axis];
+        if range > 0.0 { (MAX_16_BIT * (value - self.mins[axis]) / range).round() as u16 } else { 0 }
+    }
+
+    /// Returns the value of component `axis` that `code` stands for.
+    pub fn decode(&self, axis: usize, code: u16) -> f64 {
+        self.mins[axis] + (self.maxs[axis] - self.mins[axis]) * f64::from(code) / MAX_16_BIT
+    }
+}
+
+/// Returns sign(x)·ln(|x| + 1), the logarithmic scale of coordinates.
+pub fn log_coordinate(x: f64) -> f64 {
+    x.abs().ln_1p().copysign(x)
+}
+
+/// Returns the coordinate x whose [`log_coordinate`] is `n`.
+pub fn from_log_coordinate(n: f64) -> f64 {
+    n.abs().exp_m1().copysign(n)
+}
+
+/// Returns the indices of the Gaussians at `position` in Morton order of their logarithmic coordinates, 16 bits per axis:
+/// Gaussians near one another in space are near in the images, which then compress better.
+pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
+    let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
+    let range = Range3::of_rows((0..position.len()).map(logs));
+    let code = |row: u32| {
+        let logs = logs(row as usize);
+        (0..3).map(|axis| spread(u64::from(range.encode(axis, logs[axis]))) << axis).sum::<u64>()
+    };
+    let mut keys: Vec<(u64, u32)> = (0..position.len() as u32).into_par_iter().map(|row| (code(row), row)).collect();
+    keys.par_sort_unstable();
+    keys.into_iter().map(|(_, row)| row).collect()
+}
+
+/// Returns the images of the low and of the high bytes of 16-bit numbers: `codes` gives the three of a row.
+pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u16; 3]) -> [RgbaImage; 2] {
+    [0, 1].map(|byte| {
+        size.image(order, |row| {
+            let [x, y, z] = codes(row).map(|code| code.to_le_bytes()[byte]);
+            [x, y, z, 255]
+        })
+    })
+}
+
+/// Returns the three 16-bit numbers of which `low` and `high` are the pixels.
+pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
+    [0, 1, 2].map(|c| u16::from_le_bytes([low[c], high[c]]))
+}
+
+/// Returns the range of the logarithmic coordinates of `position` and their images of low and high bytes.
+pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u32]) -> (Range3, [RgbaImage; 2]) {
+    let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
+    let range = Range3::of_rows(order.iter().map(|&row| logs(row as usize)));
+    let images = encode_16_bit(size, order, |row| {
+        let logs = logs(row);
+        [0, 1, 2].map(|axis| range.encode(axis, logs[axis]))
+    });
+    (range, images)
+}
+
+/// Returns the position that two pixels of the images of positions stand for, in scene units.
+pub fn decode_position(range: &Range3, low: [u8; 4], high: [u8; 4]) -> [f32; 3] {
+    let codes = decode_16_bit(low, high);
+    [0, 1, 2].map(|axis| from_log_coordinate(range.decode(axis, codes[axis])) as f32)
+}
+
+/// Encodes the quaternion `q`, wxyz of any length: the three components besides the largest one, in the range ±1/√2, and
+/// which one is left out. A quaternion of length 0 is stored as the identity.
+pub fn encode_rotation(q: [f32; 4]) -> [u8; 4] {
+    let q = q.map(f64::from);
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let unit = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
+    let largest = (1..4).fold(0, |largest: usize, k| if unit[k].abs() > unit[largest].abs() { k } else { largest });
+    // q and −q are the same rotation; the component that is left out must be positive.
+    let sign = if unit[largest] < 0.0 { -1.0 } else { 1.0 };
+    let mut pixel = [0, 0, 0, FIRST_ROTATION_TAG + largest as u8];
+    for (to, k) in (0..4).filter(|&k| k != largest).enumerate() {
+        pixel[to] = (127.5 * (sign * unit[k] * std::f64::consts::SQRT_2 + 1.0)).round() as u8;
+    }
+    pixel
+}
+
+/// Returns the unit quaternion wxyz that a pixel stands for; `None` if its alpha is not 252, 253, 254 or 255.
+pub fn decode_rotation(pixel: [u8; 4]) -> Option<[f32; 4]> {
+    let largest = usize::from(pixel[3].checked_sub(FIRST_ROTATION_TAG)?);
+    let mut q = [0.0; 4];
+    for (from, k) in (0..4).filter(|&k| k != largest).enumerate() {
+        q[k] = (f64::from(pixel[from]) / 127.5 - 1.0) * std::f64::consts::FRAC_1_SQRT_2;
+    }
+    q[largest] = (1.0 - q.iter().map(|x| x * x).sum::<f64>()).max(0.0).sqrt();
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    Some(q.map(|x| (x / length) as f32))
+}
+
+/// Returns the image of three-component values, each component as its index in `codebook`; `alpha` gives the alpha of a
+/// row.
+pub fn encode_by_codebook(
+    values: &AttributeValues,
+    codebook: &Codebook,
+    size: ImageSize,
+    order: &[u32],
+    alpha: impl Fn(usize) -> u8,
+) -> RgbaImage {
+    size.image(order, |row| {
+        let [x, y, z] = values.row::<3>(row).map(|value| codebook.nearest(value));
+        [x, y, z, alpha(row)]
+    })
+}
+
+/// Returns the three values that a pixel stands for; `None` if the codebook is too short.
+pub fn decode_by_codebook(codebook: &Codebook, pixel: [u8; 4]) -> Option<[f32; 3]> {
+    Some([codebook.decode(pixel[0])?, codebook.decode(pixel[1])?, codebook.decode(pixel[2])?])
+}
+
+/// Returns the byte of an opacity in [0, 1].
+pub fn opacity_code(opacity: f64) -> u8 {
+    (255.0 * opacity).round() as u8
+}
+
+/// Returns the finite opacity logit that the byte `code` stands for. The bytes 0 and 255 stand for opacities a quarter
+/// of a step from 0 and 1.
+pub fn decode_opacity(code: u8) -> f32 {
+    logit(f64::from(code).clamp(0.25, 254.75) / 255.0) as f32
+}
+
+/// Returns the image of the palette entries: 64 entries per row, and for each entry one pixel (red, green, blue) per SH
+/// coefficient above degree 0. The vectors of `palette` have red, green and blue of each coefficient one after the other.
+/// Returns also the codebook of the values.
+pub fn encode_palette(palette: &Palette) -> (Codebook, RgbaImage) {
+    let coefficients = palette.width / 3;
+    let codebook = Codebook::fit(|| palette.centroids.iter().copied());
+    let mut image = RgbaImage::new(ENTRIES_PER_ROW * coefficients, palette.len().div_ceil(ENTRIES_PER_ROW).max(1));
+    for (entry, values) in palette.centroids.chunks_exact(palette.width).enumerate() {
+        let pixels = &mut image.pixels[entry * coefficients..][..coefficients];
+        for (pixel, rgb) in pixels.iter_mut().zip(values.as_chunks::<3>().0) {
+            let [red, green, blue] = rgb.map(|value| codebook.nearest(value));
+            *pixel = [red, green, blue, 255];
+        }
+    }
+    (codebook, image)
+}
+
+/// Returns the pixels of the image of palette entries `image` that hold entry `label`, one per SH coefficient above
+/// degree 0; `None` if the image has no such entry.
+pub fn palette_entry(image: &RgbaImage, label: usize) -> Option<&[[u8; 4]]> {
+    let coefficients = image.width / ENTRIES_PER_ROW;
+    image.pixels.get(label.checked_mul(coefficients)?..)?.get(..coefficients)
+}
+
+/// Returns the image of the palette labels of the Gaussians, 16 bits each.
+pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImage {
+    size.image(order, |row| {
+        let [low, high, ..] = labels[row].to_le_bytes();
+        [low, high, 0, 255]
+    })
+}
+
+/// Returns the palette label of a pixel.
+pub fn decode_label(pixel: [u8; 4]) -> usize {
+    usize::from(u16::from_le_bytes([pixel[0], pixel[1]]))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn images_have_room_for_every_gaussian() {
+        for count in [0, 1, 4, 15, 16, 17, 1000, 31_658, 1 << 20, 260_000_000] {
+            let ImageSize { width, height } = ImageSize::for_count(count).unwrap();
+            assert!(width * height >= count && width % 4 == 0 && height % 4 == 0, "{count}: {width} × {height}");
+        }
+        assert_eq!(ImageSize::for_count(16_384 * 16_384), None);
+    }
+
+    #[test]
+    fn kept_components_follow_in_the_order_wxyz() {
+        assert_eq!(encode_rotation([0.0; 4]), [128, 128, 128, 252]);
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        assert_eq!(encode_rotation([half, 0.0, -0.75, 0.0]), [15, 128, 128, 254]);
+        assert_eq!(decode_rotation([0, 0, 0, 251]), None);
+    }
+
+    proptest! {
+        #[test]
+        fn rotations_are_within_half_a_step(q in proptest::array::uniform4(-1.0f32..1.0)) {
+            let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
+            prop_assume!(length > 0.1);
+            let found = decode_rotation(encode_rotation(q)).unwrap();
+            let dot: f32 = found.iter().zip(q).map(|(a, b)| a * b / length).sum();
+            let error = found.iter().zip(q).map(|(a, b)| (a - dot.signum() * b / length).abs()).fold(0.0, f32::max);
+            prop_assert!(error < 0.0084, "{found:?}: {error}");
+        }
+
+        #[test]
+        fn coordinates_are_within_half_a_step(rows in proptest::collection::vec(proptest::array::uniform3(-300.0f32..9000.0), 1..40)) {
+            let mut position = AttributeValues::zeros(3, rows.len());
+            rows.iter().enumerate().for_each(|(i, &row)| position.set_row(i, row));
+            let order: Vec<u32> = (0..rows.len() as u32).rev().collect();
+            let size = ImageSize::for_count(rows.len()).unwrap();
+            let (range, [low, high]) = encode_positions(&position, size, &order);
+            for (place, &row) in order.iter().enumerate() {
+                let found = decode_position(&range, low.pixels[place], high.pixels[place]);
+                for (axis, expected) in rows[row as usize].into_iter().enumerate() {
+                    let step = (range.maxs[axis] - range.mins[axis]) / 65_535.0 * (f64::from(expected.abs()) + 1.0);
+                    let error = f64::from((found[axis] - expected).abs());
+                    prop_assert!(error <= 0.5 * step * 1.001 + 1e-6 * f64::from(expected.abs()), "{error}, step {step}");
+                }
+            }
+        }
+
+        #[test]
+        fn opacities_are_within_half_a_step(opacity in 0.0f64..1.0) {
+            let found = crate::model::opacity(decode_opacity(opacity_code(opacity)));
+            prop_assert!((found - opacity).abs() <= 0.5 / 255.0 + 1e-7);
+        }
+    }
+}

@@ -1,0 +1,249 @@
+//! Reader of `.sog` files, and of folders that hold the same files without an archive.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::marker::PhantomData;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use zip::ZipArchive;
+
+use super::codebook::Codebook;
+use super::images::{
+    Range3, decode_by_codebook, decode_label, decode_opacity, decode_position, decode_rotation, palette_entry,
+};
+use super::{META, Meta, PaletteEntry, VERSION};
+use crate::error::{Error, Result, quoted};
+use crate::files::json::{ParseAbort, read_from};
+use crate::files::open::{open_file, read_small};
+use crate::files::webp::RgbaImage;
+use crate::files::zip_directory::declared_directory;
+use crate::limits::ReadLimit;
+use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
+
+/// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
+const MAX_META_BYTES: u64 = 1 << 20;
+/// Maximum number of files in an archive, and of bytes of its list of files.
+const MAX_ENTRIES: u64 = 1024;
+const MAX_LIST_BYTES: u64 = 4 << 20;
+/// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
+const BYTES_PER_PIXEL: u64 = 16;
+/// Number of images of a file that have a pixel per Gaussian and are decoded at the same time.
+const IMAGES: u64 = 6;
+/// Maximum number of pixels of the image of palette entries: 65536 entries of degree 3.
+const MAX_PALETTE_PIXELS: usize = 15 << 16;
+/// Largest magnitude of a logarithmic coordinate: the coordinate must be finite as f32.
+const MAX_LOG_COORDINATE: f64 = 88.0;
+/// Largest magnitude of a stored SH coefficient and of the logarithm of a scale.
+const MAX_CODEBOOK_VALUE: f32 = 1e30;
+
+/// Reads the Gaussians of the `.sog` file at `path`, or of a folder with the files of such an archive, in the order of
+/// the file.
+///
+/// # Errors
+/// Fails if the file is damaged, has another version than 2, or needs more memory than `memory`.
+pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
+    let mut files = if path.is_dir() { Files::Folder(path.to_owned()) } else { Files::open_archive(path)? };
+    let text = files.read(path, META, ReadLimit::new(MAX_META_BYTES))?;
+    let meta = parse(&text, path)?;
+    let count = meta.count as usize;
+    if meta.count > u64::from(u32::MAX) {
+        return Err(Error::input(path, "meta.json, count", "at most 4294967295", meta.count.to_string()));
+    }
+    let widest = 4 * 3 * sh_coefficients(MAX_SH_DEGREE) as u64 + 4 * 11;
+    let per_gaussian = widest + IMAGES * BYTES_PER_PIXEL;
+    memory.check(path, "meta.json, count", "the Gaussians of the file", meta.count.saturating_mul(per_gaussian))?;
+    // An image may be larger than needed, but not much.
+    let max_pixels = 4 * count + (1 << 16);
+    let mut image = |name: &str, max_pixels: usize| -> Result<RgbaImage> {
+        let bytes = files.read(path, name, memory)?;
+        let found = RgbaImage::from_webp(&bytes, max_pixels);
+        found
+            .map_err(|found| Error::input(path, name, format!("a lossless WebP of at most {max_pixels} pixels"), found))
+    };
+    let mut of_gaussians = |name: &str| -> Result<RgbaImage> {
+        let image = image(name, max_pixels)?;
+        match image.pixels.len() {
+            pixels if pixels >= count => Ok(image),
+            pixels => Err(Error::input(path, name, format!("{count} pixels, one per Gaussian"), pixels.to_string())),
+        }
+    };
+    let [low, high] = [of_gaussians(&meta.means.files[0])?, of_gaussians(&meta.means.files[1])?];
+    let [scales, quats, sh0] =
+        [&meta.scales.files[0], &meta.quats.files[0], &meta.sh0.files[0]].map(|name| of_gaussians(name));
+    let (scales, quats, sh0) = (scales?, quats?, sh0?);
+    let labels = meta.sh_n.as_ref().map(|entry| of_gaussians(&entry.files[1])).transpose()?;
+    let palette = match &meta.sh_n {
+        Some(entry) => Some(read_palette(entry, &image(&entry.files[0], MAX_PALETTE_PIXELS)?, path)?),
+        None => None,
+    };
+    let range = read_range(&meta, path)?;
+    let scale_book = codebook(&meta.scales.codebook, path, "scales")?;
+    let dc_book = codebook(&meta.sh0.codebook, path, "sh0")?;
+    let degree = palette.as_ref().map_or(0, |palette| palette.degree);
+    let mut gaussians = Gaussians::zeros(count, degree);
+    let at = |i: usize, image: &str| format!("{image}, Gaussian {i}");
+    for i in 0..count {
+        let rotation = decode_rotation(quats.pixels[i]).ok_or_else(|| {
+            let found = quats.pixels[i][3].to_string();
+            Error::input(path, at(i, &meta.quats.files[0]), "an alpha of 252, 253, 254 or 255", found)
+        })?;
+        let value = |book: &Codebook, pixel: [u8; 4], image: &str| {
+            decode_by_codebook(book, pixel).ok_or_else(|| {
+                let expected = format!("indices below {}, the length of the codebook", book.entries().len());
+                Error::input(path, at(i, image), expected, format!("{:?}", &pixel[..3]))
+            })
+        };
+        gaussians.position.set_row(i, decode_position(&range, low.pixels[i], high.pixels[i]));
+        gaussians.rotation.set_row(i, rotation);
+        gaussians.log_scale.set_row(i, value(&scale_book, scales.pixels[i], &meta.scales.files[0])?);
+        gaussians.opacity_logit.set_row(i, [decode_opacity(sh0.pixels[i][3])]);
+        let dc = value(&dc_book, sh0.pixels[i], &meta.sh0.files[0])?;
+        (0..3).for_each(|c| gaussians.sh.plane_mut(c)[i] = dc[c]);
+    }
+    if let (Some(palette), Some(labels), Some(entry)) = (&palette, &labels, &meta.sh_n) {
+        let label = |i: usize| decode_label(labels.pixels[i]);
+        if let Some(i) = (0..count).find(|&i| label(i) >= palette.count) {
+            let expected = format!("a label below {}, the number of palette entries", palette.count);
+            return Err(Error::input(path, at(i, &entry.files[1]), expected, label(i).to_string()));
+        }
+        for plane in 0..palette.width {
+            let values = gaussians.sh.plane_mut(3 + plane);
+            values.iter_mut().enumerate().for_each(|(i, to)| *to = palette.values[label(i) * palette.width + plane]);
+        }
+    }
+    Ok(gaussians)
+}
+
+/// Files of an archive or of a folder.
+enum Files {
+    Archive(ZipArchive<BufReader<File>>),
+    Folder(PathBuf),
+}
+
+impl Files {
+    /// Opens the archive at `path`.
+    fn open_archive(path: &Path) -> Result<Files> {
+        let damaged = |found: String| {
+            Error::input(path, "", "a .sog, a ZIP archive of images", found)
+                .hint("if the file was copied, copy it again: one that is cut short has lost its list of files")
+        };
+        let mut file = BufReader::new(open_file(path)?);
+        let declared = declared_directory(&mut file).map_err(|error| damaged(error.to_string()))?;
+        if declared.entries > MAX_ENTRIES || declared.bytes > MAX_LIST_BYTES {
+            return Err(damaged(format!("a list of {} files in {} bytes", declared.entries, declared.bytes)));
+        }
+        Ok(Files::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
+    }
+
+    /// Reads the file called `name`, which may have at most `memory` bytes. Messages call the archive `path`.
+    fn read(&mut self, path: &Path, name: &str, memory: ReadLimit) -> Result<Vec<u8>> {
+        match self {
+            Files::Archive(archive) => {
+                let refused = |error: String| Error::input(path, name, "a file in the archive", quoted(&error));
+                let mut entry = archive.by_name(name).map_err(|error| refused(error.to_string()))?;
+                memory.check(path, name, "the file", entry.size())?;
+                let mut bytes = Vec::new();
+                let length = entry.size();
+                entry.by_ref().take(length).read_to_end(&mut bytes).map_err(|error| refused(error.to_string()))?;
+                Ok(bytes)
+            }
+            Files::Folder(folder) => {
+                if name.is_empty() || name.contains(['/', '\\', ':']) || name.starts_with('.') {
+                    return Err(Error::input(path, META, "names of files in this folder", quoted(name)));
+                }
+                read_small(&folder.join(name), memory.bytes(), "an image")
+            }
+        }
+    }
+}
+
+/// Parses `meta.json`, whose text is `text`.
+fn parse(text: &[u8], path: &Path) -> Result<Meta> {
+    let value = read_from(text, &path.join(META), &ParseAbort::default(), PhantomData::<Value>)?;
+    if value["version"] != VERSION {
+        let found = match &value["version"] {
+            Value::Null => "none, as in version 1".to_owned(),
+            version => quoted(&version.to_string()),
+        };
+        return Err(Error::input(path, "meta.json, version", VERSION.to_string(), found)
+            .hint("splat-transform of PlayCanvas converts other versions: splat-transform OLD.sog NEW.ply"));
+    }
+    serde_json::from_value(value)
+        .map_err(|error| Error::input(path, META, "the members of version 2 of the format", quoted(&error.to_string())))
+}
+
+/// Returns the range of the logarithmic coordinates.
+fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
+    let (mins, maxs) = (meta.means.mins, meta.means.maxs);
+    for axis in 0..3 {
+        let (min, max) = (mins[axis], maxs[axis]);
+        if !(-MAX_LOG_COORDINATE <= min && min <= max && max <= MAX_LOG_COORDINATE) {
+            let expected = format!("a range within ±{MAX_LOG_COORDINATE}");
+            return Err(Error::input(
+                path,
+                format!("meta.json, means, axis {axis}"),
+                expected,
+                format!("{min} to {max}"),
+            ));
+        }
+    }
+    Ok(Range3 { mins, maxs })
+}
+
+/// Returns the codebook of `what`, of at most 256 finite numbers. Some writers leave out the first number.
+fn codebook(entries: &[Option<f32>], path: &Path, what: &str) -> Result<Codebook> {
+    let place = || format!("meta.json, {what}, codebook");
+    if entries.is_empty() || entries.len() > super::codebook::ENTRIES {
+        return Err(Error::input(path, place(), "1 to 256 numbers", entries.len().to_string()));
+    }
+    let value = |at: usize| match (entries[at], at) {
+        (None, 0) => entries.get(1).copied().flatten(),
+        (value, _) => value,
+    };
+    let values: Option<Vec<f32>> =
+        (0..entries.len()).map(|at| value(at).filter(|value| value.abs() <= MAX_CODEBOOK_VALUE)).collect();
+    values
+        .map(Codebook::from_entries)
+        .ok_or_else(|| Error::input(path, place(), "finite numbers", "null or a number beyond 1e30"))
+}
+
+/// Decoded palette of SH coefficients above degree 0.
+struct DecodedPalette {
+    degree: usize,
+    /// Number of entries.
+    count: usize,
+    /// Number of values per entry: red, green and blue of each coefficient.
+    width: usize,
+    values: Vec<f32>,
+}
+
+/// Decodes the image `image` of palette entries.
+fn read_palette(entry: &PaletteEntry, image: &RgbaImage, path: &Path) -> Result<DecodedPalette> {
+    let name = &entry.files[0];
+    let degree = (1..=MAX_SH_DEGREE).find(|&degree| image.width == 64 * (sh_coefficients(degree) - 1));
+    let Some(degree) = degree.filter(|&degree| entry.bands.is_none_or(|bands| bands == degree as u64)) else {
+        let expected = match entry.bands {
+            Some(bands @ 1..=3) => format!("a width of {} pixels", 64 * (sh_coefficients(bands as usize) - 1)),
+            _ => "a width of 192, 512 or 960 pixels for 1, 2 or 3 bands".to_owned(),
+        };
+        return Err(Error::input(path, name, expected, image.width.to_string()));
+    };
+    let coefficients = sh_coefficients(degree) - 1;
+    let there = image.pixels.len() / coefficients;
+    let count = entry.count.map_or(there, |count| usize::try_from(count).unwrap_or(usize::MAX));
+    if count > there {
+        return Err(Error::input(path, name, format!("{count} palette entries"), there.to_string()));
+    }
+    let book = codebook(&entry.codebook, path, "shN")?;
+    let mut values = Vec::with_capacity(3 * count * coefficients);
+    for label in 0..count {
+        for &pixel in palette_entry(image, label).unwrap_or_default() {
+            values.extend(decode_by_codebook(&book, pixel).ok_or_else(|| {
+                let expected = format!("indices below {}, the length of the codebook", book.entries().len());
+                Error::input(path, format!("{name}, entry {label}"), expected, format!("{:?}", &pixel[..3]))
+            })?);
+        }
+    }
+    Ok(DecodedPalette { degree, count, width: 3 * coefficients, values })
+}
