@@ -114,8 +114,8 @@ impl CommandArgs {
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz or
-    /// .ftgs.ply
+    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz, .tsog,
+    /// .ftgs.ply or .gsd
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     /// Format of the output [default: by its name]
@@ -225,8 +225,12 @@ pub(super) enum OutputKindArg {
     FourDgs,
     /// One frame, for web viewers (.spz)
     Spz,
+    /// Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)
+    Tsog,
     /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
     Ftgs,
+    /// Every frame whole, for SplatRenderer of Unreal (.gsd)
+    Gsd,
 }
 
 /// Arguments of `score`.
@@ -439,8 +443,8 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs, .spz or .ftgs.ply; a folder (the model in an archive, a PLY per frame of a
-    /// sequence, or a model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .tsog, .ftgs.ply or .gsd; a folder (the model in an archive, a PLY per
+    /// frame of a sequence, or a model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// The output, as other commands name it

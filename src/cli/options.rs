@@ -338,7 +338,9 @@ pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
         OutputKindArg::Splatv => OutputKind::Splatv,
         OutputKindArg::FourDgs => OutputKind::FourDgs,
         OutputKindArg::Spz => OutputKind::Spz,
+        OutputKindArg::Tsog => OutputKind::Tsog,
         OutputKindArg::Ftgs => OutputKind::Ftgs,
+        OutputKindArg::Gsd => OutputKind::Gsd,
     }
 }
 

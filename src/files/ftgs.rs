@@ -44,17 +44,22 @@ pub struct ClipTimes {
     pub last: f64,
     /// Number of frames T if it is known. Frame i is at the time i/max(T − 1, 1).
     pub frames: Option<usize>,
+    /// Frame rate of the playback, in frames per second. A `.ftgs.ply` does not store it.
+    pub frame_rate: f64,
 }
+
+/// Frame rate of the playback if nothing else is known, in frames per second.
+pub const FRAME_RATE: f64 = 30.0;
 
 impl ClipTimes {
     /// Times of a sequence that is not mapped, with an unknown number of frames.
-    pub const UNIT: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None };
+    pub const UNIT: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
 
     /// Returns the mapping of `times`, which increase, to the range from 0 to 1.
     pub fn from_times(times: &[f64]) -> ClipTimes {
         let first = times.first().copied().unwrap_or(0.0);
         let last = times.last().copied().filter(|&last| last > first).unwrap_or(first + 1.0);
-        ClipTimes { first, last, frames: Some(times.len()) }
+        ClipTimes { first, last, frames: Some(times.len()), frame_rate: FRAME_RATE }
     }
 
     /// Returns the time from 0 to 1 that belongs to `time` of the original sequence.
@@ -62,10 +67,10 @@ impl ClipTimes {
         (time - self.first) / (self.last - self.first)
     }
 
-    /// Returns the two numbers of a text `FIRST LAST`; `None` if they are not finite or do not increase.
+    /// Returns the times of a sequence from `first` to `last`; `None` if they are not finite or do not increase.
     pub(crate) fn from_range(first: f64, last: f64) -> Option<ClipTimes> {
         let is_range = first.is_finite() && last.is_finite() && last - first > 1e-12 * first.abs().max(last.abs());
-        is_range.then_some(ClipTimes { first, last, frames: None })
+        is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT })
     }
 }
 
@@ -266,7 +271,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
         for (degree, bytes_per_row) in [(0, 88), (1, 124), (2, 184), (3, 268)] {
-            let clip = ClipTimes { first: -0.5, last: 2.0, frames: Some(31) };
+            let clip = ClipTimes { first: -0.5, last: 2.0, frames: Some(31), ..ClipTimes::UNIT };
             write_ftgs(&params(7, degree), &clip, &path).unwrap();
             let found = read(&path).unwrap();
             assert_eq!((&found.params, found.header.clip), (&params(7, degree), clip));

@@ -32,6 +32,7 @@ pub mod splatv;
 pub mod spz;
 pub(crate) mod state_dict;
 pub mod text;
+pub mod tsog;
 pub mod webp;
 mod zip_directory;
 pub(crate) mod zip_output;

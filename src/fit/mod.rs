@@ -54,7 +54,7 @@ pub struct Misfit {
 
 impl Misfit {
     /// Adds the errors of one Gaussian at one frame: of its position, in units of its middle scale, and of its opacity.
-    fn add(&mut self, position: f64, opacity: f64) {
+    pub(crate) fn add(&mut self, position: f64, opacity: f64) {
         self.states += 1;
         self.squares += position * position;
         self.opacity_squares += opacity * opacity;

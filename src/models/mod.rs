@@ -44,8 +44,9 @@ use crate::files::open::open_file;
 use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Model formats that are read from files. The first entry that recognizes a path opens it.
-const MODEL_FORMATS: [ModelFormat; 15] = [
+const MODEL_FORMATS: [ModelFormat; 16] = [
     windowed::FTGS,
+    windowed::TSOG,
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
     sc_gs::ENTRY,

@@ -18,6 +18,7 @@ use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
+use crate::outputs::gsd::write_gsd;
 use crate::outputs::kind::OutputKind;
 use crate::outputs::windows::write_fitted_windows;
 use crate::passes::{HeldFrames, States, WithDelta, gather_all};
@@ -163,7 +164,8 @@ pub fn write_sequence(
     let info = source.info();
     match kind {
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
-        OutputKind::Ftgs => return write_fitted_windows(source, kind, path, events),
+        OutputKind::Ftgs | OutputKind::Tsog => return write_fitted_windows(source, kind, path, events),
+        OutputKind::Gsd => return Ok(vec![write_gsd(source, path, held, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
             let off = write_spz(&gather_all(source, 0, Attributes::all())?, path)?;

@@ -82,7 +82,7 @@ pub(super) fn unrecognized_file(path: &Path) -> Error {
 /// Returns a text with one line for each kind of input that can be read.
 fn layouts() -> String {
     let folders = LAYOUTS.iter().map(|layout| format!("{}: a folder with {}", layout.name, layout.files.join(", ")));
-    let files = "files: .gseq, .gsz, .splatv, .ftgs.ply, .ply, params.npz, a checkpoint (.pth, .pt)".to_owned();
+    let files = "files: .gseq, .gsz, .splatv, .tsog, .ftgs.ply, .ply, params.npz, a checkpoint (.pth, .pt)".to_owned();
     let lines: Vec<String> = folders.chain([files]).collect();
     format!("inputs that can be read:\n    {}", lines.join("\n    "))
 }

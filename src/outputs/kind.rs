@@ -27,8 +27,12 @@ pub enum OutputKind {
     FourDgs,
     /// A `.spz` file: one frame, strongly compressed.
     Spz,
+    /// A `.gsd` file: every frame whole, for Unreal.
+    Gsd,
     /// A `.ftgs.ply` file: linear motion in Gaussian windows of time.
     Ftgs,
+    /// A `.tsog` file: linear motion in Gaussian windows of time, or single frames, as images for web players.
+    Tsog,
 }
 
 impl OutputKind {
@@ -53,9 +57,11 @@ impl OutputKind {
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
+             NAME.tsog      linear motion in windows of time, the smallest for web viewers\n  \
              NAME.ftgs.ply  linear motion in windows of time, for ftgs-player\n  \
+             NAME.gsd       every frame whole, for Unreal\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
-             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|ftgs",
+             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|tsog|ftgs|gsd",
             path.shown(),
             path.shown()
         )))
@@ -73,6 +79,8 @@ impl OutputKind {
             "splatv" => Some(OutputKind::Splatv),
             "4dgs" => Some(OutputKind::FourDgs),
             "spz" => Some(OutputKind::Spz),
+            "tsog" => Some(OutputKind::Tsog),
+            "gsd" => Some(OutputKind::Gsd),
             _ => None,
         }
     }
@@ -160,7 +168,19 @@ mod tests {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");
             }
         }
-        for name in ["x", "x.gsz", "X.GSEQ", "x.ply", "x.FTGS.ply", "small.v2", "run.2024", "out_0.3", ".hidden"] {
+        for name in [
+            "x",
+            "x.gsz",
+            "X.GSEQ",
+            "x.ply",
+            "x.FTGS.ply",
+            "x.tsog",
+            "x.gsd",
+            "small.v2",
+            "run.2024",
+            "out_0.3",
+            ".hidden",
+        ] {
             assert_eq!(refused(name), None, "{name}");
         }
         assert!(check_folder_name(Path::new("page.html"), "report").unwrap_err().to_string().contains("folder"));

@@ -1,18 +1,22 @@
 //! Writes any sequence in formats of linear motion in Gaussian windows of time: lines in time windows, fitted to the
 //! trajectory of every Gaussian. Models that have such motion are written without a fit.
 //!
-//! The time of these formats runs from 0, at the first frame, to 1, at the last. Memory: all lines.
+//! The time of these formats runs from 0, at the first frame, to 1, at the last. A `.tsog` can also hold single frames,
+//! and does where lines are too far off or too many ([`are_frames_better`]). Memory: all lines, or the visible Gaussians
+//! of all single frames.
 
 use std::path::Path;
 
 use crate::error::{Error, Result};
 use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, VELOCITY, WIDTH, write_ftgs};
-use crate::fit::{CubicTrack, CurveForm, Misfit, Tolerance, curved};
-use crate::model::{AttributeValues, Gaussians, StoredParams, logit};
+use crate::files::tsog::write::{MAX_FRAMES, write_tsog};
+use crate::files::tsog::{TimedGaussians, Timeline};
+use crate::fit::{CubicTrack, CurveForm, MIN_VISIBLE_OPACITY, Misfit, Tolerance, curved};
+use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, logit, opacity};
 use crate::outputs::kind::OutputKind;
-use crate::passes::tracks;
+use crate::passes::{States, tracks};
 use crate::progress::Events;
-use crate::source::FrameSource;
+use crate::source::{FrameSource, ReadPlan};
 
 /// Standard deviation of the time window of a Gaussian with constant opacity, in units of the sequence. The window is 1
 /// with an error below 1e-7 at every time from 0 to 1.
@@ -20,12 +24,18 @@ const CONSTANT_DEVIATION: f64 = 2000.0;
 /// Minimum difference of an opacity from 0 and from 1, so that its logit is finite.
 const OPACITY_MARGIN: f64 = 1e-6;
 
+/// Maximum number of Gaussians of all single frames together in a `.tsog`. Its player shows no more by default.
+pub const MAX_SINGLE_FRAMES: usize = 1_000_000;
+/// Errors of a fit above which single frames are written: root mean square of positions in units of the middle scale, and
+/// of opacities.
+const MAX_MISFIT: [f64; 2] = [0.5, 0.1];
+/// Approximate bytes in a `.tsog` of a line in a time window, divided by those of a Gaussian in a single frame.
+const BYTES_RATIO: f64 = 1.5;
+
 /// Gaussians with linear motion in time windows, fitted to a sequence.
 #[derive(Debug)]
 struct FittedWindows {
-    /// Parameters as [`crate::files::ftgs`] stores them; times are from 0 to 1.
-    params: StoredParams,
-    clip: ClipTimes,
+    lines: TimedGaussians,
     misfit: Misfit,
     /// Number of lines that were left out because a value of their Gaussian is not finite.
     left_out: usize,
@@ -33,17 +43,24 @@ struct FittedWindows {
 
 /// Returns whether `kind` is a format of linear motion in time windows.
 pub fn is_windowed(kind: OutputKind) -> bool {
-    kind == OutputKind::Ftgs
+    matches!(kind, OutputKind::Ftgs | OutputKind::Tsog)
 }
 
-/// Writes the Gaussians `params` with linear motion in time windows to the file `path`, in the format `kind`. Returns
-/// notes for the user.
+/// Returns whether the format `kind` can store Gaussians with the visibility `timeline`.
+pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
+    kind == OutputKind::Tsog || (kind == OutputKind::Ftgs && timeline == Timeline::Windows)
+}
+
+/// Writes the Gaussians `timed` to the file `path`, in the format `kind`. Returns notes for the user.
 ///
 /// # Errors
-/// Fails if the file cannot be written or `kind` has no such motion.
-pub fn write_windows(params: &StoredParams, clip: &ClipTimes, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
+/// Fails if the file cannot be written, or if `kind` cannot store the motion ([`can_store`]).
+pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
     match kind {
-        OutputKind::Ftgs => write_ftgs(params, clip, path).map(|()| Vec::new()),
+        OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
+            write_ftgs(&timed.params, &timed.clip, path).map(|()| Vec::new())
+        }
+        OutputKind::Tsog => Ok(vec![write_tsog(timed, path)?.note()]),
         _ => Err(Error::internal("time windows in a format without them")),
     }
 }
@@ -59,13 +76,19 @@ pub fn write_fitted_windows(
     path: &Path,
     events: &Events,
 ) -> Result<Vec<String>> {
-    let fitted = fit(source, events)?;
-    let FittedWindows { params, clip, misfit, left_out } = &fitted;
+    let info = source.info();
+    if kind == OutputKind::Tsog && info.times.len() == 1 {
+        let still = single_frames(source, &ClipTimes::from_times(&info.times))?;
+        let params = StoredParams::from(still.params.gaussians);
+        return write_timed(&TimedGaussians { params, timeline: Timeline::Still, ..still }, kind, path);
+    }
+    let fitted = fit(source, kind, events)?;
+    let FittedWindows { lines, misfit, left_out } = &fitted;
     let mut notes = vec![format!(
         "{} Gaussians became {} lines in time windows; error of positions, as a fraction of the Gaussian's middle \
          scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} rms, {:.3} at most",
-        source.info().count,
-        params.len(),
+        info.count,
+        lines.params.len(),
         misfit.rms(),
         misfit.position,
         misfit.opacity_rms(),
@@ -74,17 +97,67 @@ pub fn write_fitted_windows(
     if *left_out > 0 {
         notes.push(format!("{left_out} lines left out: a value of their Gaussian is not finite"));
     }
-    notes.extend(write_windows(params, clip, kind, path)?);
+    if kind == OutputKind::Tsog && are_frames_better(lines, misfit) {
+        let frames = single_frames(source, &lines.clip)?;
+        let why = format!(
+            "single frames are written instead, {} Gaussians in {} frames: the lines are too far off or too many",
+            frames.params.len(),
+            info.times.len()
+        );
+        return Ok([vec![why], notes, write_timed(&frames, kind, path)?].concat());
+    }
+    notes.extend(write_timed(lines, kind, path)?);
     Ok(notes)
 }
 
-/// Fits lines in time windows to all Gaussians of `source`.
-fn fit(source: &dyn FrameSource, events: &Events) -> Result<FittedWindows> {
+/// Returns whether single frames are written instead of `lines`: if the error of the fit is above [`MAX_MISFIT`], or if
+/// single frames, which have no such error, take about as few bytes. There may be at most [`MAX_SINGLE_FRAMES`] of
+/// them.
+fn are_frames_better(lines: &TimedGaussians, misfit: &Misfit) -> bool {
+    let is_far_off = misfit.rms() > MAX_MISFIT[0] || misfit.opacity_rms() > MAX_MISFIT[1];
+    let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
+    let frames = lines.clip.frames.unwrap_or(1);
+    (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAMES as u64 && frames <= MAX_FRAMES
+}
+
+/// Returns the visible Gaussians of all frames, each seen in its own frame only. Gaussians with values that are not
+/// finite are left out.
+fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
+    let info = source.info();
+    let mut states = States::open(source, &ReadPlan::every().holding(1))?;
+    let (mut parts, mut frame_of) = (Vec::new(), Vec::new());
+    for frame in 0..info.times.len() {
+        let state = states.at(frame)?;
+        let is_finite = |row: usize| {
+            let columns = Attributes::all().iter().map(|column| state.column(column));
+            columns.flat_map(|values| (0..values.width()).map(|c| values.plane(c)[row])).all(f32::is_finite)
+        };
+        let is_seen = |row: usize| opacity(state.opacity_logit.plane(0)[row]) >= MIN_VISIBLE_OPACITY && is_finite(row);
+        let rows: Vec<u32> = (0..state.len() as u32).filter(|&row| is_seen(row as usize)).collect();
+        frame_of.extend(std::iter::repeat_n(frame as f32, rows.len()));
+        parts.push(state.pick(&rows));
+    }
+    let mut gaussians = Gaussians::zeros(frame_of.len(), info.sh_degree);
+    for column in Attributes::all().iter() {
+        let to = gaussians.column_mut(column);
+        for c in 0..to.width() {
+            let values = parts.iter().flat_map(|part| part.column(column).plane(c).iter().copied());
+            to.plane_mut(c).iter_mut().zip(values).for_each(|(to, value)| *to = value);
+        }
+    }
+    let own = AttributeValues::from_planes(1, frame_of);
+    let timeline = Timeline::Frames(info.times.len());
+    Ok(TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip: *clip })
+}
+
+/// Fits lines in time windows to all Gaussians of `source`, for the format `kind`.
+fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let clip = ClipTimes::from_times(&info.times);
     let times: Vec<f64> = info.times.iter().map(|&time| clip.to_unit(time)).collect();
-    let (tolerance, form) = (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_DEVIATION));
+    let min_deviation = if kind == OutputKind::Ftgs { MIN_DEVIATION } else { 0.0 };
+    let (tolerance, form) = (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * min_deviation));
     let found = tracks(source, &times, &progress, |track| {
         let mut misfit = Misfit::default();
         (curved(track, form, &tolerance, &mut misfit), misfit)
@@ -97,7 +170,8 @@ fn fit(source: &dyn FrameSource, events: &Events) -> Result<FittedWindows> {
         own: AttributeValues::zeros(WIDTH, lines.len()),
     };
     lines.iter().enumerate().for_each(|(row, line)| set_row(&mut params, row, line));
-    Ok(FittedWindows { left_out: all - lines.len(), params, clip, misfit })
+    let left_out = all - lines.len();
+    Ok(FittedWindows { lines: TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit, left_out })
 }
 
 /// Returns whether all values of a line fit into f32. The width of its window may be infinite.
@@ -134,8 +208,8 @@ mod tests {
     use crate::files::ftgs::Ftgs;
     use crate::files::ply::PlyOptions;
     use crate::files::splatv::rows::ZeroRotation;
-    use crate::fit::MIN_VISIBLE_OPACITY;
-    use crate::model::{Attributes, opacity};
+    use crate::files::tsog::read::read_tsog;
+    use crate::limits::ReadLimit;
     use crate::passes::gather_all;
 
     /// Evaluates the formulas of the player: positions and opacities of all Gaussians at the time `time`.
@@ -201,10 +275,60 @@ mod tests {
     #[test]
     fn still_gaussians_are_one_line_with_an_open_window() {
         let scene = Scene::new(40, 1);
-        let fitted = fit(&scene, &Events::IGNORED).unwrap();
-        let params = &fitted.params;
+        let fitted = fit(&scene, OutputKind::Ftgs, &Events::IGNORED).unwrap();
+        let params = &fitted.lines.params;
         assert!(params.len() <= 40 && !params.is_empty());
         assert!(params.own.plane(LOG_DEVIATION).iter().all(|&log| f64::from(log) > 7.0));
         assert!((VELOCITY..WIDTH).all(|plane| params.own.plane(plane).iter().all(|&x| x == 0.0)));
+    }
+
+    /// Returns lines and the error of their fit, which visited `states` states.
+    fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, Misfit) {
+        let mut misfit = Misfit::default();
+        (0..states).for_each(|_| misfit.add(position, 0.0));
+        let params = StoredParams { gaussians: Gaussians::zeros(lines, 0), own: AttributeValues::zeros(WIDTH, lines) };
+        let clip = ClipTimes { frames: Some(10), ..ClipTimes::UNIT };
+        (TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit)
+    }
+
+    #[test]
+    fn single_frames_replace_lines_that_are_far_off_or_many() {
+        for (lines, states, position, expected) in [
+            (100, 1000, 0.1, false),
+            (100, 1000, 0.6, true),
+            (700, 1000, 0.1, true),
+            (700, MAX_SINGLE_FRAMES + 1, 0.6, false),
+        ] {
+            let (lines, misfit) = fitted(lines, states, position);
+            assert_eq!(are_frames_better(&lines, &misfit), expected, "{states} states, {position} off");
+        }
+    }
+
+    #[test]
+    fn single_frames_hold_all_visible_gaussians() {
+        let scene = Scene::new(60, 2);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scene.tsog");
+        let frames = single_frames(&scene, &ClipTimes::from_times(&scene.info().times)).unwrap();
+        let visible: usize = (0..2)
+            .map(|frame| {
+                let state = gather_all(&scene, frame, Attributes::OPACITY).unwrap();
+                let logits = state.opacity_logit.plane(0);
+                logits.iter().filter(|&&logit| opacity(logit) >= MIN_VISIBLE_OPACITY).count()
+            })
+            .sum();
+        assert_eq!((frames.params.len(), frames.timeline), (visible, Timeline::Frames(2)));
+        write_timed(&frames, OutputKind::Tsog, &path).unwrap();
+        let found = read_tsog(&path, ReadLimit::NONE).unwrap();
+        assert_eq!((found.params.len(), found.timeline), (visible, Timeline::Frames(2)));
+    }
+
+    #[test]
+    fn a_tsog_of_one_frame_is_a_still() {
+        let scene = Scene::new(50, 1);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("still.tsog");
+        write_fitted_windows(&scene, OutputKind::Tsog, &path, &Events::IGNORED).unwrap();
+        assert_eq!(read_tsog(&path, ReadLimit::NONE).unwrap().timeline, Timeline::Still);
     }
 }

@@ -12,6 +12,7 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, VELOCITY};
+use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
@@ -186,7 +187,8 @@ impl ProxyRule for FreeTime {
 
     fn hash_settings(&self, _: &mut Xxh3) {}
 
-    fn windowed(&self, raw: &StoredParams) -> Option<(StoredParams, ClipTimes)> {
-        Some((self.with_deviations(raw), self.clip))
+    fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
+        let params = self.with_deviations(raw);
+        Some(TimedGaussians { params, timeline: Timeline::Windows, clip: self.clip })
     }
 }

@@ -19,7 +19,7 @@ use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
-use crate::files::ftgs::ClipTimes;
+use crate::files::tsog::TimedGaussians;
 use crate::limits::Limits;
 use crate::model::{Attributes, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
@@ -27,7 +27,7 @@ use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::outputs::windows::{is_windowed, write_windows};
+use crate::outputs::windows::{can_store, is_windowed, write_timed};
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -59,9 +59,9 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Returns the Gaussians `raw` as Gaussians with linear motion in Gaussian windows of time, as [`crate::files::ftgs`]
-    /// stores them, with the times of their frames. `None` if their motion has another form.
-    fn windowed(&self, raw: &StoredParams) -> Option<(StoredParams, ClipTimes)> {
+    /// Returns the Gaussians `raw` in a form that files of players store without a fit; `None` if their motion has
+    /// another form.
+    fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
         let _ = raw;
         None
     }
@@ -282,8 +282,8 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` is a format
-/// of linear motion in time windows and the model has such motion. Returns notes for the user, or `None` if the model
+/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store the
+/// motion of the model. Returns notes for the user, or `None` if the model
 /// has to be fitted.
 ///
 /// # Errors
@@ -294,13 +294,11 @@ pub(super) fn write_windowed<L: ProxyRule>(
     kind: OutputKind,
     path: &Path,
 ) -> Result<Option<Vec<String>>> {
-    if !is_windowed(kind) {
-        return Ok(None);
-    }
-    let raw = motion_model::compressed_raw(model.raw(), reduction);
-    let Some((params, clip)) = model.motion_model().windowed(&raw) else { return Ok(None) };
-    let frames = clip.frames.or(Some(model.info().times.len()).filter(|&frames| frames > 0));
-    write_windows(&params, &ClipTimes { frames, ..clip }, kind, path).map(Some)
+    let raw = || motion_model::compressed_raw(model.raw(), reduction);
+    let timed = if is_windowed(kind) { model.motion_model().timed(&raw()) } else { None };
+    let Some(mut timed) = timed.filter(|timed| can_store(kind, timed.timeline)) else { return Ok(None) };
+    timed.clip.frames = timed.clip.frames.or(Some(model.info().times.len()).filter(|&frames| frames > 0));
+    write_timed(&timed, kind, path).map(Some)
 }
 
 /// Returns whether `path` is a file of at most [`MAX_COPIED_BYTES`] bytes.

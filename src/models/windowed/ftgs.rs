@@ -12,7 +12,7 @@ use crate::models::motion_model::MotionModelFrames;
 use crate::outputs::kind::OutputKind;
 
 /// Smallest standard deviation of a time window, so that no 0/0 arises.
-const SMALLEST_DEVIATION: f64 = 1e-9;
+pub(super) const SMALLEST_DEVIATION: f64 = 1e-9;
 
 /// File of ftgs-player with linear motion in time windows.
 pub(in crate::models) const FTGS: ModelFormat = ModelFormat {

@@ -3,7 +3,9 @@
 //! The output has the same format with fewer Gaussians. The parameters of a Gaussian are those of
 //! [`crate::files::ftgs`], and FreeTimeGS has the same motion.
 
+mod frame_by_frame;
 mod ftgs;
+mod tsog;
 
 use std::path::{Path, PathBuf};
 
@@ -26,6 +28,7 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
+pub(super) use tsog::TSOG;
 
 /// Opened file of a player, whose Gaussians move as `L` says.
 #[derive(Debug)]

@@ -6,6 +6,10 @@ use crate::compressed_model::ParamDelta;
 use crate::files::ftgs::{CENTER, ClipTimes, Ftgs, LOG_DEVIATION, VELOCITY, WIDTH, write_ftgs};
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
+use crate::files::tsog::read::read_tsog;
+use crate::files::tsog::write::write_tsog;
+use crate::files::tsog::{TimedGaussians, Timeline};
+use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
 use crate::models;
 use crate::models::OpenOptions;
@@ -56,7 +60,7 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
     let path = folder.path().join("a.ftgs.ply");
     let stored = params();
     for (first, last) in [(0.0, 1.0), (-1.0, 3.0)] {
-        write_ftgs(&stored, &ClipTimes { first, last, frames: None }, &path).unwrap();
+        write_ftgs(&stored, &ClipTimes { first, last, ..ClipTimes::UNIT }, &path).unwrap();
         let times = TIMES.map(|time| first + (last - first) * time);
         let model = open_at(&path, &times);
         assert_eq!((model.kind(), model.own_output()), ("ftgs-player model", OutputKind::Ftgs));
@@ -82,7 +86,7 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
 fn a_smaller_ftgs_keeps_the_values_of_its_rows() {
     let folder = tempfile::tempdir().unwrap();
     let [path, small] = ["a.ftgs.ply", "small.ftgs.ply"].map(|name| folder.path().join(name));
-    let clip = ClipTimes { first: 1.0, last: 2.0, frames: Some(7) };
+    let clip = ClipTimes { first: 1.0, last: 2.0, frames: Some(7), ..ClipTimes::UNIT };
     write_ftgs(&params(), &clip, &path).unwrap();
     let model = open_at(&path, &[1.0, 1.5, 2.0]);
     assert!(write(&*model, &pruned(vec![2, 7, 9]), OutputKind::Ftgs, &small).is_empty());
@@ -117,7 +121,7 @@ fn proxies_of_copies_move_like_their_members() {
     made.set_row(1, &copy, 0);
     made.own.plane_mut(LOG_DEVIATION).fill(0.0);
     made.gaussians.opacity_logit.plane_mut(0).fill(-3.0);
-    write_ftgs(&made, &ClipTimes { first: 2.0, last: 6.0, frames: None }, &path).unwrap();
+    write_ftgs(&made, &ClipTimes { first: 2.0, last: 6.0, ..ClipTimes::UNIT }, &path).unwrap();
     let model = open_at(&path, &[2.0, 3.0, 4.0, 6.0]);
     let rule = Recipe::preset("default").unwrap().merge;
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] };
@@ -141,4 +145,66 @@ fn player_files_are_no_trained_models() {
     for kind in [OutputKind::Ftgs, OutputKind::Splatv, OutputKind::Gseq] {
         assert!(model.check_output(kind, Path::new("x")).is_ok(), "{kind:?}");
     }
+}
+
+fn timed(timeline: Timeline) -> TimedGaussians {
+    let StoredParams { gaussians, own } = params();
+    let own = match timeline {
+        Timeline::Windows => own,
+        Timeline::Frames(frames) => AttributeValues::from_planes(1, (0..COUNT).map(|i| (i % frames) as f32).collect()),
+        Timeline::Still => AttributeValues::zeros(0, COUNT),
+    };
+    let clip = ClipTimes { frames: Some(4), ..ClipTimes::UNIT };
+    TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip }
+}
+
+#[test]
+fn tsog_states_follow_the_formulas_of_the_player() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.tsog");
+    write_tsog(&timed(Timeline::Windows), &path).unwrap();
+    let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
+    let model = open_at(&path, &TIMES);
+    assert_eq!((model.kind(), model.own_output()), ("TSOG model", OutputKind::Tsog));
+    for (state, time) in states(&*model).iter().zip(TIMES) {
+        for i in 0..COUNT {
+            let own = |plane: usize| f64::from(stored.own.plane(plane)[i]);
+            let dt = time - own(CENTER);
+            let x = f64::from(stored.gaussians.position.plane(0)[i]) + own(VELOCITY) * dt;
+            assert!((f64::from(state.position.plane(0)[i]) - x).abs() < 1e-6);
+            let window = (-0.5 * (dt / own(LOG_DEVIATION).exp()).powi(2)).exp();
+            let expected = opacity(stored.gaussians.opacity_logit.plane(0)[i]) * window;
+            assert!((opacity(state.opacity_logit.plane(0)[i]) - expected).abs() < 1e-6, "Gaussian {i} at {time}");
+        }
+    }
+}
+
+#[test]
+fn a_tsog_of_single_frames_shows_each_gaussian_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let [path, small] = ["a.tsog", "small.tsog"].map(|name| folder.path().join(name));
+    write_tsog(&timed(Timeline::Frames(5)), &path).unwrap();
+    let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
+    let model = models::open(&path, &OpenOptions::default()).unwrap();
+    assert_eq!((model.timing(), model.source().info().times.len()), (Timing::Numbered, 5));
+    for (frame, state) in states(&*model).iter().enumerate() {
+        for i in 0..COUNT {
+            let is_seen = stored.own.plane(0)[i] as usize == frame;
+            assert_eq!(opacity(state.opacity_logit.plane(0)[i]) > 1e-9, is_seen, "Gaussian {i} in frame {frame}");
+        }
+    }
+    write(&*model, &pruned(vec![1, 4, 6]), OutputKind::Tsog, &small);
+    let found = read_tsog(&small, ReadLimit::NONE).unwrap();
+    assert_eq!((found.timeline, found.params.len()), (Timeline::Frames(5), 3));
+    assert!(model.with_times(vec![0.0; 4]).is_err());
+}
+
+#[test]
+fn a_still_tsog_is_one_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("still.zip");
+    write_tsog(&timed(Timeline::Still), &path).unwrap();
+    let model = models::open(&path, &OpenOptions::default()).unwrap();
+    assert_eq!((model.source().info().times.len(), model.source().info().varying), (1, Attributes::empty()));
+    assert_eq!(states(&*model)[0].len(), COUNT);
 }
