@@ -50,16 +50,24 @@ pub struct CurveForm {
     is_linear: bool,
     /// Minimum width of the time window, in units of time.
     min_width: f64,
+    /// Maximum number of intervals between overlapping curves.
+    max_intervals: usize,
 }
 
 impl CurveForm {
     /// Cubic motion, linear rotation, and time windows of any width.
-    pub const CUBIC: CurveForm = CurveForm { is_linear: false, min_width: 0.0 };
+    pub const CUBIC: CurveForm = CurveForm { is_linear: false, min_width: 0.0, max_intervals: 32 };
 
     /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
     /// The higher coefficients of such a [`CubicTrack`] are 0.
     pub fn linear(min_width: f64) -> CurveForm {
-        CurveForm { is_linear: true, min_width }
+        CurveForm { is_linear: true, min_width, max_intervals: 32 }
+    }
+
+    /// Returns this form with at most `max_intervals` intervals between overlapping curves, one less than the number of
+    /// curves.
+    pub fn with_intervals(self, max_intervals: usize) -> CurveForm {
+        CurveForm { max_intervals, ..self }
     }
 
     /// Returns the numbers of intervals between overlapping curves that are tried, in this order.
@@ -101,7 +109,11 @@ pub fn curved(track: &FittedTrack, form: CurveForm, tolerance: &Tolerance, misfi
     done = done || attempt(vec![single_window_curve(track, form)]);
     let visible = [track.times[first], track.times[last]];
     let is_wide = |count: usize| WIDTH_PER_INTERVAL * (visible[1] - visible[0]) / count as f64 >= form.min_width;
-    for &count in form.intervals().iter().take_while(|&&count| count <= (last - first + 1).max(2) && is_wide(count)) {
+    for &count in form
+        .intervals()
+        .iter()
+        .take_while(|&&count| count <= form.max_intervals.min((last - first + 1).max(2)) && is_wide(count))
+    {
         done = done || attempt(overlapping_curves(track, form, visible, count));
     }
     let (_, curves, found) = best.unwrap_or_default();
@@ -266,6 +278,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
     for frame in 0..track.len() {
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
+        let weight = tolerance.weight(track.opacity[frame]);
         for curve in curves {
             let share = depth(curve.opacity_at(time));
             shown += share;
@@ -286,13 +299,13 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             ]
             .into_iter()
             // A curve that is hardly visible in this frame need not be as close.
-            .map(|excess| excess * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
+            .map(|excess| excess * weight * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
             .fold(worst, f64::max);
         }
         let apart = 1.0 - (-shown).exp() - track.opacity[frame];
         if track.is_seen(frame) || apart > MIN_VISIBLE_OPACITY {
             worst = worst.max(apart.abs() / tolerance.opacity);
-            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart);
+            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
         }
     }
     (if worst.is_nan() { f64::INFINITY } else { worst }, misfit)
@@ -360,8 +373,8 @@ mod tests {
         let one = curved(&cut, CurveForm::linear(0.0), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center + 0.1).abs() < 1e-6 && (one[0].width - 0.6).abs() < 1e-6, "{:?}", one[0]);
-        assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-3, "{:?}", one[0]);
-        assert!(misfit.opacity < 1e-6 && misfit.position < 1e-3, "{misfit:?}");
+        assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-2, "{:?}", one[0]);
+        assert!(misfit.opacity < 1e-6 && misfit.position < 0.05, "{misfit:?}");
     }
 
     #[test]
@@ -374,6 +387,6 @@ mod tests {
             assert_eq!((&line.position[2..], line.rotation[1]), (&[[0.0; 3]; 2][..], [0.0; 4]));
             assert!(line.width >= 0.1, "{}", line.width);
         }
-        assert!(misfit.rms() < 0.5 && misfit.opacity < 0.05, "{misfit:?}");
+        assert!(misfit.rms() < 1.0 && misfit.opacity < 0.1, "{misfit:?}");
     }
 }

@@ -26,9 +26,12 @@ const OPACITY_MARGIN: f64 = 1e-6;
 
 /// Maximum number of Gaussians of all single frames together in a `.tsog`. Its player shows no more by default.
 pub const MAX_SINGLE_FRAMES: usize = 1_000_000;
-/// Errors of a fit above which single frames are written: root mean square of positions in units of the middle scale, and
-/// of opacities.
-const MAX_MISFIT: [f64; 2] = [0.5, 0.1];
+/// Fraction of the visible states that are far off in a fit ([`Misfit::far_share`]) above which single frames are
+/// written.
+const MAX_FAR_SHARE: f64 = 0.1;
+/// Maximum number of intervals between the lines of a Gaussian in a `.tsog`. More lines take many bytes for the few
+/// Gaussians that need them.
+const COMPACT_INTERVALS: usize = 8;
 /// Approximate bytes in a `.tsog` of a line in a time window, divided by those of a Gaussian in a single frame.
 const BYTES_RATIO: f64 = 1.5;
 
@@ -85,10 +88,12 @@ pub fn write_fitted_windows(
     let fitted = fit(source, kind, events)?;
     let FittedWindows { lines, misfit, left_out } = &fitted;
     let mut notes = vec![format!(
-        "{} Gaussians became {} lines in time windows; error of positions, as a fraction of the Gaussian's middle \
-         scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} rms, {:.3} at most",
+        "{} Gaussians became {} lines in time windows; off by more than the middle scale or 0.1 of opacity: {:.1}% of \
+         what is visible; error of positions, as a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; \
+         error of opacities: {:.3} rms, {:.3} at most",
         info.count,
         lines.params.len(),
+        100.0 * misfit.far_share(),
         misfit.rms(),
         misfit.position,
         misfit.opacity_rms(),
@@ -110,11 +115,11 @@ pub fn write_fitted_windows(
     Ok(notes)
 }
 
-/// Returns whether single frames are written instead of `lines`: if the error of the fit is above [`MAX_MISFIT`], or if
+/// Returns whether single frames are written instead of `lines`: if more than [`MAX_FAR_SHARE`] of them are far off, or if
 /// single frames, which have no such error, take about as few bytes. There may be at most [`MAX_SINGLE_FRAMES`] of
 /// them.
 fn are_frames_better(lines: &TimedGaussians, misfit: &Misfit) -> bool {
-    let is_far_off = misfit.rms() > MAX_MISFIT[0] || misfit.opacity_rms() > MAX_MISFIT[1];
+    let is_far_off = misfit.far_share() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
     let frames = lines.clip.frames.unwrap_or(1);
     (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAMES as u64 && frames <= MAX_FRAMES
@@ -156,8 +161,10 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let clip = ClipTimes::from_times(&info.times);
     let times: Vec<f64> = info.times.iter().map(|&time| clip.to_unit(time)).collect();
-    let min_deviation = if kind == OutputKind::Ftgs { MIN_DEVIATION } else { 0.0 };
-    let (tolerance, form) = (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * min_deviation));
+    let (tolerance, form) = match kind {
+        OutputKind::Tsog => (Tolerance::COMPACT, CurveForm::linear(0.0).with_intervals(COMPACT_INTERVALS)),
+        _ => (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_DEVIATION)),
+    };
     let found = tracks(source, &times, &progress, |track| {
         let mut misfit = Misfit::default();
         (curved(track, form, &tolerance, &mut misfit), misfit)
@@ -285,7 +292,7 @@ mod tests {
     /// Returns lines and the error of their fit, which visited `states` states.
     fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, Misfit) {
         let mut misfit = Misfit::default();
-        (0..states).for_each(|_| misfit.add(position, 0.0));
+        (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));
         let params = StoredParams { gaussians: Gaussians::zeros(lines, 0), own: AttributeValues::zeros(WIDTH, lines) };
         let clip = ClipTimes { frames: Some(10), ..ClipTimes::UNIT };
         (TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit)
@@ -295,9 +302,9 @@ mod tests {
     fn single_frames_replace_lines_that_are_far_off_or_many() {
         for (lines, states, position, expected) in [
             (100, 1000, 0.1, false),
-            (100, 1000, 0.6, true),
+            (100, 1000, 1.5, true),
             (700, 1000, 0.1, true),
-            (700, MAX_SINGLE_FRAMES + 1, 0.6, false),
+            (700, MAX_SINGLE_FRAMES + 1, 1.5, false),
         ] {
             let (lines, misfit) = fitted(lines, states, position);
             assert_eq!(are_frames_better(&lines, &misfit), expected, "{states} states, {position} off");

@@ -53,7 +53,7 @@ pub struct Range3 {
 
 impl Range3 {
     /// Returns the range of the finite values among `values`, rows of three components; 0 to 0 without such values.
-    pub fn of_rows(values: impl Iterator<Item = [f64; 3]>) -> Range3 {
+    pub fn from_rows(values: impl Iterator<Item = [f64; 3]>) -> Range3 {
         let (mut mins, mut maxs) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for row in values {
             for c in (0..3).filter(|&c| row[c].is_finite()) {
@@ -92,7 +92,7 @@ pub fn from_log_coordinate(n: f64) -> f64 {
 /// Gaussians near one another in space are near in the images, which then compress better.
 pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
-    let range = Range3::of_rows((0..position.len()).map(logs));
+    let range = Range3::from_rows((0..position.len()).map(logs));
     let code = |row: u32| {
         let logs = logs(row as usize);
         (0..3).map(|axis| spread(u64::from(range.encode(axis, logs[axis]))) << axis).sum::<u64>()
@@ -120,7 +120,7 @@ pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
 /// Returns the range of the logarithmic coordinates of `position` and their images of low and high bytes.
 pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u32]) -> (Range3, [RgbaImage; 2]) {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
-    let range = Range3::of_rows(order.iter().map(|&row| logs(row as usize)));
+    let range = Range3::from_rows(order.iter().map(|&row| logs(row as usize)));
     let images = encode_16_bit(size, order, |row| {
         let logs = logs(row);
         [0, 1, 2].map(|axis| range.encode(axis, logs[axis]))

@@ -119,7 +119,7 @@ fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images:
         let deviation = f64::from(params.own.plane(LOG_DEVIATION)[row]).exp().max(f64::from(f32::MIN_POSITIVE));
         [f64::from(params.own.plane(CENTER)[row]), deviation, 0.0]
     };
-    let range = Range3::of_rows((0..params.len()).map(window));
+    let range = Range3::from_rows((0..params.len()).map(window));
     let pair = encode_16_bit(size, order, |row| {
         let values = window(row);
         [range.encode(0, values[0]), range.encode(1, values[1]), 0]
@@ -138,7 +138,7 @@ fn encode_velocities(
     images: &mut NamedImages,
 ) -> Option<Temporal> {
     let velocity = |row: usize| [0, 1, 2].map(|c| f64::from(params.own.plane(VELOCITY + c)[row]));
-    let range = Range3::of_rows((0..params.len()).map(velocity));
+    let range = Range3::from_rows((0..params.len()).map(velocity));
     if range.mins == [0.0; 3] && range.maxs == [0.0; 3] {
         return None;
     }
