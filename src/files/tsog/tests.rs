@@ -242,7 +242,9 @@ fn deflated_archives_and_files_without_a_profile_are_read() {
     let before = read_tsog(&path(&folder), ReadLimit::NONE).unwrap();
     rewrite(&path(&folder), CompressionMethod::Deflated, |meta| {
         let members = meta.as_object_mut().unwrap();
-        ["profile", "fps", "playback"].map(|name| members.remove(name));
+        for name in ["profile", "fps", "playback"] {
+            members.remove(name);
+        }
         members.insert("unknown".to_owned(), json!({ "ignored": true }));
     });
     let found = read_tsog(&path(&folder), ReadLimit::NONE).unwrap();
