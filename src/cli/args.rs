@@ -125,8 +125,8 @@ pub(super) struct OutputFormat {
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz,
-    /// .sog or .glb
+    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz, .sog,
+    /// .glb, .tsog, .ftgs.ply or .gsd
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     #[command(flatten)]
@@ -241,6 +241,12 @@ pub(super) enum OutputKindArg {
     Glb,
     /// Folder with one .sog per frame, for the flip book of PlayCanvas
     SogSequence,
+    /// Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)
+    Tsog,
+    /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
+    Ftgs,
+    /// Every frame whole, for SplatRenderer of Unreal (.gsd)
+    Gsd,
 }
 
 /// Arguments of `score`.
@@ -453,8 +459,9 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog or .glb; a folder (the model in an archive, a PLY per frame of a
-    /// sequence, or a model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd; a folder (the model in an archive, a PLY
+    /// per frame of a sequence, or a model of the input's own format); - for a frame stream on standard output
+    /// (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// The output, as other commands name it

@@ -355,6 +355,9 @@ fn output_kind(kind: OutputKindArg) -> OutputKind {
         OutputKindArg::Sog => OutputKind::Sog,
         OutputKindArg::Glb => OutputKind::Glb,
         OutputKindArg::SogSequence => OutputKind::SogSequence,
+        OutputKindArg::Tsog => OutputKind::Tsog,
+        OutputKindArg::Ftgs => OutputKind::Ftgs,
+        OutputKindArg::Gsd => OutputKind::Gsd,
     }
 }
 

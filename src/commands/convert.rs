@@ -16,6 +16,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::outputs::kind::{OutputKind, check_folder_name};
+use crate::outputs::windows::{MAX_SINGLE_FRAMES, is_windowed};
 use crate::passes::TRACK_BLOCK;
 use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
@@ -24,6 +25,9 @@ use crate::scene::{InputOptions, open_input};
 
 /// Approximate bytes per Gaussian while curves are fitted to its track and encoded: a few curve segments.
 const FITTED_BYTES: u64 = 4 * 600;
+
+/// Bytes per Gaussian of a frame in the images of a `.tsog` of single frames.
+const FRAME_IMAGE_BYTES: u64 = 8 * 4 + 64;
 
 /// Returns whether `convert` writes a container to `output`.
 pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
@@ -99,10 +103,12 @@ pub fn convert(
 /// Returns the resource estimate of writing all frames once as `kind`, with curve fitting where the format needs it.
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let state_bytes = work.state(Attributes::all());
-    let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs);
+    let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs) || is_windowed(kind);
     let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * state_bytes;
     let mut fixed = work.writing();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));
+    let single = (work.gaussians * work.frames).min(MAX_SINGLE_FRAMES as u64) * (state_bytes + FRAME_IMAGE_BYTES);
+    fixed.push(("single frames", if kind == OutputKind::Tsog { single } else { 0 }));
     let per_gaussian = vec![
         ("kept", 16),
         ("result", work.input.reduced + work.input.file + state_bytes),

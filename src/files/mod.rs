@@ -11,6 +11,7 @@ pub(crate) mod csv;
 pub mod defects;
 pub(crate) mod digest;
 pub mod frame_stream;
+pub mod ftgs;
 pub mod glb;
 pub mod image;
 #[doc(hidden)]
@@ -34,6 +35,7 @@ pub mod splatv;
 pub mod spz;
 pub(crate) mod state_dict;
 pub mod text;
+pub mod tsog;
 pub mod webp;
 mod zip_directory;
 pub(crate) mod zip_output;

@@ -29,10 +29,10 @@ pub const META: &str = "meta.json";
 /// Content of `meta.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Meta {
-    version: u64,
+    pub(crate) version: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     asset: Option<Asset>,
-    count: u64,
+    pub(crate) count: u64,
     means: MeansEntry,
     scales: CodebookEntry,
     quats: ImageEntry,

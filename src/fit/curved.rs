@@ -1,9 +1,9 @@
-//! Fit of curves with cubic motion and linear rotation, each visible in a soft window of time: the form that players of
-//! SpacetimeGaussians support.
+//! Fit of curves that are each visible in a soft window of time: with cubic motion and linear rotation, the form that
+//! players of SpacetimeGaussians support, or with linear motion and constant rotation ([`CurveForm`]).
 //!
 //! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
 //! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … overlapping
-//! curves. Their centers are evenly spaced over the visible time, and each width is three quarters of the spacing. The
+//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the visible time, and each width is three quarters of the spacing. The
 //! sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the
 //! opacity, add up where Gaussians overlap. So the depth of the Gaussian is distributed among the curves, by
 //! multiplicative updates that keep all depths positive (Richardson 1972, Lucy 1974).
@@ -43,8 +43,41 @@ impl CubicTrack {
     }
 }
 
-/// Maximum number of intervals between the centers of overlapping curves, one less than the number of curves.
-const MAX_INTERVALS: usize = 32;
+/// Form of the curves that are fitted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CurveForm {
+    /// Whether positions are linear and rotations constant in time, instead of cubic and linear.
+    is_linear: bool,
+    /// Minimum width of the time window, in units of time.
+    min_width: f64,
+    /// Maximum number of intervals between overlapping curves.
+    max_intervals: usize,
+}
+
+impl CurveForm {
+    /// Cubic motion, linear rotation, and time windows of any width.
+    pub const CUBIC: CurveForm = CurveForm { is_linear: false, min_width: 0.0, max_intervals: 32 };
+
+    /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
+    /// The higher coefficients of such a [`CubicTrack`] are 0.
+    pub fn linear(min_width: f64) -> CurveForm {
+        CurveForm { is_linear: true, min_width, max_intervals: 32 }
+    }
+
+    /// Returns this form with at most `max_intervals` intervals between overlapping curves, one less than the number of
+    /// curves.
+    pub fn with_intervals(self, max_intervals: usize) -> CurveForm {
+        CurveForm { max_intervals, ..self }
+    }
+
+    /// Returns the numbers of intervals between overlapping curves that are tried, in this order.
+    fn intervals(self) -> &'static [usize] {
+        if self.is_linear { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
+    }
+}
+
+/// Ratio of the width of overlapping windows to the distance of their centers.
+const WIDTH_PER_INTERVAL: f64 = 0.75;
 /// Maximum number of iterations that distribute the optical depth among overlapping curves.
 const MAX_UPDATES: usize = 60;
 /// Largest change of an optical depth in one iteration below which the iterations end.
@@ -57,9 +90,9 @@ const RIDGE: f64 = 1e-6;
 /// opacity is this times the smallest visible opacity.
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns the curves that represent `track`: as few as meet `tolerance` at every visible frame, or, if none do, the
-/// closest ones that were tried. Adds their errors to `misfit`.
-pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
+/// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,
+/// if none do, the closest ones that were tried. Adds their errors to `misfit`.
+pub fn curved(track: &FittedTrack, form: CurveForm, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
     let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
     let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
     let mut best: Option<(f64, Vec<CubicTrack>, Misfit)> = None;
@@ -70,11 +103,18 @@ pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -
         }
         excess <= 1.0
     };
-    let mut done = attempt(vec![constant_curve(track)]) || attempt(vec![single_window_curve(track)]);
-    let mut count = 2;
-    while !done && count <= MAX_INTERVALS.min((last - first + 1).max(2)) {
-        done = attempt(overlapping_curves(track, [track.times[first], track.times[last]], count));
-        count *= 2;
+    let mut done = attempt(vec![constant_curve(track, form)]);
+    let fading = if form.is_linear { fading_curve(track, form) } else { None };
+    done = done || fading.is_some_and(|curve| attempt(vec![curve]));
+    done = done || attempt(vec![single_window_curve(track, form)]);
+    let visible = [track.times[first], track.times[last]];
+    let is_wide = |count: usize| WIDTH_PER_INTERVAL * (visible[1] - visible[0]) / count as f64 >= form.min_width;
+    for &count in form
+        .intervals()
+        .iter()
+        .take_while(|&&count| count <= form.max_intervals.min((last - first + 1).max(2)) && is_wide(count))
+    {
+        done = done || attempt(overlapping_curves(track, form, visible, count));
     }
     let (_, curves, found) = best.unwrap_or_default();
     *misfit = misfit.and(found);
@@ -90,16 +130,42 @@ fn depth(opacity: f64) -> f64 {
 }
 
 /// Returns one curve of constant opacity, whose window is infinitely wide.
-fn constant_curve(track: &FittedTrack) -> CubicTrack {
+fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
-    let curve = fit_motion(track, center, f64::INFINITY, |_| 1.0);
+    let curve = fit_motion(track, form, center, f64::INFINITY, |_| 1.0);
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
+/// Returns one curve whose logarithm of opacity is the parabola that fits the visible frames best, weighted by squared
+/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does not
+/// open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is long.
+fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
+    let (first, last) = (track.times[0], track.times[track.len() - 1]);
+    let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
+    let seen: Vec<usize> = (0..track.len()).filter(|&frame| track.is_seen(frame)).collect();
+    if seen.len() < 3 {
+        return None;
+    }
+    let samples = seen.iter().map(|&frame| {
+        let opacity = track.opacity[frame];
+        ((track.times[frame] - middle) / half, [opacity.ln()], opacity * opacity)
+    });
+    let [[a], [b], [c]] = polynomial(samples, 0.0);
+    let (vertex, peak) = (-b / (2.0 * c), (a - b * b / (4.0 * c)).exp());
+    let (center, width) = (middle + half * vertex, half * (-1.0 / c).sqrt());
+    let is_usable = c < 0.0 && vertex.abs() <= 3.0 && peak <= MAX_OPACITY && width.is_finite();
+    if !is_usable {
+        return None;
+    }
+    let width = width.max(form.min_width);
+    let curve = fit_motion(track, form, center, width, |frame| window(track.times[frame], center, width));
+    Some(CubicTrack { opacity: peak, ..curve })
+}
+
 /// Returns one curve whose time window has the mean and the variance of the opacity over time.
-fn single_window_curve(track: &FittedTrack) -> CubicTrack {
+fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
     };
@@ -108,21 +174,21 @@ fn single_window_curve(track: &FittedTrack) -> CubicTrack {
     let variance = moment(&|t| (t - center).powi(2)) / whole;
     let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
     // exp(−(dt/w)²) has the variance w²/2. Frames one step apart cannot resolve a width below half a step.
-    let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9);
+    let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9).max(form.min_width);
     let windows = |frame: usize| window(track.times[frame], center, width);
     let (mut right, mut normal) = (0.0, 0.0);
     for frame in 0..track.len() {
         right += windows(frame) * track.opacity[frame];
         normal += windows(frame).powi(2);
     }
-    let curve = fit_motion(track, center, width, |frame| window(track.times[frame], center, width));
+    let curve = fit_motion(track, form, center, width, |frame| window(track.times[frame], center, width));
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
 /// Returns `count` + 1 overlapping curves for the visible time from `start` to `end`.
-fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
+fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
-    let width = 0.75 * apart;
+    let width = WIDTH_PER_INTERVAL * apart;
     let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
     let target_depths: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
     // For each curve, the frames that affect it, each with the value of the curve's window.
@@ -157,7 +223,7 @@ fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize)
         }
     }
     let curve = |(k, depth): (usize, f64)| {
-        let curve = fit_motion(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
+        let curve = fit_motion(track, form, centers[k], width, |frame| window(track.times[frame], centers[k], width));
         CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
     };
     depths.into_iter().enumerate().map(curve).collect()
@@ -165,7 +231,13 @@ fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize)
 
 /// Returns a curve that follows the position and rotation of `track` by least squares; `weight` is multiplied by the
 /// opacity of a frame. The returned opacity is 0.
-fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
+fn fit_motion(
+    track: &FittedTrack,
+    form: CurveForm,
+    center: f64,
+    width: f64,
+    weight: impl Fn(usize) -> f64,
+) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let samples: Vec<(usize, f64)> = (0..track.len())
         .map(|frame| (frame, weight(frame)))
@@ -173,10 +245,15 @@ fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usiz
         .collect();
     let reach = samples.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
     let scaled = |frame: usize| (track.times[frame] - center) / reach;
-    let position: [[f64; 3]; 4] =
-        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
-    let rotation: [[f64; 4]; 2] =
-        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
+    let positions = samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight));
+    let rotations = samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight));
+    let (position, rotation): ([[f64; 3]; 4], [[f64; 4]; 2]) = if form.is_linear {
+        let [at, velocity] = polynomial(positions, RIDGE);
+        let [mean] = polynomial(rotations, RIDGE);
+        ([at, velocity, [0.0; 3], [0.0; 3]], [mean, [0.0; 4]])
+    } else {
+        (polynomial(positions, RIDGE), polynomial(rotations, RIDGE))
+    };
     let whole: f64 = samples.iter().map(|&(_, weight)| weight).sum();
     let mean = |value: &dyn Fn(usize) -> f64| {
         samples.iter().map(|&(frame, weight)| weight * value(frame)).sum::<f64>() / whole.max(1e-300)
@@ -201,6 +278,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
     for frame in 0..track.len() {
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
+        let weight = tolerance.weight(track.opacity[frame]);
         for curve in curves {
             let share = depth(curve.opacity_at(time));
             shown += share;
@@ -221,13 +299,13 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             ]
             .into_iter()
             // A curve that is hardly visible in this frame need not be as close.
-            .map(|excess| excess * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
+            .map(|excess| excess * weight * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
             .fold(worst, f64::max);
         }
         let apart = 1.0 - (-shown).exp() - track.opacity[frame];
         if track.is_seen(frame) || apart > MIN_VISIBLE_OPACITY {
             worst = worst.max(apart.abs() / tolerance.opacity);
-            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart);
+            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
         }
     }
     (if worst.is_nan() { f64::INFINITY } else { worst }, misfit)
@@ -253,11 +331,11 @@ mod tests {
     fn cubic_and_fading_tracks_are_recovered_exactly() {
         let cubic = |t: f64| [t - 2.0 * t * t + t.powi(3), 0.3, -t];
         let mut misfit = Misfit::default();
-        let one = curved(&track(60, cubic, |_| 0.8), &Tolerance::default(), &mut misfit);
+        let one = curved(&track(60, cubic, |_| 0.8), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(one.len() == 1 && one[0].width.is_infinite() && (one[0].opacity - 0.8).abs() < 1e-9);
         assert!(misfit.position < 1e-3 && misfit.states == 60, "{misfit:?}");
         let fading = track(60, cubic, |t| 0.9 * window(t, 0.4, 0.15));
-        let one = curved(&fading, &Tolerance::default(), &mut misfit);
+        let one = curved(&fading, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
         assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.opacity < 0.01);
@@ -267,22 +345,48 @@ mod tests {
     fn complex_tracks_are_shared_by_curves_whose_opacity_adds_up() {
         let wave = |t: f64| [(18.0 * t).sin(), 0.0, 0.0];
         let mut misfit = Misfit::default();
-        let many = curved(&track(120, wave, |_| 0.6), &Tolerance::default(), &mut misfit);
-        assert!((4..=MAX_INTERVALS + 1).contains(&many.len()), "{} curves", many.len());
+        let many = curved(&track(120, wave, |_| 0.6), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
+        assert!((4..=33).contains(&many.len()), "{} curves", many.len());
         assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
         let mut misfit = Misfit::default();
-        let step =
-            curved(&track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 }), &Tolerance::default(), &mut misfit);
+        let half_seen = track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 });
+        let step = curved(&half_seen, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(step.len() > 2 && misfit.opacity < 0.4, "{} curves, {misfit:?}", step.len());
     }
 
     #[test]
     fn invisible_track_has_no_curve_and_single_frame_has_one() {
+        for form in [CurveForm::CUBIC, CurveForm::linear(0.02)] {
+            let fit = |track: FittedTrack| curved(&track, form, &Tolerance::default(), &mut Misfit::default());
+            assert!(fit(track(20, |_| [0.0; 3], |_| 1e-3)).is_empty());
+            let still = fit(track(1, |_| [1.0; 3], |_| 0.5));
+            assert!(still.len() == 1 && still[0].position_at(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
+            assert!(!fit(track(30, |_| [0.0; 3], |t| if (t - 0.5).abs() < 1e-9 { 0.5 } else { 0.0 })).is_empty());
+        }
+    }
+
+    #[test]
+    fn a_window_cut_by_the_end_of_the_sequence_is_one_line() {
         let mut misfit = Misfit::default();
-        assert!(curved(&track(20, |_| [0.0; 3], |_| 1e-3), &Tolerance::default(), &mut misfit).is_empty());
-        let still = curved(&track(1, |_| [1.0; 3], |_| 0.5), &Tolerance::default(), &mut misfit);
-        assert!(still.len() == 1 && still[0].position_at(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
-        let flash = track(30, |_| [0.0; 3], |t| if (t - 0.5).abs() < 1e-9 { 0.5 } else { 0.0 });
-        assert!(!curved(&flash, &Tolerance::default(), &mut misfit).is_empty());
+        let cut = track(40, |t| [2.0 * t, 1.0 - t, 0.0], |t| 0.8 * window(t, -0.1, 0.6));
+        let cut = FittedTrack { rotation: vec![[1.0, 0.0, 0.0, 0.0]; 40], ..cut };
+        let one = curved(&cut, CurveForm::linear(0.0), &Tolerance::default(), &mut misfit);
+        assert_eq!(one.len(), 1);
+        assert!((one[0].center + 0.1).abs() < 1e-6 && (one[0].width - 0.6).abs() < 1e-6, "{:?}", one[0]);
+        assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-2, "{:?}", one[0]);
+        assert!(misfit.opacity < 1e-6 && misfit.position < 0.05, "{misfit:?}");
+    }
+
+    #[test]
+    fn lines_have_no_higher_terms_and_no_narrow_window() {
+        let mut misfit = Misfit::default();
+        let turning = track(60, |t| [(3.0 * t).sin(), (3.0 * t).cos(), 0.0], |t| 0.6 + 0.2 * (9.0 * t).sin());
+        let lines = curved(&turning, CurveForm::linear(0.1), &Tolerance::default(), &mut misfit);
+        assert!((2..=9).contains(&lines.len()), "{} lines", lines.len());
+        for line in &lines {
+            assert_eq!((&line.position[2..], line.rotation[1]), (&[[0.0; 3]; 2][..], [0.0; 4]));
+            assert!(line.width >= 0.1, "{}", line.width);
+        }
+        assert!(misfit.rms() < 1.0 && misfit.opacity < 0.1, "{misfit:?}");
     }
 }

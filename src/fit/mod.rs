@@ -1,15 +1,15 @@
 //! Fits of simple motions to the track of one Gaussian (its states at all frames), in the forms that compact formats
 //! store.
 //!
-//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic motions in soft windows
-//! of time. Both report their error.
+//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic or linear motions in soft
+//! windows of time. Both report their error.
 
 mod curved;
 mod least_squares;
 mod straight;
 mod track;
 
-pub use curved::{CubicTrack, curved};
+pub use curved::{CubicTrack, CurveForm, curved};
 pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, straight};
 pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
@@ -28,14 +28,30 @@ pub struct Tolerance {
     pub opacity: f64,
     /// Maximum difference of SH coefficients.
     pub sh: f64,
+    /// Opacity below which a Gaussian may be further off, in inverse proportion to its opacity; 0 for no such Gaussians.
+    pub full_opacity: f64,
+}
+
+impl Tolerance {
+    /// Tolerances of a compact fit by [`curved`]: a Gaussian may be off by half of its middle scale.
+    pub const COMPACT: Tolerance =
+        Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
+
+    /// Returns the weight, at most 1, of errors of a Gaussian of opacity `opacity`.
+    fn weight(&self, opacity: f64) -> f64 {
+        if opacity < self.full_opacity { opacity / self.full_opacity } else { 1.0 }
+    }
 }
 
 impl Default for Tolerance {
     /// Returns tolerances of about one step of an 8-bit quantization.
     fn default() -> Tolerance {
-        Tolerance { position: 0.1, rotation: 0.05, log_scale: 0.05, opacity: 0.02, sh: 0.05 }
+        Tolerance { position: 0.1, rotation: 0.05, log_scale: 0.05, opacity: 0.02, sh: 0.05, full_opacity: 0.0 }
     }
 }
+
+/// Errors beyond which a fitted Gaussian is far off: of its position, in units of its middle scale, and of its opacity.
+const FAR: [f64; 2] = [1.0, 0.1];
 
 /// Error of fits, over all Gaussians and the frames in which they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -44,6 +60,12 @@ pub struct Misfit {
     pub states: u64,
     /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
     squares: f64,
+    /// Sum of squared differences between the opacities of fit and Gaussian.
+    opacity_squares: f64,
+    /// Sum of the opacities of the Gaussians.
+    visible: f64,
+    /// Sum of the opacities of the Gaussians that are off by more than [`FAR`].
+    far: f64,
     /// Largest distance between positions, in units of the Gaussian's middle scale.
     pub position: f64,
     /// Largest difference between the opacities of fit and Gaussian.
@@ -51,10 +73,14 @@ pub struct Misfit {
 }
 
 impl Misfit {
-    /// Adds the errors of one Gaussian at one frame: of its position, in units of its middle scale, and of its opacity.
-    fn add(&mut self, position: f64, opacity: f64) {
+    /// Adds the errors of one Gaussian of opacity `visible` at one frame: of its position, in units of its middle scale,
+    /// and of its opacity.
+    pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
+        self.visible += visible;
+        self.far += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
         self.states += 1;
         self.squares += position * position;
+        self.opacity_squares += opacity * opacity;
         self.position = self.position.max(position);
         self.opacity = self.opacity.max(opacity.abs());
     }
@@ -64,6 +90,9 @@ impl Misfit {
         Misfit {
             states: self.states + other.states,
             squares: self.squares + other.squares,
+            opacity_squares: self.opacity_squares + other.opacity_squares,
+            visible: self.visible + other.visible,
+            far: self.far + other.far,
             position: self.position.max(other.position),
             opacity: self.opacity.max(other.opacity),
         }
@@ -72,5 +101,16 @@ impl Misfit {
     /// Returns the root mean square distance between positions, in units of the Gaussian's middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
+    }
+
+    /// Returns the fraction of the visible states, weighted by their opacity, that are off by more than the middle scale
+    /// or by more than 0.1 of opacity. Unlike the other errors, this one hardly counts Gaussians that are hardly seen.
+    pub fn far_share(&self) -> f64 {
+        self.far / self.visible.max(f64::MIN_POSITIVE)
+    }
+
+    /// Returns the root mean square difference between the opacities of fit and Gaussian.
+    pub fn opacity_rms(&self) -> f64 {
+        (self.opacity_squares / self.states.max(1) as f64).sqrt()
     }
 }

@@ -38,6 +38,7 @@ pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit)
             misfit.add(
                 track.distance(frame, position_at(piece, track.times[frame])),
                 track.opacity[frame] - piece.opacity,
+                track.opacity[frame],
             );
         }
     }

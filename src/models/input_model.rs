@@ -406,7 +406,7 @@ pub struct Conventions {
     pub time_duration: Option<f64>,
     /// Whether 4D rotations use the convention from before 15 September 2024, without the reversal of axes.
     pub rot4d_unflipped: bool,
-    /// How Gaussians of a `.splatv` with a zero quaternion are treated; `None` means [`ZeroRotation::Drop`].
+    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means [`ZeroRotation::Drop`].
     pub zero_rotation: Option<ZeroRotation>,
 }
 

@@ -27,6 +27,7 @@ mod still_files;
 pub mod stream;
 pub mod trajectories;
 mod unrecognized;
+mod windowed;
 
 use std::fs;
 use std::path::Path;
@@ -42,7 +43,9 @@ use crate::error::{Error, Result, ShowPath};
 use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Model formats that are read from files. The first entry that recognizes a path opens it.
-const MODEL_FORMATS: [ModelFormat; 15] = [
+const MODEL_FORMATS: [ModelFormat; 17] = [
+    windowed::FTGS,
+    windowed::TSOG,
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
     still_files::ENTRY,

@@ -20,7 +20,9 @@ use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
+use crate::outputs::gsd::write_gsd;
 use crate::outputs::kind::OutputKind;
+use crate::outputs::windows::write_fitted_windows;
 use crate::passes::{HeldFrames, States, WithDelta, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
@@ -164,6 +166,8 @@ pub fn write_sequence(
     let info = source.info();
     match kind {
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
+        OutputKind::Ftgs | OutputKind::Tsog => return write_fitted_windows(source, kind, path, events),
+        OutputKind::Gsd => return Ok(vec![write_gsd(source, path, held, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz | OutputKind::Spz4 => {
             let version = if kind == OutputKind::Spz { SpzVersion::V3 } else { SpzVersion::V4 };

@@ -83,7 +83,9 @@ pub(super) fn unrecognized_file(path: &Path) -> Error {
 fn layouts() -> String {
     let folders = LAYOUTS.iter().map(|layout| format!("{}: a folder with {}", layout.name, layout.files.join(", ")));
     let files =
-        "files: .gseq, .gsz, .splatv, .ply, .sog, .spz, .splat, .glb, params.npz, a checkpoint (.pth, .pt)".to_owned();
+        "files: .gseq, .gsz, .splatv, .tsog, .ftgs.ply, .ply, .sog, .spz, .splat, .glb, params.npz, a checkpoint \
+                 (.pth, .pt)"
+            .to_owned();
     let lines: Vec<String> = folders.chain([files]).collect();
     format!("inputs that can be read:\n    {}", lines.join("\n    "))
 }

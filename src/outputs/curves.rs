@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::files::accuracy::Accuracy;
 use crate::files::splatv::SplatvGaussian;
 use crate::files::splatv::write::{default_cameras, measure, words, write};
-use crate::fit::{CubicTrack, Misfit, Tolerance, curved};
+use crate::fit::{CubicTrack, CurveForm, Misfit, Tolerance, curved};
 use crate::model::{Attributes, color};
 use crate::passes::{gather_all, tracks};
 use crate::progress::Events;
@@ -27,7 +27,7 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     let tolerance = Tolerance::default();
     let found = tracks(source, &times, &progress, |track| {
         let mut misfit = Misfit::default();
-        (curved(track, &tolerance, &mut misfit), misfit)
+        (curved(track, CurveForm::CUBIC, &tolerance, &mut misfit), misfit)
     })?;
     let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
     let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(splatv_gaussian).collect();

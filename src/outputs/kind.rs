@@ -36,6 +36,12 @@ pub enum OutputKind {
     Glb,
     /// A folder with one `.sog` file per frame.
     SogSequence,
+    /// A `.gsd` file: every frame whole, for Unreal.
+    Gsd,
+    /// A `.ftgs.ply` file: linear motion in Gaussian windows of time.
+    Ftgs,
+    /// A `.tsog` file: linear motion in Gaussian windows of time, or single frames, as images for web players.
+    Tsog,
 }
 
 impl OutputKind {
@@ -62,15 +68,22 @@ impl OutputKind {
              NAME.spz       one frame, for most web viewers\n  \
              NAME.sog       one frame as images, for web viewers\n  \
              NAME.glb       one frame, for viewers of glTF\n  \
+             NAME.tsog      linear motion in windows of time, the smallest for web viewers\n  \
+             NAME.ftgs.ply  linear motion in windows of time, for ftgs-player\n  \
+             NAME.gsd       every frame whole, for Unreal\n  \
              a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
              or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz|sog|glb|\
-             sog-sequence",
+             sog-sequence|tsog|ftgs|gsd",
             path.shown(),
             path.shown()
         )))
     }
 
     fn from_name(path: &Path) -> Option<OutputKind> {
+        // This ending has two parts, of which the second one alone means an ordinary PLY.
+        if path.file_name()?.to_str()?.to_ascii_lowercase().ends_with(".ftgs.ply") {
+            return Some(OutputKind::Ftgs);
+        }
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gseq" => Some(OutputKind::Gseq),
             "ply" => Some(OutputKind::Ply),
@@ -80,6 +93,8 @@ impl OutputKind {
             "spz" => Some(OutputKind::Spz),
             "sog" => Some(OutputKind::Sog),
             "glb" => Some(OutputKind::Glb),
+            "tsog" => Some(OutputKind::Tsog),
+            "gsd" => Some(OutputKind::Gsd),
             _ => None,
         }
     }
@@ -168,6 +183,13 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_double_ending_of_ftgs_is_no_plain_ply() {
+        let kind = |name: &str| OutputKind::from_path(Path::new(name), None, OutputKind::Model);
+        assert_eq!(["a/x.ftgs.ply", "x.Ftgs.PLY"].map(kind), [OutputKind::Ftgs; 2]);
+        assert_eq!(["x.ply", "ftgs.ply", "x.ftgs/x.ply"].map(kind), [OutputKind::Ply; 3]);
+    }
+
+    #[test]
     fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
         for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.fbx"] {
@@ -176,7 +198,19 @@ mod tests {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");
             }
         }
-        for name in ["x", "x.gsz", "X.GSEQ", "x.ply", "small.v2", "run.2024", "out_0.3", ".hidden"] {
+        for name in [
+            "x",
+            "x.gsz",
+            "X.GSEQ",
+            "x.ply",
+            "x.FTGS.ply",
+            "x.tsog",
+            "x.gsd",
+            "small.v2",
+            "run.2024",
+            "out_0.3",
+            ".hidden",
+        ] {
             assert_eq!(refused(name), None, "{name}");
         }
         assert!(check_folder_name(Path::new("page.html"), "report").unwrap_err().to_string().contains("folder"));

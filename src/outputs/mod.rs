@@ -10,6 +10,8 @@ pub mod curves;
 pub mod film;
 pub mod four_dgs;
 pub mod frame_stream;
+pub mod gsd;
 pub mod index_map;
 pub mod kind;
 pub mod rows;
+pub mod windows;

@@ -369,7 +369,17 @@ fn still_takes_any_cameras_or_a_virtual_rig() {
 #[test]
 fn convert_writes_every_kind_and_refuses_misfits() {
     let workplace = Workplace::new();
-    for output in ["a.splatv", "a.4dgs", "a.gseq", "frames --as ply-sequence", "model", "cloud.ply"] {
+    for output in [
+        "a.splatv",
+        "a.4dgs",
+        "a.ftgs.ply",
+        "a.tsog",
+        "a.gsd",
+        "a.gseq",
+        "frames --as ply-sequence",
+        "model",
+        "cloud.ply",
+    ] {
         let said = workplace.done(&format!("convert {{tiny}} {output} --cameras {{tiny}}"));
         assert!(said.contains("300 Gaussians x 10 frames"), "{said}");
     }
@@ -380,6 +390,11 @@ fn convert_writes_every_kind_and_refuses_misfits() {
     assert!(evaluate("evaluate {tiny} a.gseq --cameras {tiny} --json") > 90.0);
     let fitted = evaluate("evaluate {tiny} a.splatv --cameras {tiny} --json");
     assert!(fitted > 25.0, "{fitted} dB");
+    for name in ["a.ftgs.ply", "a.tsog"] {
+        let fitted = evaluate(&format!("evaluate {{tiny}} {name} --cameras {{tiny}} --json"));
+        assert!(fitted > 25.0, "{name}: {fitted} dB");
+    }
+    assert_eq!(&fs::read(workplace.path("a.gsd")).unwrap()[..4], b"GSD1");
     assert_eq!(&fs::read(workplace.path("a.4dgs")).unwrap()[1..5], b"4DGS");
     workplace.refused(2, "convert {tiny} a.spz --cameras {tiny}", &["a.spz", "10 frames", ".splatv"]);
     workplace.refused(2, "convert {tiny} a.gsz", &["splatsieve compress INPUT -o NAME.gsz"]);
@@ -394,6 +409,20 @@ fn convert_writes_every_kind_and_refuses_misfits() {
         fs::metadata(workplace.path("small.4dgs")).unwrap().len()
             < fs::metadata(workplace.path("a.4dgs")).unwrap().len()
     );
+}
+
+#[test]
+fn files_of_players_are_compressed_to_their_own_format() {
+    let workplace = Workplace::new();
+    for (whole, small, kind) in [("a.ftgs.ply", "b.ftgs.ply", "ftgs-player model"), ("a.tsog", "b.tsog", "TSOG model")]
+    {
+        workplace.done(&format!("convert {{tiny}} {whole} --cameras {{tiny}}"));
+        workplace.done(&format!("compress {whole} --cameras {{tiny}} -o {small} --ratio 0.5 --no-refine --quiet"));
+        let size = |name: &str| fs::metadata(workplace.path(name)).unwrap().len();
+        assert!(size(small) < size(whole), "{small}: {} of {}", size(small), size(whole));
+        let info = workplace.done(&format!("info {small} --cameras {{tiny}}"));
+        assert!(info.contains(kind), "{info}");
+    }
 }
 
 #[test]

@@ -92,7 +92,7 @@ const CONTAINER_BYTES: usize = 640 << 20;
 const ARCHIVE_BYTES: usize = 256 << 20;
 
 /// List of all readers of user-supplied bytes.
-pub(crate) const ENTRIES: [Entry; 23] = [
+pub(crate) const ENTRIES: [Entry; 25] = [
     Entry {
         name: "archive",
         corpus: "archive",
@@ -125,6 +125,7 @@ pub(crate) const ENTRIES: [Entry; 23] = [
         most_bytes: CONTAINER_BYTES,
     },
     Entry { name: "deform", corpus: "deform", read: deform, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
+    Entry { name: "ftgs", corpus: "ftgs", read: ftgs, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
     Entry { name: "params", corpus: "params", read: params, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
     Entry { name: "pickle", corpus: "pickle", read: pickle, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
     Entry {
@@ -193,6 +194,7 @@ pub(crate) const ENTRIES: [Entry; 23] = [
         most_bytes: SMALL_BYTES,
     },
     Entry { name: "splatv", corpus: "splatv", read: splatv, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
+    Entry { name: "tsog", corpus: "tsog", read: tsog, repair_checksums: repair_zip, most_bytes: SMALL_BYTES },
     Entry { name: "stream", corpus: "stream", read: stream, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
 ];
 
@@ -344,6 +346,14 @@ fn params(bytes: &[u8], folder: &InputFolder) -> Outcome {
 
 fn splatv(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.splatv", bytes))
+}
+
+fn ftgs(bytes: &[u8], folder: &InputFolder) -> Outcome {
+    model(&folder.write_file("a.ftgs.ply", bytes))
+}
+
+fn tsog(bytes: &[u8], folder: &InputFolder) -> Outcome {
+    model(&folder.write_file("a.tsog", bytes))
 }
 
 /// Reads a file of one frame within 8 MiB of memory: a small file may declare any number of Gaussians.

@@ -1076,6 +1076,145 @@ def make_spacetime():
     write("ply", "spacetime_largest", header(names=of_lite) + floats([3.4e38] * len(of_lite) * COUNT))
 
 
+def make_ftgs():
+    names = [*NAMES, "time", "log_duration", *(f"velocity_{k}" for k in range(3))]
+    comments = ["ftgs_version 1", "time_units normalized", "sh_degree 1", "use_velocity 1", "min_duration 0.02"]
+    comments = [*comments, "opacity_floor 0.0001", "n_frames 30", "splatsieve_times 0.5 2.5"]
+    text = header(names=names).replace(b"element", "".join(f"comment {line}\n" for line in comments).encode() + b"element")
+    rows = [[*row(), DICE.random(), *normal(4, 0.5, -1)] for _ in range(COUNT)]
+    whole = text + b"".join(map(floats, rows))
+    damaged("ftgs", whole, [0, 60, len(text) - 2, len(text) + 3, len(whole) - 1])
+    for name, before, after in (
+        ("version", b"ftgs_version 1", b"ftgs_version 2"),
+        ("no_version", b"comment ftgs_version 1\n", b""),
+        ("seconds", b"normalized", b"seconds"),
+        ("degree", b"sh_degree 1", b"sh_degree 9"),
+        ("not_used", b"use_velocity 1", b"use_velocity 0"),
+        ("no_duration", b"min_duration 0.02", b"min_duration 0"),
+        ("infinite_duration", b"min_duration 0.02", b"min_duration inf"),
+        ("floor", b"0.0001", b"1e400"),
+        ("many_frames", b"n_frames 30", b"n_frames 99999999999999999999"),
+        ("times_back", b"0.5 2.5", b"2.5 0.5"),
+        ("times_equal", b"0.5 2.5", b"1e300 1e300"),
+        ("one_time", b"0.5 2.5", b"0.5"),
+        ("no_velocity", b"velocity_1", b"velocity_x"),
+        ("none", b"vertex 6", b"vertex 0"),
+    ):
+        write("ftgs", name, whole.replace(before, after, 1))
+    for name, value in (("nan", math.nan), ("infinite", math.inf), ("largest", 3.4e38), ("zeros_only", 0.0)):
+        write("ftgs", name, text + floats([value] * len(names) * COUNT))
+
+
+def webp(pixels, width):
+    """Returns a lossless WebP of pixels (red, green, blue, alpha), with codes of eight bits for every byte."""
+    bits = []
+
+    def put(value, count):
+        bits.extend(value >> k & 1 for k in range(count))
+
+    height = len(pixels) // width
+    put(0x2F, 8), put(width - 1, 14), put(height - 1, 14), put(1, 1), put(0, 3)
+    # Neither a transform, nor a color cache, nor several groups of codes.
+    put(0, 3)
+    for symbols in (280, 256, 256, 256):
+        # The lengths of codes are 0 or 8; in the order of the format these are the third and the twelfth length.
+        put(0, 1), put(12 - 4, 4)
+        for k in range(12):
+            put(1 if k in (2, 11) else 0, 3)
+        put(0, 1)
+        for symbol in range(symbols):
+            put(1 if symbol < 256 else 0, 1)
+    # A code of distances with one symbol, 0.
+    put(1, 1), put(0, 1), put(0, 1), put(0, 1)
+    for red, green, blue, alpha in pixels:
+        for value in (green, red, blue, alpha):
+            bits.extend(value >> k & 1 for k in range(7, -1, -1))
+    bits += [0] * (-len(bits) % 16)
+    data = bytes(sum(bit << k for k, bit in enumerate(bits[at : at + 8])) for at in range(0, len(bits), 8))
+    chunk = b"WEBPVP8L" + struct.pack("<I", len(data)) + data
+    return b"RIFF" + struct.pack("<I", len(chunk)) + chunk
+
+
+def make_tsog():
+    def image(alpha=255):
+        tag = DICE.randrange(252, 256) if alpha == "tag" else alpha
+        return webp([tuple([*(DICE.randrange(256) for _ in range(3)), tag]) for _ in range(16)], 4)
+
+    def labels():
+        return webp([(DICE.randrange(3), 0, 0, 255) for _ in range(16)], 4)
+
+    book = sorted(round(value, 4) for value in normal(256))
+    files = {"means_l.webp": image(), "means_u.webp": image(), "scales.webp": image(), "quats.webp": image("tag")}
+    files |= {"sh0.webp": image(200), "timeline_l.webp": image(), "timeline_u.webp": image(), "motion.webp": image()}
+    of_sh = {"centroids.webp": webp([(1, 2, 3, 255)] * 192, 192), "labels.webp": labels()}
+    meta = {
+        "version": 4,
+        "count": COUNT,
+        "means": {"mins": [-1, -1, -1], "maxs": [1, 1, 1], "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": book, "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": book, "files": ["sh0.webp"]},
+        "profile": {"id": "org.opsiclear.tsog-playback", "version": 1},
+        "timeline": {"type": 1, "mins": [0, 0.1], "maxs": [1, 2], "files": ["timeline_l.webp", "timeline_u.webp"]},
+        "temporal": {"means": {"mins": [[-1, -1, -1]], "maxs": [[1, 1, 1]], "files": ["motion.webp"]}},
+        "fps": 30,
+        "playback": {"duration": 1.0, "fps": 30},
+    }
+    sh_n = {"bands": 1, "count": 3, "codebook": book, "files": ["centroids.webp", "labels.webp"]}
+
+    def file(meta, files=files, method=zipfile.ZIP_STORED):
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", method) as archive:
+            for name, data in [*files.items(), ("meta.json", meta if isinstance(meta, bytes) else json.dumps(meta))]:
+                archive.writestr(zipfile.ZipInfo(name), data, method)
+        return out.getvalue()
+
+    whole = file(meta)
+    list_of_files = whole.index(b"PK\x01\x02")
+    damaged("tsog", whole, [0, 26, 30, 60, list_of_files, list_of_files + 20, len(whole) - 22, len(whole) - 12])
+    write("tsog", "deflated", file(meta, method=zipfile.ZIP_DEFLATED))
+    write("tsog", "harmonics", file(meta | {"shN": sh_n}, files | of_sh))
+    write("tsog", "label_beyond", file(meta | {"shN": sh_n | {"count": 1}}, files | of_sh))
+    write("tsog", "bands", file(meta | {"shN": sh_n | {"bands": 3}}, files | of_sh))
+    frames = {"type": 0, "N": 5, "delta": 13107, "files": meta["timeline"]["files"]}
+    single = {key: value for key, value in meta.items() if key != "temporal"}
+    write("tsog", "frames", file(single | {"timeline": frames}))
+    write("tsog", "still", file({key: value for key, value in single.items() if key != "timeline"}))
+    write("tsog", "motion_of_frames", file(meta | {"timeline": frames}))
+    for name, change in {
+        "version": {"version": 2},
+        "none": {"count": 0},
+        "more_than_pixels": {"count": 17},
+        "many": {"count": 1 << 62},
+        "negative": {"count": -1},
+        "no_means": {"means": {}},
+        "range_back": {"means": meta["means"] | {"mins": [2, 2, 2]}},
+        "range_wide": {"means": meta["means"] | {"maxs": [1e9, 1e9, 1e9]}},
+        "short_book": {"scales": {"codebook": [1.0], "files": ["scales.webp"]}},
+        "empty_book": {"sh0": {"codebook": [], "files": ["sh0.webp"]}},
+        "null_book": {"sh0": {"codebook": [None] * 256, "files": ["sh0.webp"]}},
+        "no_tag": {"quats": {"files": ["sh0.webp"]}},
+        "null_timeline": {"timeline": None},
+        "no_width": {"timeline": meta["timeline"] | {"mins": [0, 0]}},
+        "type": {"timeline": meta["timeline"] | {"type": 7}},
+        "many_frames": {"timeline": frames | {"N": 1 << 40}},
+        "delta": {"timeline": frames | {"delta": 0}},
+        "fast": {"temporal": {"means": {"mins": [[-3e38] * 3], "maxs": [[3e38] * 3], "files": ["motion.webp"]}}},
+        "turning": {"temporal": meta["temporal"] | {"rotation": {}}},
+        "three_images": {"temporal": {"means": meta["temporal"]["means"] | {"files": ["motion.webp"] * 3}}},
+        "duration": {"playback": {"duration": 1e300}},
+        "rate": {"fps": 0},
+        "missing_image": {"quats": {"files": ["other.webp"]}},
+        "path": {"quats": {"files": ["../meta.json"]}},
+        "meta_as_image": {"quats": {"files": ["meta.json"]}},
+    }.items():
+        write("tsog", name, file(meta | change))
+    write("tsog", "no_json", file(b"{"))
+    write("tsog", "nested", file(b"[" * 5000))
+    write("tsog", "no_meta", file(meta).replace(b"meta.json", b"mate.json"))
+    write("tsog", "large_image", file(meta, files | {"motion.webp": webp([(0, 0, 0, 255)] * 16, 16)[:21] + b"\xff" * 200}))
+
+
 def make_families():
     # Independent of the random numbers used before.
     DICE.seed(16)
@@ -1084,6 +1223,8 @@ def make_families():
     make_params()
     make_splatv()
     make_spacetime()
+    make_ftgs()
+    make_tsog()
 
 
 def main():

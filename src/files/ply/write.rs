@@ -120,6 +120,20 @@ pub(crate) fn write_rows_like(
 /// # Errors
 /// Fails if the file cannot be written, or if the number of SH coefficients belongs to no degree from 0 to 3.
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
+    write_inria_with(gaussians, comments, &[], path)
+}
+
+/// Writes `gaussians` like [`write_inria`], with the further float properties `more` at the end of each row: names, and
+/// one value per Gaussian.
+///
+/// # Errors
+/// Fails like [`write_inria`].
+pub(crate) fn write_inria_with(
+    gaussians: &Gaussians,
+    comments: &[String],
+    more: &[(&str, &[f32])],
+    path: &Path,
+) -> Result<()> {
     let width = gaussians.sh.width();
     if !(0..=MAX_SH_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
         return Err(Error::internal(format!("{width} SH planes belong to no degree from 0 to 3")));
@@ -136,8 +150,10 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     planes.push(gaussians.opacity_logit.plane(0));
     planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
     planes.extend((0..4).map(|c| gaussians.rotation.plane(c)));
+    planes.extend(more.iter().map(|(_, values)| *values));
+    let names = more.iter().map(|(name, _)| *name);
     create(path, |out| {
-        out.write_all(inria_header(gaussians.len(), rest, comments).as_bytes())?;
+        out.write_all(inria_header(gaussians.len(), rest, comments, names).as_bytes())?;
         for i in 0..gaussians.len() {
             for plane in &planes {
                 out.write_all(&plane[i].to_le_bytes())?;
@@ -147,8 +163,9 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     })
 }
 
-/// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`.
-fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
+/// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`, followed
+/// by the properties `more`.
+fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl Iterator<Item = &'a str>) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
         header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
@@ -157,7 +174,7 @@ fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned).into_iter();
     let names = names.chain((0..rest).map(|k| format!("f_rest_{k}")));
     let last = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
-    for name in names.chain(last.map(str::to_owned)) {
+    for name in names.chain(last.map(str::to_owned)).chain(more.map(str::to_owned)) {
         header += &format!("property float {name}\n");
     }
     header + "end_header\n"

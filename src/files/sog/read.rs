@@ -45,7 +45,14 @@ const MAX_CODEBOOK_VALUE: f32 = 1e30;
 pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let mut files = if path.is_dir() { Files::Folder(path.to_owned()) } else { Files::open_archive(path)? };
     let text = files.read(path, META, ReadLimit::new(MAX_META_BYTES))?;
-    let meta = parse(&text, path)?;
+    decode(&parse(&text, path)?, &mut files, path, memory)
+}
+
+/// Decodes the Gaussians that `meta` describes from the images in `files`, in the order of the file.
+///
+/// # Errors
+/// Fails if an image is missing or damaged, or if more memory than `memory` is needed.
+pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let count = meta.count as usize;
     if meta.count > u64::from(u32::MAX) {
         return Err(Error::input(path, "meta.json, count", "at most 4294967295", meta.count.to_string()));
@@ -53,31 +60,19 @@ pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let widest = 4 * 3 * sh_coefficients(MAX_SH_DEGREE) as u64 + 4 * 11;
     let per_gaussian = widest + IMAGES * BYTES_PER_PIXEL;
     memory.check(path, "meta.json, count", "the Gaussians of the file", meta.count.saturating_mul(per_gaussian))?;
-    // An image may be larger than needed, but not much.
-    let max_pixels = 4 * count + (1 << 16);
-    let mut image = |name: &str, max_pixels: usize| -> Result<RgbaImage> {
-        let bytes = files.read(path, name, memory)?;
-        let found = RgbaImage::from_webp(&bytes, max_pixels);
-        found
-            .map_err(|found| Error::input(path, name, format!("a lossless WebP of at most {max_pixels} pixels"), found))
-    };
-    let mut of_gaussians = |name: &str| -> Result<RgbaImage> {
-        let image = image(name, max_pixels)?;
-        match image.pixels.len() {
-            pixels if pixels >= count => Ok(image),
-            pixels => Err(Error::input(path, name, format!("{count} pixels, one per Gaussian"), pixels.to_string())),
-        }
-    };
+    let mut of_gaussians = |name: &str| files.image_of_gaussians(path, name, count, memory);
     let [low, high] = [of_gaussians(&meta.means.files[0])?, of_gaussians(&meta.means.files[1])?];
     let [scales, quats, sh0] =
         [&meta.scales.files[0], &meta.quats.files[0], &meta.sh0.files[0]].map(|name| of_gaussians(name));
     let (scales, quats, sh0) = (scales?, quats?, sh0?);
     let labels = meta.sh_n.as_ref().map(|entry| of_gaussians(&entry.files[1])).transpose()?;
     let palette = match &meta.sh_n {
-        Some(entry) => Some(read_palette(entry, &image(&entry.files[0], MAX_PALETTE_PIXELS)?, path)?),
+        Some(entry) => {
+            Some(read_palette(entry, &files.image(path, &entry.files[0], MAX_PALETTE_PIXELS, memory)?, path)?)
+        }
         None => None,
     };
-    let range = read_range(&meta, path)?;
+    let range = read_range(meta, path)?;
     let scale_book = codebook(&meta.scales.codebook, path, "scales")?;
     let dc_book = codebook(&meta.sh0.codebook, path, "sh0")?;
     let degree = palette.as_ref().map_or(0, |palette| palette.degree);
@@ -116,16 +111,16 @@ pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
 }
 
 /// Files of an archive or of a folder.
-enum Files {
+pub(crate) enum Files {
     Archive(ZipArchive<BufReader<File>>),
     Folder(PathBuf),
 }
 
 impl Files {
     /// Opens the archive at `path`.
-    fn open_archive(path: &Path) -> Result<Files> {
+    pub(crate) fn open_archive(path: &Path) -> Result<Files> {
         let damaged = |found: String| {
-            Error::input(path, "", "a .sog, a ZIP archive of images", found)
+            Error::input(path, "", "a ZIP archive of images", found)
                 .hint("if the file was copied, copy it again: one that is cut short has lost its list of files")
         };
         let mut file = BufReader::new(open_file(path)?);
@@ -136,8 +131,37 @@ impl Files {
         Ok(Files::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
     }
 
+    /// Decodes the image called `name`, of at most `max_pixels` pixels.
+    fn image(&mut self, path: &Path, name: &str, max_pixels: usize, memory: ReadLimit) -> Result<RgbaImage> {
+        // A lossless WebP takes little more than four bytes per pixel, so more cannot come from a valid file.
+        let most = ReadLimit::new(memory.bytes().min(8 * max_pixels as u64 + (1 << 20)));
+        let bytes = self.read(path, name, most)?;
+        let found = RgbaImage::from_webp(&bytes, max_pixels);
+        found
+            .map_err(|found| Error::input(path, name, format!("a lossless WebP of at most {max_pixels} pixels"), found))
+    }
+
+    /// Decodes the image called `name`, which has a pixel for each of `count` Gaussians.
+    ///
+    /// # Errors
+    /// Fails if the image is missing, damaged, too small, or much larger than needed.
+    pub(crate) fn image_of_gaussians(
+        &mut self,
+        path: &Path,
+        name: &str,
+        count: usize,
+        memory: ReadLimit,
+    ) -> Result<RgbaImage> {
+        // An image may be larger than needed, but not much.
+        let image = self.image(path, name, 4 * count + (1 << 16), memory)?;
+        match image.pixels.len() {
+            pixels if pixels >= count => Ok(image),
+            pixels => Err(Error::input(path, name, format!("{count} pixels, one per Gaussian"), pixels.to_string())),
+        }
+    }
+
     /// Reads the file called `name`, which may have at most `memory` bytes. Messages call the archive `path`.
-    fn read(&mut self, path: &Path, name: &str, memory: ReadLimit) -> Result<Vec<u8>> {
+    pub(crate) fn read(&mut self, path: &Path, name: &str, memory: ReadLimit) -> Result<Vec<u8>> {
         match self {
             Files::Archive(archive) => {
                 let refused = |error: String| Error::input(path, name, "a file in the archive", quoted(&error));

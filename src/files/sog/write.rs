@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
+use serde::Serialize;
 use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
@@ -61,7 +62,16 @@ pub fn write_sog(state: &Gaussians, path: &Path) -> Result<SogErrors> {
         return Err(Error::usage(format!("{}: {} Gaussians are too many for a .sog", path.shown(), state.len())));
     };
     let order = morton_order(&state.position);
-    let (meta, images, errors) = encode(state, size, &order)?;
+    let (meta, images, errors) = encode(state, size, &order, "a .sog")?;
+    write_archive(path, images, &meta)?;
+    Ok(errors)
+}
+
+/// Writes the archive `path` with the files `images` and the description `meta` of them.
+///
+/// # Errors
+/// Fails if an image is too large or writing fails.
+pub(crate) fn write_archive(path: &Path, images: NamedImages, meta: &impl Serialize) -> Result<()> {
     let failed = |error| Error::io("write", path)(error);
     let file = File::create(path).map_err(Error::io("create", path))?;
     let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(file)));
@@ -74,10 +84,9 @@ pub fn write_sog(state: &Gaussians, path: &Path) -> Result<SogErrors> {
     for (name, image) in images {
         add(&name, &image.to_webp().map_err(failed)?)?;
     }
-    let text = serde_json::to_vec(&meta).map_err(|error| Error::internal(format!("{META}: {error}")))?;
+    let text = serde_json::to_vec(meta).map_err(|error| Error::internal(format!("{META}: {error}")))?;
     add(META, &text)?;
-    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)?;
-    Ok(errors)
+    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
 /// Returns the Gaussians of `state` whose opacity is not stored as 0, in the same order.
@@ -88,11 +97,19 @@ pub fn drawn(state: &Gaussians) -> Cow<'_, Gaussians> {
 }
 
 /// Images of a file with their names in the archive.
-type NamedImages = Vec<(String, RgbaImage)>;
+pub(crate) type NamedImages = Vec<(String, RgbaImage)>;
 
 /// Encodes the Gaussians `state`, in the order `order`, as images of size `size`. Returns the content of `meta.json`, the
-/// images with their names, and the errors.
-fn encode(state: &Gaussians, size: ImageSize, order: &[u32]) -> Result<(Meta, NamedImages, SogErrors)> {
+/// images with their names, and the errors. `kind` names the file in messages, for example "a .sog".
+///
+/// # Errors
+/// Fails if stored values would exceed the error bounds of [`accuracy`](crate::files::accuracy).
+pub(crate) fn encode(
+    state: &Gaussians,
+    size: ImageSize,
+    order: &[u32],
+    kind: &str,
+) -> Result<(Meta, NamedImages, SogErrors)> {
     let mut log_scale = state.log_scale.clone();
     log_scale.planes_mut().iter_mut().for_each(|x| *x = x.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE));
     let scale_book = Codebook::fit(|| log_scale.planes().iter().copied());
@@ -120,7 +137,7 @@ fn encode(state: &Gaussians, size: ImageSize, order: &[u32]) -> Result<(Meta, Na
             accuracy.add_sh(row, f64::from(state.sh.plane(plane)[row]));
         }
     }
-    accuracy.check("a .sog")?;
+    accuracy.check(kind)?;
     let files = |name: &str| [format!("{name}.webp")];
     let [means_l, means_u, of_scales, of_quats, of_sh0] = ["means_l", "means_u", "scales", "quats", "sh0"].map(files);
     let mut images = vec![

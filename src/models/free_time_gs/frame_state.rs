@@ -4,11 +4,15 @@
 //! max(exp(durations), 0.02) + 1e-8 is the standard deviation in time and σ(o) is the stored opacity. Source:
 //! `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer does without the bounds
 //! 1e-4 and 0.02.
+//!
+//! The same motion with other bounds, and with another unit of time, is that of `.ftgs.ply` and `.tsog` files.
 
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
+use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, VELOCITY};
+use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
@@ -16,53 +20,61 @@ use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Index in [`StoredParams::own`] of the time at which a Gaussian is most opaque.
-pub(super) const TIME: usize = 0;
-/// Index in [`StoredParams::own`] of the logarithm of the standard deviation in time.
-pub(super) const DURATION: usize = 1;
-/// First of three indices in [`StoredParams::own`] of the velocity along x, y, z.
-pub(super) const VELOCITY: usize = 2;
-/// Number of parameters per Gaussian that only this model format has; they are stored in [`StoredParams::own`].
-pub(super) const OWN: usize = 5;
-
-/// Minimum standard deviation in time, and a value that is then added to it.
-const DEVIATION_FLOOR: [f64; 2] = [0.02, 1e-8];
-/// Minimum opacity of a Gaussian at any time.
-const MIN_OPACITY: f64 = 1e-4;
-
-/// Motion model of FreeTimeGS: straight lines and a temporal window.
-#[derive(Debug)]
-pub(super) struct FreeTime;
+/// Motion model of FreeTimeGS: straight lines and a temporal window. The further parameters of a Gaussian
+/// ([`StoredParams::own`]) are those of [`crate::files::ftgs`].
+#[derive(Debug, Clone)]
+pub(in crate::models) struct FreeTime {
+    /// Frames. Stored times, durations and velocities are in the unit of time of [`ClipTimes`], from 0 to 1.
+    pub(in crate::models) clip: ClipTimes,
+    /// Minimum standard deviation in time, and a value that is then added to it.
+    pub(in crate::models) deviation_floor: [f64; 2],
+    /// Minimum opacity of a Gaussian at any time.
+    pub(in crate::models) min_opacity: f64,
+}
 
 /// Values of some Gaussians that do not depend on time, for computing their temporal windows.
 #[derive(Debug)]
-pub(super) struct Windows {
+pub(in crate::models) struct Windows {
     /// For each Gaussian 1/(2s²), where s is the standard deviation in time.
     rates: Vec<f64>,
     /// For each Gaussian exp(−o), where o is the stored opacity logit.
     inverse_odds: Vec<f64>,
 }
 
-/// Returns the standard deviation s in time that belongs to a stored duration (its logarithm).
-fn deviation(duration: f32) -> f64 {
-    f64::from(duration).exp().max(DEVIATION_FLOOR[0]) + DEVIATION_FLOOR[1]
-}
+impl FreeTime {
+    /// Motion model of the trainer FreeTimeGsVanilla.
+    pub(in crate::models) const TRAINED: FreeTime =
+        FreeTime { clip: ClipTimes::UNIT, deviation_floor: [0.02, 1e-8], min_opacity: 1e-4 };
 
-/// Returns 1/(2s²), where s is the standard deviation in time that belongs to a stored duration.
-fn rate(duration: f32) -> f64 {
-    0.5 / deviation(duration).powi(2)
-}
+    /// Returns the standard deviation s in time that belongs to a stored duration (its logarithm).
+    fn deviation(&self, duration: f32) -> f64 {
+        f64::from(duration).exp().max(self.deviation_floor[0]) + self.deviation_floor[1]
+    }
 
-/// Returns the opacity logit that belongs to the minimum opacity of a Gaussian.
-fn min_logit() -> f64 {
-    (MIN_OPACITY / (1.0 - MIN_OPACITY)).ln()
+    /// Returns 1/(2s²), where s is the standard deviation in time that belongs to a stored duration.
+    fn rate(&self, duration: f32) -> f64 {
+        0.5 / self.deviation(duration).powi(2)
+    }
+
+    /// Returns the opacity logit that belongs to the minimum opacity of a Gaussian.
+    fn min_logit(&self) -> f64 {
+        (self.min_opacity / (1.0 - self.min_opacity)).ln()
+    }
+
+    /// Returns the stored parameters `raw` with durations that need no minimum.
+    pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
+        let mut raw = raw.clone();
+        let durations = raw.own.plane_mut(LOG_DEVIATION).iter_mut();
+        durations.for_each(|duration| *duration = self.deviation(*duration).ln() as f32);
+        raw
+    }
 }
 
 impl MotionModel for FreeTime {
     type Prepared = Windows;
 
     fn prepare(&self, raw: &StoredParams) -> Windows {
-        let rates = raw.own.plane(DURATION).iter().map(|&duration| rate(duration)).collect();
+        let rates = raw.own.plane(LOG_DEVIATION).iter().map(|&duration| self.rate(duration)).collect();
         Windows {
             rates,
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
@@ -87,7 +99,7 @@ impl MotionModel for FreeTime {
         out: &mut Gaussians,
     ) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
-        let centers = raw.own.plane(TIME);
+        let (time, centers) = (self.clip.to_unit(time), raw.own.plane(CENTER));
         if want.contains(Attributes::POSITION) {
             for c in 0..3 {
                 let (from, velocity) = (raw.gaussians.position.plane(c), raw.own.plane(VELOCITY + c));
@@ -98,7 +110,7 @@ impl MotionModel for FreeTime {
             }
         }
         if want.contains(Attributes::OPACITY) {
-            let min_logit = min_logit();
+            let min_logit = self.min_logit();
             let to =
                 out.opacity_logit.plane_mut(0).iter_mut().zip(centers).zip(&windows.rates).zip(&windows.inverse_odds);
             to.for_each(|(((to, &center), &rate), &inverse_odds)| {
@@ -112,8 +124,9 @@ impl MotionModel for FreeTime {
     fn jacobian(&self, time: f64, raw: &StoredParams, windows: &Windows, want: Attributes) -> Result<Jacobian> {
         let mut jacobian = Jacobian::default();
         if want.contains(Attributes::OPACITY) {
-            let min_logit = min_logit();
-            let centers = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.inverse_odds);
+            let min_logit = self.min_logit();
+            let time = self.clip.to_unit(time);
+            let centers = raw.own.plane(CENTER).iter().zip(&windows.rates).zip(&windows.inverse_odds);
             let slopes = centers.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = -rate * (time - f64::from(center)).powi(2);
                 if exponent < min_logit || faded_logit(inverse_odds, exponent) <= min_logit {
@@ -130,14 +143,17 @@ impl MotionModel for FreeTime {
 
 impl ProxyRule for FreeTime {
     fn propose(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<StoredParams> {
-        let raw = model.raw();
+        let (raw, motion) = (model.raw(), model.motion_model());
+        let (ClipTimes { first, last, .. }, floor) = (motion.clip, motion.deviation_floor);
+        // Paths are in the unit of the times of frames, so that they can be compared with frames.
+        let span = last - first;
         let line = |id: u32| {
             let id = id as usize;
             LinearPath {
                 position: raw.gaussians.position.row::<3>(id).map(f64::from),
-                velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id])),
-                center: raw.own.plane(TIME)[id].into(),
-                deviation: deviation(raw.own.plane(DURATION)[id]),
+                velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id]) / span),
+                center: first + span * f64::from(raw.own.plane(CENTER)[id]),
+                deviation: span * motion.deviation(raw.own.plane(LOG_DEVIATION)[id]),
             }
         };
         let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
@@ -155,9 +171,9 @@ impl ProxyRule for FreeTime {
             let line = matched.line;
             let StoredParams { gaussians, own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
-            own.plane_mut(TIME)[row] = line.center as f32;
-            own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION_FLOOR[1]).max(DEVIATION_FLOOR[0]).ln() as f32;
-            (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = line.velocity[c] as f32);
+            own.plane_mut(CENTER)[row] = motion.clip.to_unit(line.center) as f32;
+            own.plane_mut(LOG_DEVIATION)[row] = (line.deviation / span - floor[1]).max(floor[0]).ln() as f32;
+            (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = (span * line.velocity[c]) as f32);
             let Some((opacity, covariance)) = matched.shape else { continue };
             let like = gaussians.rotation.row::<4>(row).map(f64::from);
             let (scales, rotation) = scale_rotation(covariance, like);
@@ -170,4 +186,9 @@ impl ProxyRule for FreeTime {
     }
 
     fn hash_settings(&self, _: &mut Xxh3) {}
+
+    fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
+        let params = self.with_deviations(raw);
+        Some(TimedGaussians { params, timeline: Timeline::Windows, clip: self.clip })
+    }
 }

@@ -6,7 +6,7 @@
 //! `velocities` [N, 3]. Output: the same checkpoint with fewer Gaussians. Cameras must be those of the trainer's
 //! parser: it normalizes the coordinates of the scene and does not store how.
 
-mod frame_state;
+pub(super) mod frame_state;
 
 use std::path::{Path, PathBuf};
 
@@ -16,10 +16,11 @@ use super::in_checkpoint::{
 };
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
+use crate::files::ftgs::{CENTER, LOG_DEVIATION, VELOCITY, WIDTH};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
-use frame_state::{DURATION, FreeTime, OWN, TIME, VELOCITY};
+use frame_state::FreeTime;
 
 /// Name of the subfolder of a result folder that holds the checkpoints.
 const CHECKPOINT_FOLDER: &str = "ckpts";
@@ -136,7 +137,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         ));
     };
     let bands = sh_coefficients(degree);
-    let mut reader = CheckpointReader::new(checkpoint, count, degree, if has_motion { OWN } else { 0 })?;
+    let mut reader = CheckpointReader::new(checkpoint, count, degree, if has_motion { WIDTH } else { 0 })?;
     let planes = [
         (Attributes::POSITION, &[3][..], 0, 3),
         (Attributes::LOG_SCALE, &[3], 0, 3),
@@ -149,7 +150,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         reader.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;
     }
     let motion_tensors =
-        [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
+        [("times", &[1][..], CENTER, 1), ("durations", &[1], LOG_DEVIATION, 1), ("velocities", &[3], VELOCITY, 3)];
     for (id, (name, row, first, width)) in motion_nodes.into_iter().zip(motion_tensors) {
         reader.read(id, &place(name), row, RowElement::own(first, width))?;
     }
@@ -158,7 +159,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         true => {
             let description =
                 ModelDescription { kind: "FreeTimeGS checkpoint", seconds_per_state: 3e-8, ..description };
-            Box::new(CheckpointModel::new(reader, FreeTime, description)?)
+            Box::new(CheckpointModel::new(reader, FreeTime::TRAINED, description)?)
         }
         false => {
             let description = ModelDescription { kind: "gsplat checkpoint", seconds_per_state: 1e-8, ..description };

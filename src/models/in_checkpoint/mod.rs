@@ -19,6 +19,7 @@ use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
+use crate::files::tsog::TimedGaussians;
 use crate::limits::Limits;
 use crate::model::{Attributes, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
@@ -26,6 +27,7 @@ use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::outputs::windows::{can_store, is_windowed, write_timed};
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -54,6 +56,13 @@ pub(super) trait ProxyRule: MotionModel {
         Self: Sized,
     {
         let _ = times;
+        None
+    }
+
+    /// Returns the Gaussians `raw` in a form that files of players store without a fit; `None` if their motion has
+    /// another form.
+    fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
+        let _ = raw;
         None
     }
 
@@ -263,11 +272,33 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        match kind {
-            OutputKind::Model => self.write_model(reduction, path).map(|()| Vec::new()),
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
+        if kind == OutputKind::Model {
+            return self.write_model(reduction, path).map(|()| Vec::new());
+        }
+        match write_windowed(&self.model, reduction, kind, path)? {
+            Some(notes) => Ok(notes),
+            None => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
         }
     }
+}
+
+/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store the
+/// motion of the model. Returns notes for the user, or `None` if the model
+/// has to be fitted.
+///
+/// # Errors
+/// Fails if the format cannot hold the values or the file cannot be written.
+pub(super) fn write_windowed<L: ProxyRule>(
+    model: &MotionModelFrames<L>,
+    reduction: &CompressedModel,
+    kind: OutputKind,
+    path: &Path,
+) -> Result<Option<Vec<String>>> {
+    let raw = || motion_model::compressed_raw(model.raw(), reduction);
+    let timed = if is_windowed(kind) { model.motion_model().timed(&raw()) } else { None };
+    let Some(mut timed) = timed.filter(|timed| can_store(kind, timed.timeline)) else { return Ok(None) };
+    timed.clip.frames = timed.clip.frames.or(Some(model.info().times.len()).filter(|&frames| frames > 0));
+    write_timed(&timed, kind, path).map(Some)
 }
 
 /// Returns whether `path` is a file of at most [`MAX_COPIED_BYTES`] bytes.

@@ -1,0 +1,3 @@
+#![no_main]
+
+splatsieve_fuzz::target!("ftgs");

@@ -1,0 +1,374 @@
+//! `.ftgs.ply` files, version 1, of the player ftgs-player: Gaussians with linear motion in Gaussian windows of time.
+//!
+//! A PLY file with the properties of the INRIA layout and five more floats per Gaussian: `time` (center of its window),
+//! `log_duration` (natural logarithm of the standard deviation σ of the window) and `velocity_0..2`. Time t of the
+//! player runs from 0 to 1. With dt = t − `time`: position + velocity·dt, and opacity max(α·exp(−½(dt/max(σ,
+//! `min_duration`))²), `opacity_floor`). Comments of the header hold the version and the settings ([`FtgsHeader`]).
+//!
+//! The comment `splatsieve_times FIRST LAST`, which players ignore, maps the time of the player to the time of the
+//! sequence that was converted: FIRST at 0, LAST at 1.
+
+use std::path::Path;
+
+use crate::error::{Error, Result, quoted};
+use crate::files::defects::Defects;
+use crate::files::ply::write::write_inria_with;
+use crate::files::ply::{Ply, PlyOptions};
+use crate::files::splatv::rows::ZeroRotation;
+use crate::model::{AttributeValues, Attributes, StoredParams};
+
+/// Index in [`StoredParams::own`] of the center of the time window.
+pub const CENTER: usize = 0;
+/// Index in [`StoredParams::own`] of the natural logarithm of the standard deviation of the time window.
+pub const LOG_DEVIATION: usize = 1;
+/// First of three indices in [`StoredParams::own`] of the velocity along x, y, z, per unit of time.
+pub const VELOCITY: usize = 2;
+/// Number of parameters in [`StoredParams::own`] of a Gaussian with linear motion in a Gaussian window of time.
+pub const WIDTH: usize = 5;
+
+/// Minimum standard deviation of a time window that the player shows, as a fraction of the sequence.
+pub const MIN_DEVIATION: f64 = 0.02;
+/// Minimum opacity of a Gaussian at any time.
+const OPACITY_FLOOR: f64 = 1e-4;
+/// Properties that an INRIA PLY does not have, in the order of [`StoredParams::own`].
+const OWN_PROPERTIES: [&str; WIDTH] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
+/// Comment by which a file of this format is recognized.
+pub const MARKER_COMMENT: &str = "ftgs_version";
+
+/// Frames of a sequence whose time runs from 0 to 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClipTimes {
+    /// Time of the original sequence at the time 0.
+    pub first: f64,
+    /// Time of the original sequence at the time 1; above `first`.
+    pub last: f64,
+    /// Number of frames T if it is known. Frame i is at the time i/max(T − 1, 1).
+    pub frames: Option<usize>,
+    /// Frame rate of the playback, in frames per second. A `.ftgs.ply` does not store it.
+    pub frame_rate: f64,
+}
+
+/// Frame rate of the playback if nothing else is known, in frames per second.
+pub const FRAME_RATE: f64 = 30.0;
+
+impl ClipTimes {
+    /// Times of a sequence that is not mapped, with an unknown number of frames.
+    pub const UNIT: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
+
+    /// Returns the mapping of `times`, which increase, to the range from 0 to 1.
+    pub fn from_times(times: &[f64]) -> ClipTimes {
+        let first = times.first().copied().unwrap_or(0.0);
+        let last = times.last().copied().filter(|&last| last > first).unwrap_or(first + 1.0);
+        ClipTimes { first, last, frames: Some(times.len()), frame_rate: FRAME_RATE }
+    }
+
+    /// Returns the time from 0 to 1 that belongs to `time` of the original sequence.
+    pub fn to_unit(&self, time: f64) -> f64 {
+        (time - self.first) / (self.last - self.first)
+    }
+
+    /// Returns the times of a sequence from `first` to `last`; `None` if they are not finite or do not increase.
+    pub(crate) fn from_range(first: f64, last: f64) -> Option<ClipTimes> {
+        let is_range = first.is_finite() && last.is_finite() && last - first > 1e-12 * first.abs().max(last.abs());
+        is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT })
+    }
+}
+
+/// Settings in the header of a file.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FtgsHeader {
+    /// Times of the frames.
+    pub clip: ClipTimes,
+    /// Minimum standard deviation of a time window.
+    pub min_deviation: f64,
+    /// Minimum opacity of a Gaussian at any time.
+    pub opacity_floor: f64,
+    /// Whether the velocities are used; if not, the Gaussians do not move.
+    uses_velocity: bool,
+}
+
+/// Opened file: the parameters of its Gaussians, and the Gaussians that were repaired or left out.
+#[derive(Debug)]
+pub struct Ftgs {
+    /// Settings of the header.
+    pub header: FtgsHeader,
+    /// Parameters of the Gaussians that were read.
+    pub params: StoredParams,
+    /// Rows (Gaussians) with defects.
+    pub defects: Defects,
+}
+
+/// Defects of a row (Gaussian): name, whether the row is left out, and the reason.
+const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
+const ZERO_QUATERNION: (&str, bool, &str) = (
+    "zero quaternion",
+    true,
+    "the player refuses files with such rotations; --zero-rotation identity keeps the Gaussians without a rotation",
+);
+const KEPT_ZERO_QUATERNION: (&str, bool, &str) =
+    ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
+
+impl FtgsHeader {
+    /// Parses the comments of the PLY file at `path`. `sh_degree` is the SH degree of its properties.
+    fn parse(path: &Path, comments: &[String], sh_degree: usize) -> Result<FtgsHeader> {
+        let value = |name: &str| {
+            let of = |comment: &String| Some(comment.strip_prefix(name)?.strip_prefix([' ', '\t'])?.trim().to_owned());
+            comments.iter().find_map(of)
+        };
+        let place = |name: &str| format!("header, comment {name}");
+        let number = |name: &str, default: f64, is_valid: &dyn Fn(f64) -> bool, expected: &str| match value(name) {
+            None => Ok(default),
+            Some(text) => match text.parse::<f64>().ok().filter(|&number| is_valid(number)) {
+                Some(number) => Ok(number),
+                None => Err(Error::input(path, place(name), expected, quoted(&text))),
+            },
+        };
+        let is_word = |name: &str, expected: &str| match value(name) {
+            Some(text) if text != expected => Err(Error::input(path, place(name), expected, quoted(&text))
+                .hint("export the model again with a version of its tool that writes version 1 of the format")),
+            _ => Ok(()),
+        };
+        is_word(MARKER_COMMENT, "1")?;
+        is_word("time_units", "normalized")?;
+        let degree =
+            number("sh_degree", sh_degree as f64, &|degree| degree == sh_degree as f64, "the degree of f_rest_*");
+        degree?;
+        let uses_velocity = number("use_velocity", 1.0, &|x| x == 0.0 || x == 1.0, "0 or 1")? == 1.0;
+        let is_positive = |x: f64| x.is_finite() && x >= 0.0;
+        let min_deviation = number("min_duration", MIN_DEVIATION, &is_positive, "a number of at least 0")?;
+        let opacity_floor =
+            number("opacity_floor", OPACITY_FLOOR, &|x| (0.0..1.0).contains(&x), "a number from 0 to below 1")?;
+        let frames = number("n_frames", 0.0, &|x| (1.0..=1e9).contains(&x) && x.fract() == 0.0, "a number of frames")?;
+        let clip = match value("splatsieve_times") {
+            None => ClipTimes::UNIT,
+            Some(text) => {
+                let numbers: Vec<f64> = text.split_ascii_whitespace().filter_map(|word| word.parse().ok()).collect();
+                let clip = if let [first, last] = numbers[..] { ClipTimes::from_range(first, last) } else { None };
+                clip.ok_or_else(|| {
+                    Error::input(path, place("splatsieve_times"), "two increasing numbers", quoted(&text))
+                })?
+            }
+        };
+        let clip = ClipTimes { frames: (frames > 0.0).then_some(frames as usize), ..clip };
+        Ok(FtgsHeader { clip, min_deviation, opacity_floor, uses_velocity })
+    }
+}
+
+impl Ftgs {
+    /// Reads the file at `path`. Gaussians with values that are not finite are left out, and so are Gaussians with a
+    /// zero quaternion unless `zero_rotation` keeps them.
+    ///
+    /// # Errors
+    /// Fails if the file is not a PLY of Gaussians, lacks a property, has another version or unit of time, or if all
+    /// Gaussians would be left out.
+    pub fn open(path: &Path, options: &PlyOptions, zero_rotation: ZeroRotation) -> Result<Ftgs> {
+        let ply = Ply::open_with(path, options)?;
+        let header = FtgsHeader::parse(path, ply.comments(), ply.sh_degree())?;
+        let own_bytes = 4 * WIDTH as u64 * ply.count() as u64;
+        options.memory.check(path, "element vertex", "the Gaussians of the file", own_bytes)?;
+        let mut own = AttributeValues::zeros(WIDTH, ply.count());
+        for (plane, name) in OWN_PROPERTIES.into_iter().enumerate() {
+            let values = ply.values(name)?;
+            let values =
+                values.ok_or_else(|| Error::input(path, "element vertex", format!("property {name}"), "none"))?;
+            if header.uses_velocity || plane < VELOCITY {
+                own.plane_mut(plane).copy_from_slice(&values);
+            }
+        }
+        let mut params = StoredParams { gaussians: ply.whole()?, own };
+        let (defects, kept) = inspect(&params, zero_rotation);
+        if defects.dropped > 0 && kept.is_empty() {
+            let kinds: Vec<String> =
+                defects.kinds.iter().map(|kind| format!("{} in {}", kind.what, kind.rows)).collect();
+            return Err(Error::input(path, "element vertex", "Gaussians that the player shows", kinds.join(", "))
+                .hint("the model did not train, or its conversion failed: export it again"));
+        }
+        if defects.dropped > 0 {
+            params = params.pick(&kept);
+        }
+        for row in 0..params.len() {
+            if params.gaussians.rotation.row::<4>(row) == [0.0; 4] {
+                params.gaussians.rotation.set_row(row, [1.0, 0.0, 0.0, 0.0]);
+            }
+        }
+        Ok(Ftgs { header, params, defects })
+    }
+}
+
+/// Returns the defects of the rows (Gaussians) of `params`, and the indices of the rows that are kept.
+fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<u32>) {
+    let mut defects = Defects::new(params.len());
+    let columns: Vec<&AttributeValues> =
+        Attributes::all().iter().map(|column| params.gaussians.column(column)).chain([&params.own]).collect();
+    let zero = match zero_rotation {
+        ZeroRotation::Drop => ZERO_QUATERNION,
+        ZeroRotation::Identity => KEPT_ZERO_QUATERNION,
+    };
+    let mut kept = Vec::new();
+    for row in 0..params.len() {
+        let is_finite = |column: &&AttributeValues| (0..column.width()).all(|c| column.plane(c)[row].is_finite());
+        let found =
+            [(!columns.iter().all(is_finite), NON_FINITE), (params.gaussians.rotation.row::<4>(row) == [0.0; 4], zero)];
+        let found: Vec<_> = found.into_iter().filter_map(|(is_there, defect)| is_there.then_some(defect)).collect();
+        defects.add(row as u32, &found);
+        if !found.iter().any(|&(_, dropped, _)| dropped) {
+            kept.push(row as u32);
+        }
+    }
+    (defects, kept)
+}
+
+/// Writes the Gaussians `params` with linear motion in time windows to the file `path`. Their times are those of the
+/// player, from 0 to 1, and `clip` gives the frames.
+///
+/// # Errors
+/// Fails if the file cannot be written.
+pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Result<()> {
+    let degree = params.gaussians.sh_degree();
+    let mut comments = vec![
+        format!("{MARKER_COMMENT} 1"),
+        "time_units normalized".to_owned(),
+        format!("sh_degree {degree}"),
+        "use_velocity 1".to_owned(),
+        format!("min_duration {MIN_DEVIATION}"),
+        format!("opacity_floor {OPACITY_FLOOR}"),
+    ];
+    comments.extend(clip.frames.map(|frames| format!("n_frames {frames}")));
+    if (clip.first, clip.last) != (0.0, 1.0) {
+        comments.push(format!("splatsieve_times {} {}", clip.first, clip.last));
+    }
+    let own: Vec<(&str, &[f32])> =
+        OWN_PROPERTIES.into_iter().enumerate().map(|(plane, name)| (name, params.own.plane(plane))).collect();
+    write_inria_with(&params.gaussians, &comments, &own, path)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::model::Gaussians;
+
+    /// Returns `count` Gaussians with linear motion in time windows.
+    fn params(count: usize, sh_degree: usize) -> StoredParams {
+        let mut made =
+            StoredParams { gaussians: Gaussians::zeros(count, sh_degree), own: AttributeValues::zeros(WIDTH, count) };
+        let mut next = 0.0f64;
+        let columns = made.gaussians.columns_mut(Attributes::all()).chain([&mut made.own]);
+        for value in columns.flat_map(AttributeValues::planes_mut) {
+            next = (next + 0.618_034).fract();
+            *value = next as f32 - 0.4;
+        }
+        made
+    }
+
+    fn read(path: &Path) -> Result<Ftgs> {
+        Ftgs::open(path, &PlyOptions::default(), ZeroRotation::Drop)
+    }
+
+    #[test]
+    fn written_files_read_back_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ftgs.ply");
+        for (degree, bytes_per_row) in [(0, 88), (1, 124), (2, 184), (3, 268)] {
+            let clip = ClipTimes { first: -0.5, last: 2.0, frames: Some(31), ..ClipTimes::UNIT };
+            write_ftgs(&params(7, degree), &clip, &path).unwrap();
+            let found = read(&path).unwrap();
+            assert_eq!((&found.params, found.header.clip), (&params(7, degree), clip));
+            assert_eq!((found.header.min_deviation, found.header.opacity_floor), (0.02, 1e-4));
+            let file = std::fs::read(&path).unwrap();
+            let header = file.windows(11).position(|bytes| bytes == b"end_header\n").unwrap() + 11;
+            assert_eq!(file.len() - header, 7 * bytes_per_row);
+        }
+    }
+
+    #[test]
+    fn headers_have_the_comments_of_the_format() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ftgs.ply");
+        write_ftgs(&params(1, 0), &ClipTimes { frames: Some(60), ..ClipTimes::UNIT }, &path).unwrap();
+        let file = std::fs::read(&path).unwrap();
+        let text = String::from_utf8_lossy(&file[..600]).into_owned();
+        let expected = "ply\nformat binary_little_endian 1.0\ncomment ftgs_version 1\ncomment time_units normalized\n\
+                        comment sh_degree 0\ncomment use_velocity 1\ncomment min_duration 0.02\n\
+                        comment opacity_floor 0.0001\ncomment n_frames 60\nelement vertex 1\nproperty float x\n";
+        assert!(text.starts_with(expected), "{text}");
+        assert!(text.contains(
+            "property float rot_3\nproperty float time\nproperty float log_duration\nproperty float velocity_0\n"
+        ));
+    }
+
+    /// Writes a file, replaces `from` by `to` in it, and reads it.
+    fn read_changed(from: &str, to: &str) -> Result<Ftgs> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ftgs.ply");
+        write_ftgs(&params(4, 0), &ClipTimes { frames: Some(9), ..ClipTimes::UNIT }, &path).unwrap();
+        let file = std::fs::read(&path).unwrap();
+        let at = file.windows(from.len()).position(|bytes| bytes == from.as_bytes()).unwrap();
+        std::fs::write(&path, [&file[..at], to.as_bytes(), &file[at + from.len()..]].concat()).unwrap();
+        read(&path)
+    }
+
+    #[test]
+    fn settings_out_of_range_are_refused_by_name() {
+        for (from, to, expected) in [
+            ("ftgs_version 1", "ftgs_version 2", "comment ftgs_version"),
+            ("units normalized", "units seconds", "comment time_units"),
+            ("sh_degree 0", "sh_degree 3", "comment sh_degree"),
+            ("use_velocity 1", "use_velocity yes", "comment use_velocity"),
+            ("min_duration 0.02", "min_duration -1", "comment min_duration"),
+            ("opacity_floor 0.0001", "opacity_floor 1", "comment opacity_floor"),
+            ("n_frames 9", "n_frames 0", "comment n_frames"),
+            ("n_frames 9", "splatsieve_times 2 1", "comment splatsieve_times"),
+            ("log_duration", "log_durations", "property log_duration"),
+        ] {
+            let message = read_changed(from, to).expect_err(to).to_string();
+            assert!(message.contains(expected) && message.contains("a.ftgs.ply"), "{to}: {message}");
+        }
+    }
+
+    #[test]
+    fn velocities_count_only_if_the_header_says_so() {
+        let still = read_changed("use_velocity 1", "use_velocity 0").unwrap();
+        assert!((VELOCITY..WIDTH).all(|plane| still.params.own.plane(plane) == [0.0; 4]));
+        assert_eq!(still.params.own.plane(CENTER), params(4, 0).own.plane(CENTER));
+    }
+
+    #[test]
+    fn rows_that_the_player_refuses_are_left_out_and_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ftgs.ply");
+        let mut odd = params(6, 1);
+        odd.own.plane_mut(VELOCITY + 1)[1] = f32::NAN;
+        odd.gaussians.sh.plane_mut(7)[2] = f32::INFINITY;
+        odd.gaussians.rotation.set_row(4, [0.0; 4]);
+        write_ftgs(&odd, &ClipTimes::UNIT, &path).unwrap();
+        let found = read(&path).unwrap();
+        assert_eq!((found.params.len(), found.defects.dropped), (3, 3));
+        assert_eq!(found.params, params(6, 1).pick(&[0, 3, 5]));
+        let notes = found.defects.notes().join("\n");
+        assert!(
+            notes.contains("2 of 6 rows") && notes.contains("rows 1, 2") && notes.contains("--zero-rotation"),
+            "{notes}"
+        );
+        let kept = Ftgs::open(&path, &PlyOptions::default(), ZeroRotation::Identity).unwrap();
+        assert_eq!((kept.params.len(), kept.params.gaussians.rotation.row(2)), (4, [1.0, 0.0, 0.0, 0.0]));
+        odd.own.plane_mut(CENTER).fill(f32::NAN);
+        write_ftgs(&odd, &ClipTimes::UNIT, &path).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("NaN or infinite value in 6"));
+    }
+
+    proptest! {
+        #[test]
+        fn changed_bytes_never_panic(at in 0..700usize, value in any::<u8>()) {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("a.ftgs.ply");
+            write_ftgs(&params(2, 0), &ClipTimes::UNIT, &path).unwrap();
+            let mut file = std::fs::read(&path).unwrap();
+            let at = at % file.len();
+            file[at] = value;
+            std::fs::write(&path, &file).unwrap();
+            _ = read(&path);
+        }
+    }
+}

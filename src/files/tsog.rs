@@ -1,0 +1,147 @@
+//! `.tsog` files, version 4 of the format (temporal SOG): moving Gaussians as lossless WebP images in a ZIP archive.
+//!
+//! The images and the members of `meta.json` of a [`.sog`](super::sog) file, and those of the table. Time t runs from 0 to
+//! 1. Sources: the encoder of xiaomi-research/tsog, and the playback profile of OpsiClear-4DGS/ftgs-player.
+//!
+//! | member | content | value of the bytes R G B of its images |
+//! |---|---|---|
+//! | `timeline`, type 1 | range of c and σ, two images | low and high byte of c and σ: opacity α·exp(−½((t − c)/σ)²) |
+//! | `timeline`, type 0 | numbers of frames `N` and `delta`, two images | low and high byte of q: the Gaussian is seen in frame ⌊q/delta⌋ only |
+//! | `temporal.means` | range of the velocity v, one or two images | v with 8 or 16 bits: position + v·(t − c) |
+//! | `profile`, `fps`, `playback` | version of the profile, frame rate and duration | |
+//!
+//! Without `timeline` the file is a still. The member `splatsieve`, which players ignore, maps the time of the player to
+//! the time of the sequence that was converted.
+
+pub mod read;
+pub mod write;
+
+use serde::{Deserialize, Serialize};
+
+use super::sog::Meta;
+use crate::files::ftgs::{ClipTimes, WIDTH};
+use crate::model::StoredParams;
+
+/// Version of the format that is read and written.
+pub const VERSION: u64 = 4;
+/// Name of the playback profile that players expect.
+const PROFILE: &str = "org.opsiclear.tsog-playback";
+/// Number of frames of a file that does not give a duration.
+const DEFAULT_FRAMES: usize = 300;
+
+/// Visibility of the Gaussians of a file over time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Timeline {
+    /// All Gaussians are seen at every time, and do not move.
+    Still,
+    /// Each Gaussian is seen in one of the given number of frames only. [`StoredParams::own`] holds the index of this
+    /// frame.
+    Frames(usize),
+    /// Linear motion in Gaussian windows of time. [`StoredParams::own`] holds the parameters of
+    /// [`crate::files::ftgs`].
+    Windows,
+}
+
+impl Timeline {
+    /// Returns the number of further parameters of a Gaussian, in [`StoredParams::own`].
+    pub fn width(self) -> usize {
+        match self {
+            Timeline::Still => 0,
+            Timeline::Frames(_) => 1,
+            Timeline::Windows => WIDTH,
+        }
+    }
+}
+
+/// Gaussians with their visibility over time, as players show them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TimedGaussians {
+    /// Stored parameters; what the further ones mean depends on `timeline`.
+    pub params: StoredParams,
+    /// Visibility over time.
+    pub timeline: Timeline,
+    /// Frames, and the mapping of their times to the range from 0 to 1.
+    pub clip: ClipTimes,
+}
+
+/// Content of `meta.json`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct TsogMeta {
+    #[serde(flatten)]
+    sog: Meta,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    profile: Option<Profile>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    timeline: Option<TimelineEntry>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    temporal: Option<Temporal>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fps: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    playback: Option<Playback>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    splatsieve: Option<OriginalTimes>,
+}
+
+/// Playback profile that a file follows.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Profile {
+    id: String,
+    version: u64,
+}
+
+/// Images of the time windows (type 1) or of the frames (type 0) of the Gaussians.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct TimelineEntry {
+    #[serde(rename = "type")]
+    kind: u64,
+    #[serde(rename = "N", skip_serializing_if = "Option::is_none")]
+    frames: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    delta: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mins: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    maxs: Option<[f64; 2]>,
+    files: [String; 2],
+}
+
+/// Motion of the Gaussians.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Temporal {
+    means: Velocity,
+}
+
+/// Images of the velocities: one with 8 bits per axis, or those of the low and high bytes of 16 bits.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Velocity {
+    mins: [[f64; 3]; 1],
+    maxs: [[f64; 3]; 1],
+    files: Vec<String>,
+}
+
+/// Settings of the player.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Playback {
+    /// Duration in seconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    duration: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fps: Option<f64>,
+}
+
+/// Times of the first and the last frame of the sequence that was converted.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct OriginalTimes {
+    times: [f64; 2],
+}
+
+/// Returns the number of 16-bit codes that stand for one of `frames` frames.
+fn codes_per_frame(frames: usize) -> usize {
+    (1 << 16) / frames.max(1)
+}
+
+#[cfg(test)]
+mod tests;

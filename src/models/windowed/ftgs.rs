@@ -1,0 +1,48 @@
+//! `.ftgs.ply` files as a model format.
+
+use std::io::Read;
+use std::path::Path;
+
+use super::WindowedModel;
+use crate::files::ftgs::{Ftgs, MARKER_COMMENT};
+use crate::files::open::open_file;
+use crate::models::free_time_gs::frame_state::FreeTime;
+use crate::models::input_model::{ModelFormat, Timing};
+use crate::models::motion_model::MotionModelFrames;
+use crate::outputs::kind::OutputKind;
+
+/// Smallest standard deviation of a time window, so that no 0/0 arises.
+pub(super) const SMALLEST_DEVIATION: f64 = 1e-9;
+
+/// File of ftgs-player with linear motion in time windows.
+pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
+    recognizes: |found| found.is_file_of(b"ply", "ply") && has_marker(found.path),
+    open: |path, options| {
+        options.refuse_for(path)?;
+        let file = Ftgs::open(path, &options.ply(), options.conventions.zero_rotation.unwrap_or_default())?;
+        let motion = FreeTime {
+            clip: file.header.clip,
+            deviation_floor: [file.header.min_deviation.max(SMALLEST_DEVIATION), 0.0],
+            min_opacity: file.header.opacity_floor,
+        };
+        let sh_degree = file.params.gaussians.sh_degree();
+        Ok(Box::new(WindowedModel {
+            path: path.to_owned(),
+            name: "ftgs-player model",
+            own: OutputKind::Ftgs,
+            timing: Timing::Continuous,
+            notes: file.defects.notes(),
+            model: MotionModelFrames::new(motion, file.params, sh_degree),
+        }))
+    },
+};
+
+/// Returns whether the header of the PLY file at `path` has the comment that marks this format.
+fn has_marker(path: &Path) -> bool {
+    // The marker is at the start of the header; the rest of the file is not read.
+    let mut head = Vec::new();
+    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
+    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
+    let marker = format!("comment {MARKER_COMMENT} ");
+    read && header.windows(marker.len()).any(|bytes| bytes == marker.as_bytes())
+}

@@ -1,0 +1,163 @@
+//! Files of players for Gaussians with linear motion in Gaussian windows of time, as model formats.
+//!
+//! The output has the same format with fewer Gaussians. The parameters of a Gaussian are those of
+//! [`crate::files::ftgs`], and FreeTimeGS has the same motion.
+
+mod frame_by_frame;
+mod ftgs;
+mod tsog;
+
+use std::path::{Path, PathBuf};
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::in_checkpoint::{ProxyRule, write_windowed};
+use super::motion_model::{MotionModelFrames, solve};
+use super::size::{Size, bytes_below, bytes_read_for};
+use super::trajectories::{NO_ARCHIVE, state_bytes, write_sequence};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::error::{Error, Result};
+use crate::files::cameras::Clock;
+use crate::files::digest::hash_file;
+use crate::limits::Limits;
+use crate::model::{Attributes, Jacobian};
+use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
+use crate::recipe::MergeParams;
+use crate::source::FrameSource;
+pub(super) use ftgs::FTGS;
+pub(super) use tsog::TSOG;
+
+/// Opened file of a player, whose Gaussians move as `L` says.
+#[derive(Debug)]
+struct WindowedModel<L: ProxyRule> {
+    path: PathBuf,
+    /// Name of the format, shown to users.
+    name: &'static str,
+    /// Kind of output that has the format of this file.
+    own: OutputKind,
+    /// Whether frames can be at any time.
+    timing: Timing,
+    /// Repairs and guesses made while opening.
+    notes: Vec<String>,
+    model: MotionModelFrames<L>,
+}
+
+impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
+    fn kind(&self) -> &'static str {
+        self.name
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        &self.model
+    }
+
+    fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        hash_file(&self.path, &mut hash)?;
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_read_for([&*self.path])
+    }
+
+    fn size(&self) -> Result<Size> {
+        Ok(Size { cloud: self.bytes()?, ..Size::default() })
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind == self.own {
+            true => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
+            false => Ok(Size::from_frames(bytes_below(path)?)),
+        }
+    }
+
+    fn residence(&self) -> MemoryProfile {
+        let raw = self.model.raw();
+        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.own.width() as u64;
+        MemoryProfile {
+            per_gaussian: whole,
+            // A copy of the parameters, without the Gaussians that were left out.
+            opening: whole,
+            // A copy of the stored parameters and the values prepared from them.
+            reader: whole + 16 + 8,
+            reduced: 2 * whole,
+            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+            file: whole + 24,
+            fixed: 0,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+            seconds_per_state: 3e-8,
+            decoded: 0,
+        }
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.notes.clone()
+    }
+
+    fn timing(&self) -> Timing {
+        self.timing
+    }
+
+    fn clock(&self) -> Clock {
+        Clock::Given
+    }
+
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
+        let found = self.model.info().times.len();
+        if self.timing == Timing::Numbered && times.len() != found {
+            return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
+        }
+        self.model = match self.model.motion_model().for_times(&times) {
+            Some(motion) => MotionModelFrames::new(motion, self.model.raw().clone(), self.model.info().sh_degree),
+            None => self.model,
+        };
+        self.model = self.model.with_times(times)?;
+        Ok(self)
+    }
+
+    fn own_output(&self) -> OutputKind {
+        self.own
+    }
+
+    fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model | OutputKind::Ply => Err(Error::usage(
+                "a file of a player cannot be written as a trained model\n  write its own format, a .gseq or --as \
+                 ply-sequence",
+            )),
+            OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
+            _ => Ok(()),
+        }
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
+        solve(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.reduced(reduction)))
+    }
+
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+        events: &Events,
+    ) -> Result<Vec<String>> {
+        match write_windowed(&self.model, reduction, kind, path)? {
+            Some(notes) => Ok(notes),
+            None => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,64 @@
+//! `.tsog` files as a model format.
+
+use std::path::Path;
+
+use super::WindowedModel;
+use super::frame_by_frame::FrameByFrame;
+use super::ftgs::SMALLEST_DEVIATION;
+use crate::error::Result;
+use crate::files::tsog::read::{is_tsog, read_tsog};
+use crate::files::tsog::{TimedGaussians, Timeline};
+use crate::models::free_time_gs::frame_state::FreeTime;
+use crate::models::in_checkpoint::ProxyRule;
+use crate::models::in_checkpoint::still::Still;
+use crate::models::input_model::{InputModel, ModelFormat, Timing};
+use crate::models::motion_model::MotionModelFrames;
+use crate::outputs::kind::OutputKind;
+
+/// File of web players with linear motion in time windows, with single frames, or with a still.
+pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
+    recognizes: |found| !found.is_folder && is_named_or_zip(found.path, &found.head),
+    open: |path, options| {
+        options.refuse_for(path)?;
+        let TimedGaussians { params, timeline, clip } = read_tsog(path, options.memory)?;
+        let sh_degree = params.gaussians.sh_degree();
+        match timeline {
+            Timeline::Windows => {
+                let motion = FreeTime { clip, deviation_floor: [SMALLEST_DEVIATION, 0.0], min_opacity: 0.0 };
+                opened(path, Timing::Continuous, MotionModelFrames::new(motion, params, sh_degree), Vec::new())
+            }
+            Timeline::Frames(frames) => {
+                let motion = FrameByFrame::new(frames, clip);
+                let note = format!(
+                    "{} Gaussians in {frames} single frames: each is visible in one frame only, so none is followed \
+                     through time",
+                    params.len()
+                );
+                let times = motion.times().to_vec();
+                let model = MotionModelFrames::new(motion, params, sh_degree).with_times(times)?;
+                opened(path, Timing::Numbered, model, vec![note])
+            }
+            Timeline::Still => {
+                let model = MotionModelFrames::new(Still, params, sh_degree).with_times(vec![0.0])?;
+                opened(path, Timing::Numbered, model, Vec::new())
+            }
+        }
+    },
+};
+
+/// Returns whether the file is named `.tsog`, or is a ZIP archive with the content of one.
+fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
+    let is_named = path.extension().is_some_and(|found| found.eq_ignore_ascii_case("tsog"));
+    is_named || (head.starts_with(b"PK\x03\x04") && is_tsog(path))
+}
+
+/// Returns the opened file at `path`, whose frames `model` computes.
+fn opened<L: ProxyRule + 'static>(
+    path: &Path,
+    timing: Timing,
+    model: MotionModelFrames<L>,
+    notes: Vec<String>,
+) -> Result<Box<dyn InputModel>> {
+    let (path, own) = (path.to_owned(), OutputKind::Tsog);
+    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model }))
+}
