@@ -9,7 +9,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 pub(super) use self::shared::{
-    CacheArgs, CameraFile, Cameras, Earlier, Input, LinkArg, Memory, Rot4d, SplitArg, Trained, ZeroRotationArg,
+    CacheArgs, CameraFile, Cameras, Earlier, Input, LinkArg, Memory, OutputKindArg, Rot4d, SplitArg, Trained,
+    ZeroRotationArg,
 };
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
@@ -213,40 +214,6 @@ pub(super) struct OverrideArgs {
     /// Drop these Gaussians: a file with one id per line, or a list such as 3,10-20
     #[arg(long, help_heading = WHAT_STAYS, value_name = "FILE|IDS", hide_short_help = true)]
     pub(super) drop_ids: Option<String>,
-}
-
-/// Formats of an output.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum OutputKindArg {
-    /// Model folder in the format of the input
-    Model,
-    /// Container with all frames (.gseq)
-    Gseq,
-    /// Folder with one PLY file per frame
-    PlySequence,
-    /// One PLY file: the canonical Gaussians of a model, or a single frame
-    Ply,
-    /// Archive (.gsz), the smallest: to store and to send
-    Archive,
-    /// Gaussians with cubic motion in time windows, for splaTV and WebGS
-    Splatv,
-    /// Gaussians with linear motion in pieces, for readers of 4dgs
-    #[value(name = "4dgs")]
-    FourDgs,
-    /// One frame, for web viewers (.spz)
-    Spz,
-    /// One frame as images, for web viewers (.sog)
-    Sog,
-    /// One frame, uncompressed, for viewers of glTF (.glb)
-    Glb,
-    /// Folder with one .sog per frame, for the flip book of PlayCanvas
-    SogSequence,
-    /// Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)
-    Tsog,
-    /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
-    Ftgs,
-    /// Every frame whole, for SplatRenderer of Unreal (.gsd)
-    Gsd,
 }
 
 /// Arguments of `score`.

@@ -32,7 +32,7 @@ const DEFAULT_FRAMES: usize = 300;
 /// Visibility of the Gaussians of a file over time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timeline {
-    /// All Gaussians are seen at every time, and do not move.
+    /// A still: every Gaussian is visible at every time and does not move.
     Still,
     /// Each Gaussian is seen in one of the given number of frames only. [`StoredParams::own`] holds the index of this
     /// frame.

@@ -179,3 +179,37 @@ pub(in crate::cli) enum SplitArg {
     /// Every view
     All,
 }
+
+/// Formats of an output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum OutputKindArg {
+    /// Model folder in the format of the input
+    Model,
+    /// Container with all frames (.gseq)
+    Gseq,
+    /// Folder with one PLY file per frame
+    PlySequence,
+    /// One PLY file: the canonical Gaussians of a model, or a single frame
+    Ply,
+    /// Archive (.gsz), the smallest: to store and to send
+    Archive,
+    /// Gaussians with cubic motion in time windows, for splaTV and WebGS
+    Splatv,
+    /// Gaussians with linear motion in pieces, for readers of 4dgs
+    #[value(name = "4dgs")]
+    FourDgs,
+    /// One frame, for web viewers (.spz)
+    Spz,
+    /// One frame as images, for web viewers (.sog)
+    Sog,
+    /// One frame, uncompressed, for viewers of glTF (.glb)
+    Glb,
+    /// Folder with one .sog per frame, for the flip book of PlayCanvas
+    SogSequence,
+    /// Gaussians with linear motion in time windows as images, the smallest for web viewers (.tsog)
+    Tsog,
+    /// Gaussians with linear motion in time windows, for ftgs-player (.ftgs.ply)
+    Ftgs,
+    /// Every frame whole, for SplatRenderer of Unreal (.gsd)
+    Gsd,
+}
