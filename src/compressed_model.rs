@@ -178,8 +178,9 @@ pub struct CompressedModel {
     pub proxies: Proxies,
     /// Parameter delta: values that refinement adds to the stored parameters, constant in time.
     pub change: ParamDelta,
-    /// Trajectory delta: values, varying in time, that refinement adds beside the constant `change`. Used for formats
-    /// with explicit frames, and only if there are no proxies.
+    /// Trajectory delta: values, varying in time, that refinement adds to the attributes at each frame, on top of the
+    /// constant `change`. Empty unless the model format stores the state of every Gaussian for every frame, and empty
+    /// if there are proxies.
     pub course: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.
     pub field: Precision,

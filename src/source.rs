@@ -75,7 +75,8 @@ impl ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
-    /// Returns the maximum number of frames that a reader keeps of the frames decoded together.
+    /// Returns the maximum number of frames that a reader keeps in memory after it has decoded a tile, for later reads.
+    /// Decoding a tile gives the values of several consecutive frames at once.
     pub fn held(&self) -> usize {
         self.held
     }

@@ -91,7 +91,7 @@ struct Table {
     tensors: Vec<TensorEntry>,
     /// Number of extra bytes per Gaussian that are no attributes.
     beside: usize,
-    /// Names and lengths in bytes of the copied files.
+    /// Name and length in bytes of each entry of [`Content::files`], in the order in which their bytes are stored.
     files: Vec<(String, usize)>,
 }
 

@@ -48,8 +48,9 @@ impl<const N: usize> PredictorFit<N> {
         }
     }
 
-    /// Returns the fitted weights. Solves the normal equations by Cholesky factorization, with a ridge of 1e-4 times
-    /// the mean diagonal so that they are solvable. All weights are 0 if all differences are 0 or one is not finite.
+    /// Returns the fitted weights in 64ths. Solves the normal equations by Cholesky factorization, with a ridge of 1e-4
+    /// times the mean diagonal so that they are solvable. All weights are 0 if the differences of all samples
+    /// (neighboring values less their means) are 0, or if one of them is not finite.
     pub(super) fn parts(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {

@@ -237,9 +237,12 @@ impl Cache {
         }
     }
 
-    /// Determines how to obtain the full result of `stage`, which is not stored. Returns the number of shards to join:
-    /// those that are not stored still have to be computed; 1 means that the whole stage has to be computed. A run that
-    /// computes only one shard computes and stores it here and ends with [`Error::ShardDone`].
+    /// Returns the number n of shards from which the full result of `stage`, which is not stored, is joined. The caller
+    /// computes each of the n shards that is not stored yet. If n is 1, the caller computes the whole stage undivided.
+    ///
+    /// A run that is limited to one of several shards gets a number only if all shards are stored or there is no cache.
+    /// Otherwise the function computes and stores that shard, unless it is stored already, and fails with
+    /// [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,

@@ -86,8 +86,9 @@ const CONVERGED: f64 = 1e-3;
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Value of a curve's time window at a frame below which the frame does not affect the curve. The limit for window ×
-/// opacity is this times the smallest visible opacity.
+/// Frames at which the time window of a curve has at most this value are not used to fit the opacity of the curve.
+/// Frames at which window × opacity is at most this value times the smallest visible opacity are not used to fit its
+/// motion.
 const MIN_WEIGHT: f64 = 1e-3;
 
 /// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,

@@ -60,7 +60,8 @@ pub struct Misfit {
     pub states: u64,
     /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
     squares: f64,
-    /// Sum of squared differences between the opacities of fit and Gaussian.
+    /// Sum, over all compared states, of the squared difference between the opacity of the fit and that of the
+    /// Gaussian.
     opacity_squares: f64,
     /// Sum of the opacities of the Gaussians.
     visible: f64,
@@ -85,7 +86,8 @@ impl Misfit {
         self.opacity = self.opacity.max(opacity.abs());
     }
 
-    /// Returns the errors of both sets of fits together.
+    /// Returns the error over all states of `self` and of `other`: counts and sums are added, and each largest
+    /// difference is the larger of the two.
     pub fn and(self, other: Misfit) -> Misfit {
         Misfit {
             states: self.states + other.states,

@@ -247,7 +247,7 @@ pub struct Forecast {
     pub threads: u64,
     /// Whether the speed of this machine was measured on the scene for this forecast.
     pub measured: bool,
-    /// Maximum memory of the process, bytes.
+    /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,
     /// Expected times of all stages in order.
     pub stages: Vec<StageForecast>,

@@ -120,7 +120,8 @@ pub struct PassCounts {
     pub passing: usize,
     /// Number of nodes that joined another node.
     pub joins: usize,
-    /// Number of parallel rounds in which the leaders were decided.
+    /// Number of parallel rounds in which nodes were assigned to leaders (nodes that other nodes join). Nodes that are
+    /// undecided after the last round are assigned sequentially and not counted here.
     pub rounds: usize,
     /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
     pub sequential: bool,

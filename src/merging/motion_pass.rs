@@ -235,7 +235,9 @@ mod tests {
             Ok(found)
         }
 
-        /// Measures the motion similarity of all pairs from whole frames, without partitions.
+        /// Measures the motion similarity of all candidate pairs by reading every frame once with all Gaussians,
+        /// without dividing the pairs into partitions. Returns for each pair the indices of its Gaussians in `ids` and
+        /// the bits of the similarity (`f64::to_bits`), so that NaN equals NaN.
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
             let gate = MotionGate::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));

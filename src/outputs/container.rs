@@ -278,8 +278,8 @@ impl ContainerWriter {
 pub enum BlockChange {
     /// Attributes that vary with time may change from frame to frame; all others equal those of the frame block before.
     Varying,
-    /// Attributes that vary with time may change from frame to frame; all others are constant in the frame block but
-    /// may differ from the block before.
+    /// Every attribute is encoded anew, because it may differ from the frame block before. Attributes that vary with
+    /// time may change from frame to frame in the frame block; all others are constant in it.
     New,
     /// All frames of the frame block are equal.
     Still,

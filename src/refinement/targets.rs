@@ -122,8 +122,10 @@ impl Targets {
         }
     }
 
-    /// Returns the grid with `stride` of the pixels of view `k` that are used: all pixels unless it is a training view.
-    /// Its phase is fixed for each view and differs between views. `stride` must be a multiple of [`Targets::stride`].
+    /// Returns the grid of the pixels of view `k` that are rendered and compared. For a training view, these are the
+    /// pixels at every `stride`-th column and row; for validation and test views, all pixels. The first column and row
+    /// come from a hash of `k`, so that different training views sample different pixels. `stride` must be a multiple
+    /// of [`Targets::stride`].
     fn grid(&self, k: usize, stride: NonZeroU32) -> PixelGrid {
         match self.purpose(k) {
             Purpose::Training => {

@@ -87,7 +87,8 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
         .collect()
 }
 
-/// Returns edges of bins from 0 to 1 for fractions of `frames` frames. No bin is narrower than one frame.
+/// Returns the edges of bins of equal width from 0 to 1, for values that are a number of frames divided by `frames`.
+/// There are at most [`BINS`] bins and at most one per frame, so that no bin is narrower than 1 / `frames`.
 fn even(frames: usize) -> Vec<f64> {
     let bins = frames.clamp(1, BINS);
     (0..=bins).map(|k| k as f64 / bins as f64).collect()

@@ -1,8 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
-//! Input: the scores of all renders, then the chosen renders again. Output: PNG files as data URIs. A page holds at
-//! most [`CHOSEN`] renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per
-//! result.
+//! Input: the scores of all renders, from which some renders are chosen, and then the images of the chosen renders,
+//! which the caller renders a second time. Output: PNG files as data URIs. A page holds at most [`CHOSEN`] renders of
+//! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 

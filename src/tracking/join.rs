@@ -19,8 +19,9 @@ const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true
 /// Largest ratio of the sizes of joined tracks, as a natural log: ln √2. The grid that finds similar Gaussians finds no
 /// other sizes.
 const MAX_LN_SIZE_RATIO: f32 = std::f32::consts::LN_2 / 2.0;
-/// Largest number of frames in which two tracks may both be present and still be joined. Frames in which only one of
-/// them is present are subtracted. A Gaussian may fade out as one track while it fades in as the other.
+/// Largest count of shared frames with which two tracks may still be joined. A frame in which both tracks are present
+/// raises the count by 1; a frame in which one of them is missing lowers it by 1, down to 0. Some shared frames are
+/// allowed because a Gaussian may fade out as one track while it fades in as the other.
 const MAX_SHARED_FRAMES: u8 = 4;
 
 /// Rules by which tracks are joined. Tracks that satisfy the second rule also satisfy the first.

@@ -25,8 +25,8 @@ const POSITION_OCTAVES: usize = 10;
 /// Number of values in the encoding of a position: its 3 components, and their sines and cosines for each octave.
 const POSITION_INPUTS: usize = 3 + 6 * POSITION_OCTAVES;
 
-/// Deep MLP of position and time that computes the motion of Gaussians. The result for a Gaussian has the same bits in
-/// every block.
+/// Deep MLP of position and time that computes the motion of Gaussians. Gaussians are evaluated in blocks; the result
+/// for a Gaussian has the same bits whichever other Gaussians are in its block.
 #[derive(Debug, Clone)]
 pub struct Network {
     /// Number of octaves (frequencies 2⁰, 2¹, …) in the encoding of the time.

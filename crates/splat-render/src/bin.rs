@@ -176,8 +176,9 @@ impl Bins {
 /// Number of bits of a digit of the radix sort. The counts of all values of a digit fit in the first-level cache.
 const DIGIT_BITS: u32 = 11;
 
-/// Sorts `keys` by their upper halves. Keys with equal upper halves keep their order, so their lower halves must
-/// increase beforehand. `spare` is a buffer.
+/// Sorts `keys` (depth in the upper 32 bits, index of the splat in the lower 32) by depth. Keys of equal depth keep
+/// their order. The caller passes keys with increasing indices, so the result is sorted by depth, then by index.
+/// `spare` is a buffer for reuse; its content has no meaning.
 fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     spare.clear();
     spare.resize(keys.len(), 0);

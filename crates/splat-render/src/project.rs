@@ -98,7 +98,7 @@ pub(super) struct Splat {
     pub(super) v: f64,
     /// Coefficient of (dx − shear·dy)² in the exponent of alpha, 1/pixels².
     pub(super) falloff_x: f32,
-    /// Shift along x of the position of the largest alpha from one pixel row to the next, pixels.
+    /// Slant of the splat: in the pixel row at offset dy, alpha is largest at dx = shear·dy. Pixels along x per row.
     pub(super) shear: f32,
     /// Coefficient of dy² in the exponent of alpha, 1/pixels².
     pub(super) falloff_y: f32,

@@ -92,7 +92,7 @@ pub(in crate::cli) struct Earlier {
 }
 
 impl Earlier {
-    /// Returns the policy as the library takes it.
+    /// Returns whether existing output files may be replaced, as the library's type [`Replace`].
     pub(in crate::cli) fn replace(&self) -> Replace {
         if self.overwrite { Replace::Existing } else { Replace::Never }
     }

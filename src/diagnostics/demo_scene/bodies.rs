@@ -32,7 +32,8 @@ pub enum DemoBody {
     /// Sparks that fly, each visible for an eighth of the sequence at its own time: disjoint life spans, no motion
     /// outside of them.
     Spark,
-    /// Hanging wires of needles, 25 times longer than thick. Still; small in area but visible.
+    /// Hanging wires, each a row of needle-shaped Gaussians that are 25 times longer than thick. Without motion; small
+    /// in area but visible.
     Wire,
 }
 

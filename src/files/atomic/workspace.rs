@@ -149,8 +149,9 @@ pub(super) fn publishing_name(name: &OsStr) -> OsString {
     workspace
 }
 
-/// Returns whether a workspace holds an earlier folder or a journal. Both must be handled before the workspace is
-/// removed.
+/// Returns whether the workspace `folder` holds traces of an interrupted run: the previous output folder, set aside
+/// while it was being replaced, or a journal of moves. The previous folder must be restored, or the moves completed or
+/// reverted, before the workspace is removed.
 pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }

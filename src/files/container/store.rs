@@ -151,8 +151,11 @@ impl Container {
         self.slot(self.places.len(), 0, 0)
     }
 
-    /// Returns the index, among all distinct tiles, of a tile of column `index` of `places`. If `index` is the number
-    /// of columns, this is the number of distinct tiles.
+    /// Returns the index of a tile among all distinct tiles, which are counted by attribute, then by frame block, then
+    /// by Gaussian block. `index` is the index of the tile's attribute in [`Container::places`]. An attribute that does
+    /// not vary over time has only the tiles of one frame block, so `frame_block` is ignored for it.
+    ///
+    /// If `index` is the number of attributes and both blocks are 0, the result is the number of distinct tiles.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };

@@ -102,7 +102,8 @@ pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     keys.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Returns the images of the low and of the high bytes of 16-bit numbers: `codes` gives the three of a row.
+/// Returns two images, of the low and of the high bytes of 16-bit numbers. `codes` returns the three numbers (x, y, z)
+/// of the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`: x, y and z are red, green and blue.
 pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u16; 3]) -> [RgbaImage; 2] {
     [0, 1].map(|byte| {
         size.image(order, |row| {

@@ -59,7 +59,8 @@ impl LinearPath {
 /// Path, window and shape of a proxy that were matched to its members over the sampled frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
-    /// Weighted mean of the members' paths and windows.
+    /// Path and temporal window of the proxy: the mean of those of its members (merged Gaussians) with the weights of
+    /// the cluster, see [`LinearPath::blended`].
     pub(in crate::models) line: LinearPath,
     /// Opacity logit at the center of the window, and spatial covariance (xx xy xz yy yz zz). `None` if the proxy is
     /// visible at no sampled frame.

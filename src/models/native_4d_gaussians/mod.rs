@@ -35,7 +35,8 @@ const CAPTURE_LENGTH_4D: usize = 19;
 /// Number of values in the capture tuple of a static model.
 const CAPTURE_LENGTH_STATIC: usize = 12;
 
-/// Training checkpoint, or the model folder that contains it.
+/// Model format of 4D Gaussian Splatting in its native form: recognizes and opens a training checkpoint, or the model
+/// folder that contains it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         // Other formats also save checkpoints beside a folder `point_cloud`, so the capture must be that of a 4D model.

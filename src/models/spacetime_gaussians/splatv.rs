@@ -1,7 +1,8 @@
 //! `.splatv` files as an input, and as an output of the lite SpacetimeGaussians model.
 //!
-//! Unchanged Gaussians keep their stored words. Gaussians that no player draws are left out. An infinite width stands
-//! for a temporal window that is 1 at every time ([`rows`](crate::files::splatv::rows)).
+//! When a compressed `.splatv` input is written as `.splatv`, Gaussians that compression did not change are copied as
+//! the 32-bit words of the input file. Gaussians that no player draws are left out. If the temporal window of a
+//! Gaussian has an infinite width in the file, the window is 1 at every time ([`rows`](crate::files::splatv::rows)).
 
 use std::fs;
 use std::path::Path;

@@ -168,8 +168,9 @@ fn errors(reference_views: &ReferenceViews<'_>, source: &dyn FrameSource, widths
     (0..5).map(|k| reference_views.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
 }
 
-/// Returns the number of bits of every attribute in some blocks of Gaussians and one block of frames in the middle,
-/// encoded with the error bounds `widths`.
+/// Returns for each attribute the size in bits of a sample of the archive, encoded with the error bounds `widths`. The
+/// sample is at most [`COUNTED_BLOCKS`] evenly spaced blocks of Gaussians over one block of frames in the middle of the
+/// sequence.
 fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     let (info, packing) = (source.info(), packing(Bounds::new(widths)));
     let blocks = info.count.div_ceil(GAUSSIAN_BLOCK);

@@ -40,8 +40,9 @@ const MIN_ERROR: f64 = 1e-14;
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
 /// Number of times that [`OCTAVE_RANGE`] is halved to find the change.
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range of the final common change of all quantization steps for a byte limit, octaves (doublings), from coarser to
-/// finer.
+/// Search range if the archive has a byte limit. At the end, all quantization steps are multiplied by one factor
+/// 2^octaves, chosen so that the archive just fits the limit. First the coarsest, then the finest allowed number of
+/// octaves.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
 /// Number of times that [`BYTES_OCTAVE_RANGE`] is halved to find the change.
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;

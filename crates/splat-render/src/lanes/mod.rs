@@ -77,9 +77,11 @@ pub(super) trait Lanes: Copy {
     /// Returns a vector whose group k has entry `first + k` of `values` in all of its lanes, where `values` is read as
     /// one list. `first` is a multiple of [`Lanes::GROUPS`].
     fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Loads a vector from the groups of `from` that begin at index `first`, a multiple of [`Lanes::GROUPS`].
+    /// Loads a vector from [`Lanes::GROUPS`] consecutive groups of `from` (arrays of eight values), the first of which
+    /// has index `first`, a multiple of [`Lanes::GROUPS`].
     fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Stores the vector to the groups of `to` that begin at index `first`, a multiple of [`Lanes::GROUPS`].
+    /// Stores the vector to [`Lanes::GROUPS`] consecutive groups of `to` (arrays of eight values), the first of which
+    /// has index `first`, a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
     /// Returns the sum of each lane.
     fn add(self, other: Self) -> Self;
@@ -173,7 +175,7 @@ pub(super) trait Sums: Copy {
     fn zero() -> Self;
     /// Returns the sum of `self` and `other` in each lane.
     fn plus(self, other: Self) -> Self;
-    /// Returns the sums of the eight lanes.
+    /// Returns the eight sums, one for each lane, without adding them to one another.
     fn values(self) -> [f32; LANES];
 
     /// Returns the total of the eight lanes, added in a fixed order.
