@@ -131,7 +131,7 @@ fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
     assert_eq!(films[0]["psnr"][shown["frame"].as_u64().unwrap() as usize], shown["psnr"]);
     // The base64 of an image may contain any letters.
     let written = |part: &str| part.split_once('"').map_or(part, |(_, after)| after).to_owned();
-    let words: String = page.split("data:image/png;base64,").map(written).collect();
+    let words: String = page.split(";base64,").map(written).collect();
     for none in ["NaN", "inf<", "inf,", ">-0<"] {
         assert!(!words.contains(none), "{none} is no number");
     }

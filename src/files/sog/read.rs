@@ -86,7 +86,7 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
         let value = |book: &Codebook, pixel: [u8; 4], image: &str| {
             decode_by_codebook(book, pixel).ok_or_else(|| {
                 let expected = format!("indices below {}, the length of the codebook", book.entries().len());
-                Error::input(path, at(i, image), expected, format!("{:?}", &pixel[..3]))
+                Error::input(path, at(i, image), expected, format!("{}, {}, {}", pixel[0], pixel[1], pixel[2]))
             })
         };
         gaussians.position.set_row(i, decode_position(&range, low.pixels[i], high.pixels[i]));
@@ -265,7 +265,12 @@ fn read_palette(entry: &PaletteEntry, image: &RgbaImage, path: &Path) -> Result<
         for &pixel in palette_entry(image, label).unwrap_or_default() {
             values.extend(decode_by_codebook(&book, pixel).ok_or_else(|| {
                 let expected = format!("indices below {}, the length of the codebook", book.entries().len());
-                Error::input(path, format!("{name}, entry {label}"), expected, format!("{:?}", &pixel[..3]))
+                Error::input(
+                    path,
+                    format!("{name}, entry {label}"),
+                    expected,
+                    format!("{}, {}, {}", pixel[0], pixel[1], pixel[2]),
+                )
             })?);
         }
     }
