@@ -525,6 +525,6 @@ fn stages_print_once_and_undone_merging_is_left_out() {
         run.stderr.lines().any(|line| line.starts_with("merging  left out: PSNR on scored views at the same "))
     };
     let undone =
-        ["0.2 --no-refine", "0.6 --no-refine", "0.4 --set refine_steps=20 --set refine_cut_steps=5"].map(compress);
+        ["0.2 --no-refine", "0.8 --no-refine", "0.4 --set refine_steps=20 --set refine_cut_steps=5"].map(compress);
     assert_eq!(undone, [false, true, false]);
 }
