@@ -245,7 +245,8 @@ fn accessor<'a>(
     };
     let width = component_bytes(component).filter(|_| allowed.contains(&component));
     let Some(width) = width else {
-        return Err(wrong(format!("one of the component types {allowed:?}"), component.to_string()));
+        let allowed = allowed.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        return Err(wrong(format!("one of the component types {allowed}"), component.to_string()));
     };
     let components = match kind {
         "SCALAR" => 1,
