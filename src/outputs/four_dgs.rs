@@ -65,9 +65,9 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Rounds positions and velocities to the quantization grid of the file. The encoder compares decoded values with its
-/// bounds without allowing for their rounding to f32. For coordinates of a few units, this rounding would move values
-/// half a step away from the grid beyond the bound.
+/// Rounds positions, velocities, colors and opacities to the quantization grid of the file. The encoder compares decoded
+/// values with its bounds without allowing for their rounding to f32. For coordinates of a few units, this rounding would
+/// move values half a step away from the grid beyond the bound. Colors of 8 bits are half a step away if they are odd.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
@@ -88,6 +88,12 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
         let window = f64::from(set.win_hi[i]) - f64::from(set.win_lo[i]);
         let class = life_class(0, steps.sigma_log, true, window, support_k(options.cutoff));
         motion.iter_mut().for_each(|value| snap(value, 0.0, motion_step(class, steps.motion)));
+    }
+    for color in set.colors.as_chunks_mut::<4>().0 {
+        for (value, step) in color.iter_mut().zip([steps.rgb, steps.rgb, steps.rgb, steps.alpha]) {
+            snap(value, 0.0, step);
+            *value = value.clamp(0.0, 1.0);
+        }
     }
 }
 
@@ -140,6 +146,28 @@ mod tests {
     use crate::diagnostics::demo_scene::Scene;
     use crate::model::{Attributes, opacity};
     use crate::passes::gather_all;
+
+    #[test]
+    fn colors_of_eight_bits_are_written() {
+        let byte = |k: usize| k as f32 / 255.0;
+        let mut set = GaussianSet {
+            positions: (0..256).flat_map(|k| [k as f32, 0.0, 0.0]).collect(),
+            scales: vec![0.1; 3 * 256],
+            rotations: [0.0, 0.0, 0.0, 1.0].repeat(256),
+            colors: (0..256).flat_map(|k| [byte(k), byte(255 - k), byte(k), byte(k)]).collect(),
+            motions: vec![0.0; 3 * 256],
+            mu_t: vec![0.0; 256],
+            sigma_t: vec![f32::INFINITY; 256],
+            win_lo: vec![0.0; 256],
+            win_hi: vec![1.0; 256],
+            ..GaussianSet::default()
+        };
+        let (exact, options) = (set.colors.clone(), WriteOptions::default());
+        snap_to_grid(&mut set, &options);
+        write_to_vec(&set, 1.0, &options, &SceneExtras::default()).unwrap();
+        let largest = set.colors.iter().zip(&exact).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(largest <= 1.0001 / 255.0, "colors differ by {largest}");
+    }
 
     #[test]
     fn a_reader_of_the_format_finds_every_visible_gaussian() {
