@@ -66,7 +66,8 @@ fn check_killed_runs(gaussians: usize, kills: usize) {
     while done < kills {
         runs += 1;
         let (work, target) = (workplace.path(&format!("work{runs}")), format!("killed{runs}.gseq"));
-        let arguments = format!("{RUN} -o {target} --cache work{runs}");
+        // A run may be killed after it has written its output.
+        let arguments = format!("{RUN} -o {target} --cache work{runs} --overwrite");
         let mut kept = BTreeMap::new();
         let ended = loop {
             let mut child = command(&workplace, &arguments).spawn().unwrap();
