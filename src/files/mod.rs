@@ -34,6 +34,8 @@ pub mod splat;
 pub mod splatv;
 pub mod spz;
 pub(crate) mod state_dict;
+#[cfg(test)]
+mod tests;
 pub mod text;
 pub mod tsog;
 pub mod webp;

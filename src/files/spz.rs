@@ -223,6 +223,7 @@ fn byte(value: f64) -> u8 {
 
 #[cfg(test)]
 mod tests {
+    use crate::files::tests::assert_signs_reverse_axes;
     use std::io::Read;
 
     use flate2::read::GzDecoder;
@@ -324,33 +325,8 @@ mod tests {
         assert!(write_spz(&state, SpzVersion::V3, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// Evaluates a color in the same direction in the original and in the reversed coordinate system; the signs in
-    /// [`AXIS_SIGNS`] must make both equal.
     #[test]
     fn sh_signs_match_the_reversed_axes() {
-        let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
-            [
-                -y,
-                z,
-                -x,
-                x * y,
-                -y * z,
-                2.0 * z * z - x * x - y * y,
-                -x * z,
-                x * x - y * y,
-                -y * (3.0 * x * x - y * y),
-                x * y * z,
-                -y * (4.0 * z * z - x * x - y * y),
-                z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
-                -x * (4.0 * z * z - x * x - y * y),
-                z * (x * x - y * y),
-                -x * (x * x - 3.0 * y * y),
-            ]
-        };
-        let direction = [0.48, -0.6, 0.64];
-        let turned = basis([direction[0], -direction[1], -direction[2]]);
-        for (k, (a, b)) in basis(direction).iter().zip(turned).enumerate() {
-            assert!((a * f64::from(AXIS_SIGNS[k]) - b).abs() < 1e-12, "function {k}");
-        }
+        assert_signs_reverse_axes(AXIS_SIGNS, [1.0, -1.0, -1.0]);
     }
 }

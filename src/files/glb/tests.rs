@@ -7,18 +7,14 @@ use serde_json::{Value, json};
 
 use super::read::read_glb;
 use super::write::write_glb;
-use crate::diagnostics::demo_scene::Scene;
 use crate::error::Error;
+use crate::files::tests::{assert_signs_reverse_axes, gaussians_with_sh};
 use crate::limits::ReadLimit;
-use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
-use crate::passes::gather_all;
+use crate::model::{Gaussians, opacity};
 
 /// Returns 30 Gaussians without any symmetry, with SH degree `degree`.
 fn gaussians(degree: usize) -> Gaussians {
-    let mut state = gather_all(&Scene::new(30, 1), 0, Attributes::all()).unwrap();
-    state.sh = AttributeValues::zeros(3 * sh_coefficients(degree), 30);
-    state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
-    state
+    gaussians_with_sh(30, degree)
 }
 
 /// Returns the JSON text of a file and the rest of its bytes.
@@ -60,32 +56,9 @@ fn attributes_are_read_back() {
     }
 }
 
-/// Evaluates a color in the same direction in both axes; the signs must make both equal.
 #[test]
 fn sh_signs_match_the_reversed_axes() {
-    let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
-        [
-            -y,
-            z,
-            -x,
-            x * y,
-            -y * z,
-            2.0 * z * z - x * x - y * y,
-            -x * z,
-            x * x - y * y,
-            -y * (3.0 * x * x - y * y),
-            x * y * z,
-            -y * (4.0 * z * z - x * x - y * y),
-            z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
-            -x * (4.0 * z * z - x * x - y * y),
-            z * (x * x - y * y),
-            -x * (x * x - 3.0 * y * y),
-        ]
-    };
-    let turned = basis([-0.48, 0.6, 0.64]);
-    for (k, (a, b)) in basis([0.48, -0.6, 0.64]).iter().zip(turned).enumerate() {
-        assert!((a * f64::from(super::AXIS_SIGNS[k]) - b).abs() < 1e-12, "function {k}");
-    }
+    assert_signs_reverse_axes(super::AXIS_SIGNS, [-1.0, -1.0, 1.0]);
 }
 
 #[test]

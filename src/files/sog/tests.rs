@@ -14,17 +14,16 @@ use super::read::read_sog;
 use super::write::write_sog;
 use crate::diagnostics::demo_scene::Scene;
 use crate::error::Error;
+use crate::files::tests::gaussians_with_sh;
 use crate::limits::ReadLimit;
-use crate::model::{AttributeValues, Attributes, Gaussians, color, opacity, sh_coefficients};
+use crate::model::{Attributes, Gaussians, color, opacity};
 use crate::passes::gather_all;
 
 /// Returns `count` Gaussians without any symmetry, with SH degree `degree`.
 fn gaussians(count: usize, degree: usize) -> Gaussians {
-    let mut state = gather_all(&Scene::new(count, 1), 0, Attributes::all()).unwrap();
-    let dc = state.sh.planes()[..3 * count].to_vec();
-    state.sh = AttributeValues::zeros(3 * sh_coefficients(degree), count);
-    state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
-    state.sh.planes_mut()[..3 * count].copy_from_slice(&dc);
+    let mut state = gaussians_with_sh(count, degree);
+    let plain = gather_all(&Scene::new(count, 1), 0, Attributes::SH).unwrap();
+    state.sh.planes_mut()[..3 * count].copy_from_slice(&plain.sh.planes()[..3 * count]);
     state.position.plane_mut(0).iter_mut().for_each(|x| *x = 40.0 * *x + 100.0);
     state
 }

@@ -264,17 +264,13 @@ mod tests {
     use flate2::write::GzEncoder;
 
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
     use crate::files::spz::{SpzVersion, write_spz};
-    use crate::model::{AttributeValues, Attributes, opacity};
-    use crate::passes::gather_all;
+    use crate::files::tests::gaussians_with_sh;
+    use crate::model::{AttributeValues, opacity};
 
     /// Returns Gaussians whose attributes have no symmetry, with SH degree `degree`.
     fn gaussians(degree: usize) -> Gaussians {
-        let mut state = gather_all(&Scene::new(200, 1), 0, Attributes::all()).unwrap();
-        state.sh = AttributeValues::zeros(3 * sh_coefficients(degree), 200);
-        state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
-        state
+        gaussians_with_sh(200, degree)
     }
 
     #[test]
