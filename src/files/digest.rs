@@ -12,6 +12,16 @@ use crate::error::{Error, Result};
 /// Number of bytes that are read and hashed at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
+/// Returns a digest of the bytes of the files `paths`, one after the other, as 32 hexadecimal digits.
+///
+/// # Errors
+/// Fails if a file cannot be read.
+pub(crate) fn digest_of_files<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<String> {
+    let mut hash = Xxh3::new();
+    paths.into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
+    Ok(format!("{:032x}", hash.digest128()))
+}
+
 /// Adds the bytes of the file at `path` to `hash`.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
     hash_rest(&mut open_file(path)?, path, hash)

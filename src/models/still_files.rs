@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::ply_sequence::open_frames;
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::size::bytes_read_for;
 use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
@@ -175,11 +175,6 @@ impl InputModel for StillFiles {
 
     fn bytes(&self) -> Result<u64> {
         bytes_read_for(files_of(&self.paths)?.iter().map(PathBuf::as_path))
-    }
-
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
-        let _ = kind;
-        Ok(Size::from_frames(bytes_below(path)?))
     }
 
     fn stored_bytes(&self) -> Result<u64> {

@@ -2,11 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use xxhash_rust::xxh3::Xxh3;
-
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::files::state_dict::{is_pair, names, read_state_dict};
 use crate::limits::ReadLimit;
 use crate::models::iterations::iteration_numbers;
@@ -124,10 +122,6 @@ impl Paths {
     /// Returns the xxh3-128 hash of the bytes of the point cloud file, the network and `cfg_args`, as 32 hex digits.
     /// Fails if a file cannot be read.
     pub(super) fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        [&self.point_cloud, &self.network, &self.cfg_args]
-            .into_iter()
-            .try_for_each(|path| hash_file(path, &mut hash))?;
-        Ok(format!("{:032x}", hash.digest128()))
+        digest_of_files([&*self.point_cloud, &*self.network, &*self.cfg_args])
     }
 }

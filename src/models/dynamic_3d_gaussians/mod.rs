@@ -8,13 +8,11 @@ mod proxies;
 
 use std::path::{Path, PathBuf};
 
-use xxhash_rust::xxh3::Xxh3;
-
 use super::size::bytes_read_for;
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::Result;
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians, SH_C0, color};
@@ -57,9 +55,7 @@ impl InputModel for Params {
     }
 
     fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        hash_file(&self.path(), &mut hash)?;
-        Ok(format!("{:032x}", hash.digest128()))
+        digest_of_files([&*self.path()])
     }
 
     fn bytes(&self) -> Result<u64> {

@@ -275,20 +275,35 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         if kind == OutputKind::Model {
             return self.write_model(reduction, path).map(|()| Vec::new());
         }
-        match write_windowed(&self.model, reduction, kind, path)? {
-            Some(notes) => Ok(notes),
-            None => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
-        }
+        write_frames(&self.model, reduction, kind, path, limits.frames_held, events)
+    }
+}
+
+/// Writes the compressed model `reduction` of `model` to `path` as `kind`, an output with frames. Its motion is stored
+/// without a fit if `kind` can do so. Readers keep at most `held` frames. Returns notes for the user.
+///
+/// # Errors
+/// Fails if the format cannot hold the values or the file cannot be written.
+pub(super) fn write_frames<L: ProxyRule>(
+    model: &MotionModelFrames<L>,
+    reduction: &CompressedModel,
+    kind: OutputKind,
+    path: &Path,
+    held: usize,
+    events: &Events,
+) -> Result<Vec<String>> {
+    match write_windowed(model, reduction, kind, path)? {
+        Some(notes) => Ok(notes),
+        None => write_sequence(&model.reduced(reduction), kind, path, held, events),
     }
 }
 
 /// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store the
-/// motion of the model. Returns notes for the user, or `None` if the model
-/// has to be fitted.
+/// motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.
-pub(super) fn write_windowed<L: ProxyRule>(
+fn write_windowed<L: ProxyRule>(
     model: &MotionModelFrames<L>,
     reduction: &CompressedModel,
     kind: OutputKind,

@@ -18,8 +18,6 @@ use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use xxhash_rust::xxh3::Xxh3;
-
 use super::files::copy;
 use super::iterations::find_iteration;
 use super::size::{Size, bytes_below, bytes_read_for};
@@ -27,7 +25,7 @@ use super::trajectories::{NO_ARCHIVE, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, quoted};
 use crate::files::cameras::Clock;
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::files::open::open_file;
 use crate::files::python_literal::{Literal, parse_call};
 use crate::files::state_dict::read_state_dict;
@@ -241,10 +239,8 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        hash_file(&self.files.cloud, &mut hash)?;
-        self.files.other_files().iter().try_for_each(|path| hash_file(path, &mut hash))?;
-        Ok(format!("{:032x}", hash.digest128()))
+        let other_files = self.files.other_files();
+        digest_of_files([&*self.files.cloud].into_iter().chain(other_files.iter().map(AsRef::as_ref)))
     }
 
     fn bytes(&self) -> Result<u64> {

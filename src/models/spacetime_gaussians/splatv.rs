@@ -7,8 +7,6 @@
 use std::fs;
 use std::path::Path;
 
-use xxhash_rust::xxh3::Xxh3;
-
 use super::common::{check_kind, residence};
 use super::decoder::ColorActivation;
 use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
@@ -18,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::files::accuracy::Accuracy;
 use crate::files::cameras::Clock;
 use crate::files::defects::Defects;
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::files::json::read_json;
 use crate::files::splatv::rows::{has_zero_quaternion, inspect, repair};
 use crate::files::splatv::write::{default_cameras, measure, words, write as write_file};
@@ -156,9 +154,7 @@ impl InputModel for SplatvModel {
     }
 
     fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        hash_file(self.file.path(), &mut hash)?;
-        Ok(format!("{:032x}", hash.digest128()))
+        digest_of_files([self.file.path()])
     }
 
     fn bytes(&self) -> Result<u64> {

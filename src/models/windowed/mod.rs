@@ -9,16 +9,14 @@ mod tsog;
 
 use std::path::{Path, PathBuf};
 
-use xxhash_rust::xxh3::Xxh3;
-
-use super::in_checkpoint::{ProxyRule, write_windowed};
+use super::in_checkpoint::{ProxyRule, write_frames};
 use super::motion_model::{MotionModelFrames, solve};
 use super::size::{Size, bytes_below, bytes_read_for};
-use super::trajectories::{NO_ARCHIVE, state_bytes, write_sequence};
+use super::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::limits::Limits;
 use crate::model::{Attributes, Jacobian};
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
@@ -55,9 +53,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
     }
 
     fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        hash_file(&self.path, &mut hash)?;
-        Ok(format!("{:032x}", hash.digest128()))
+        digest_of_files([&*self.path])
     }
 
     fn bytes(&self) -> Result<u64> {
@@ -152,10 +148,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        match write_windowed(&self.model, reduction, kind, path)? {
-            Some(notes) => Ok(notes),
-            None => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
-        }
+        write_frames(&self.model, reduction, kind, path, limits.frames_held, events)
     }
 }
 

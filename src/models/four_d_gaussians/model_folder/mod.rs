@@ -8,19 +8,17 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use rayon::prelude::*;
-use xxhash_rust::xxh3::Xxh3;
-
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BLOCK, BlockSlices, BlockwiseReader};
 use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, ReadPlan, Reads};
+use rayon::prelude::*;
 
 use super::cfg_args::ModelConfig;
 use super::small_field::rounded;
-use crate::files::digest::hash_file;
+use crate::files::digest::digest_of_files;
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::state_dict::read_state_dict;
 use crate::models::iterations::find_iteration;
@@ -82,9 +80,7 @@ impl ModelPaths {
     /// # Errors
     /// Fails if a file cannot be read.
     pub fn digest(&self) -> Result<String> {
-        let mut hash = Xxh3::new();
-        self.required().into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
-        Ok(format!("{:032x}", hash.digest128()))
+        digest_of_files(self.required())
     }
 }
 
