@@ -16,7 +16,7 @@ pub use gather::{BlockwiseReader, gather, gather_all};
 pub use held::HeldFrames;
 pub use parts::BlockSlices;
 pub use pictures::{Batch, RenderedSource, VIEWS_PER_THREAD, ViewStates, show};
-pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, spread, spread_over};
+pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, pixel_stride, spread, spread_over};
 pub use states::States;
 pub use tracks::{TRACK_BLOCK, tracks};
 

@@ -1,11 +1,23 @@
 //! Selection of the views of a schedule (list of the views at each frame) that a pass renders.
 
+use std::num::NonZeroU32;
+
 use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
 
 /// Number of views for which reading a frame is worth its time. A selection of few views takes this many of each frame,
 /// and so reads fewer frames.
 pub const VIEWS_PER_FRAME: usize = 3;
+
+/// Maximum stride of the pixels of a view. Beyond it the work per Gaussian dominates the time of a render.
+const MAX_PIXEL_STRIDE: u32 = 4;
+
+/// Returns the largest stride, up to 4, that leaves about `wanted` of the `pixels` pixels of a view if only every
+/// stride-th pixel in each direction is rendered.
+pub fn pixel_stride(pixels: u64, wanted: f64) -> NonZeroU32 {
+    let stride = (pixels as f64 / wanted.max(1.0)).sqrt();
+    NonZeroU32::new((stride as u32).min(MAX_PIXEL_STRIDE)).unwrap_or(NonZeroU32::MIN)
+}
 
 /// Selection of every n-th frame and of every m-th view in it, for frames that arrive one by one.
 #[derive(Debug, Clone)]

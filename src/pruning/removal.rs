@@ -7,19 +7,17 @@ use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, FrameView};
 use crate::passes::pictures::{RenderedSource, Workers};
+use crate::passes::pixel_stride;
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
 /// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. Other views change
 /// the ranking more than other pixels do.
 const PIXELS_PER_GAUSSIAN: f64 = 1.5;
-/// Maximum stride of the pixels of views by which Gaussians are ranked.
-const MAX_STRIDE: u32 = 4;
-
-/// Returns the stride of the pixels of views of `pixels` pixels by which `count` Gaussians are ranked.
+/// Returns the stride of the pixels of the views by which `count` Gaussians are ranked. `pixels`: number of pixels of a
+/// view.
 pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
-    let stride = (pixels as f64 / (PIXELS_PER_GAUSSIAN * count.max(1) as f64)).sqrt();
-    NonZeroU32::new((stride as u32).min(MAX_STRIDE)).unwrap_or(NonZeroU32::MIN)
+    pixel_stride(pixels, PIXELS_PER_GAUSSIAN * count as f64)
 }
 
 /// Renders the Gaussians `ids` alone and returns for each of them the [`RemovalError`], the squared error that removing

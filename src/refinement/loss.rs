@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::targets::{mean_square, wide};
 use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim, ssim_gradient};
+use crate::passes::pixel_stride;
 use crate::render::Image;
 
 /// Factor of the mean square error in the loss. With it, the squared error and 1 − SSIM contribute about equally at 35
@@ -14,8 +15,6 @@ const SQUARED_WEIGHT: f64 = 20.0;
 /// Number of rendered pixels of a training view per survivor (Gaussian left by pruning) that is enough: with a stride
 /// that leaves 2 pixels or more, refinement loses at most 0.1 dB.
 const PIXELS_PER_GAUSSIAN: f64 = 2.5;
-/// Maximum stride of the pixels of training views. Beyond it the work per Gaussian dominates.
-const MAX_STRIDE: u32 = 4;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -54,12 +53,14 @@ impl Loss {
         slope
     }
 
-    /// Returns the stride of the pixels of training views of `pixels` pixels if `survivors` Gaussians are left. It is 1 if
-    /// SSIM is part of the loss, because SSIM needs neighboring pixels.
+    /// Returns the stride at which the pixels of training views are rendered and compared. `pixels`: number of pixels of
+    /// a view. `survivors`: number of Gaussians left by pruning. It is 1 if SSIM is part of the loss, because SSIM needs
+    /// neighboring pixels.
     pub(super) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
-        let stride = (pixels as f64 / (PIXELS_PER_GAUSSIAN * survivors.max(1) as f64)).sqrt();
-        let most = if self.ssim > 0.0 { 1 } else { MAX_STRIDE };
-        NonZeroU32::new((stride as u32).min(most)).unwrap_or(NonZeroU32::MIN)
+        match self.ssim > 0.0 {
+            true => NonZeroU32::MIN,
+            false => pixel_stride(pixels, PIXELS_PER_GAUSSIAN * survivors as f64),
+        }
     }
 
     /// Returns the mean square error of the render `picture`, and its 1 − SSIM, or 0 if SSIM is not part of the loss.

@@ -11,7 +11,7 @@ use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
-use crate::model::{Attributes, Gaussians, Gradients, SequenceInfo, StoredParams};
+use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, SequenceInfo, StoredParams};
 use crate::passes::States;
 use crate::refinement::optimizer::{Adam, RateSchedule};
 use crate::render::{RemovalError, Renderer};
@@ -262,15 +262,11 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Returns the positions of all Gaussians at the first frame of the target views, deltas included.
-    pub(super) fn positions(&self) -> Vec<[f32; 3]> {
-        let Some(LinearizedState { state, .. }) = self.linearized.first() else { return Vec::new() };
-        let change = &self.descent.change().0.position;
-        let moved = |i: usize| {
-            let [mut at, by] = [state.position.row::<3>(i), if change.is_empty() { [0.0; 3] } else { change.row(i) }];
-            at.iter_mut().zip(by).for_each(|(at, by)| *at += by);
-            at
-        };
-        (0..state.len()).map(moved).collect()
+    pub(super) fn positions(&self) -> AttributeValues {
+        let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
+        let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
+        self.descent.change().add_to(&mut moved, Attributes::POSITION);
+        moved.position
     }
 
     /// Restarts the optimizer from the total delta `change`, an earlier result of [`OptimizerState::change`] with the

@@ -1,6 +1,7 @@
 //! Choice of the Gaussians that a prune step removes.
 
 use crate::merging::tree::{Nearest, Tree, TreePoint};
+use crate::model::AttributeValues;
 
 /// Number of candidates for removal, as a multiple of the number of Gaussians to remove.
 const CANDIDATES: f64 = 1.6;
@@ -12,12 +13,13 @@ const CANDIDATES: f64 = 1.6;
 /// Gaussians are removed in order of increasing error, equal errors by decreasing index. A removed Gaussian protects its
 /// nearest neighbor, because each error assumes that all others remain, and two neighbors that cover for each other
 /// would otherwise both be removed. If that leaves too few candidates, protected ones are removed too.
-pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &[[f32; 3]]) -> Vec<u32> {
+pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &AttributeValues) -> Vec<u32> {
     let removed_count = errors.len().saturating_sub(count);
     let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();
     ranked.sort_by_key(|&i| (fixed[i as usize], errors[i as usize], std::cmp::Reverse(i)));
     let candidates = &ranked[..((CANDIDATES * removed_count as f64) as usize).min(ranked.len())];
-    let mut points: Vec<TreePoint> = (0..).zip(positions).map(|(index, &at)| TreePoint { at, index }).collect();
+    let point = |index: u32| TreePoint { at: positions.row(index as usize), index };
+    let mut points: Vec<TreePoint> = (0..errors.len() as u32).map(point).collect();
     points.retain(|point| point.at.iter().all(|x| x.is_finite()));
     let (tree, mut nearest) = (Tree::new(&mut points), Nearest::default());
     let mut is_protected = vec![false; errors.len()];
@@ -32,7 +34,7 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
         }
         is_removed[i as usize] = true;
         left -= 1;
-        nearest.start(i, positions[i as usize], 1, f64::INFINITY);
+        nearest.start(i, positions.row(i as usize), 1, f64::INFINITY);
         tree.search(&points, &mut nearest);
         if let Some(&(_, neighbor)) = nearest.sorted().first() {
             is_protected[neighbor as usize] = true;
@@ -52,8 +54,8 @@ mod tests {
     use super::*;
 
     /// Returns positions on a line, one per coordinate of `along`.
-    fn line(along: &[f32]) -> Vec<[f32; 3]> {
-        along.iter().map(|&x| [x, 0.0, 0.0]).collect()
+    fn line(along: &[f32]) -> AttributeValues {
+        AttributeValues::from_planes(3, [along, &vec![0.0; 2 * along.len()]].concat())
     }
 
     #[test]
@@ -81,7 +83,7 @@ mod tests {
 
     #[test]
     fn positions_that_are_not_finite_are_accepted() {
-        let positions = [[f32::NAN; 3], [f32::INFINITY, 0.0, 0.0], [0.0; 3], [0.0; 3]];
+        let positions = line(&[f32::NAN, f32::INFINITY, 0.0, 0.0]);
         assert_eq!(survivors(&[1, 2, 3, 4], 2, &[false; 4], &positions), [2, 3]);
     }
 }

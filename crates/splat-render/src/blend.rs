@@ -40,8 +40,6 @@ pub(super) struct SampledPixels {
     across: usize,
     /// Number of rows.
     down: usize,
-    /// Whether the pixels are those of a grid with a stride above 1.
-    is_strided: bool,
 }
 
 impl SampledPixels {
@@ -63,7 +61,7 @@ impl SampledPixels {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
             [xs[half][0], xs.as_flattened()[last]]
         });
-        SampledPixels { x0, y0, xs, ys, spans, across, down, is_strided: grid.stride() > 1 }
+        SampledPixels { x0, y0, xs, ys, spans, across, down }
     }
 
     /// Returns which groups of [`LANES`] neighboring pixels in a row of the tile contain a pixel of the render, one bit
@@ -313,7 +311,7 @@ impl TileFootprint {
                 footprint.groups |= V::bits(nearest.at_least(floor)) << (column * SIDE + first * LANES);
             }
         }
-        if sampled.is_strided && splat.drawn_tiles != Splat::UNBOUNDED && footprint.groups != 0 {
+        if splat.drawn_tiles != Splat::UNBOUNDED && footprint.groups != 0 {
             footprint.exclude_tiles(splat, sampled);
         }
         footprint

@@ -45,6 +45,8 @@ pub(super) struct CameraTerms {
     pub(super) center: [f64; 3],
     /// Width and height of the full image, pixels.
     image_size: [u32; 2],
+    /// Numbers of tiles across and down the full image.
+    image_tiles: [u32; 2],
     /// Pixels of the image that are rendered.
     pub(super) grid: PixelGrid,
     /// Numbers of columns and rows of `grid`: the size of the render.
@@ -74,6 +76,7 @@ impl CameraTerms {
             ],
             center: camera.center().to_array(),
             image_size,
+            image_tiles: image_size.map(|pixels| pixels.div_ceil(TILE)),
             grid,
             size,
             tiles: size.map(|pixels| pixels.div_ceil(TILE)),
@@ -302,7 +305,7 @@ impl ProjectedSplats {
         // touch.
         let root = cutoff.sqrt();
         let (radius, half) = (self.radius[i], [root * self.half_u[i], root * self.half_v[i]]);
-        let image_tiles = view.image_size.map(|pixels| pixels.div_ceil(TILE));
+        let image_tiles = view.image_tiles;
         let (x0, x1) = tile_range(u, radius, half[0], image_tiles[0]);
         let (y0, y1) = tile_range(v, radius, half[1], image_tiles[1]);
         if x0 >= x1 || y0 >= y1 {

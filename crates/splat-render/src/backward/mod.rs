@@ -44,8 +44,9 @@ impl Renderer {
     /// attributes of `gaussians` to `out`.
     ///
     /// `loss` gets the image and returns the loss and its derivative with respect to each value of the image. Returns
-    /// the loss. If `view` renders a grid of pixels, the image has the size of the grid, and the derivatives are those of the
-    /// loss of these pixels alone. Results have the same bits for any number of threads. A pixel whose color or derivative is not finite
+    /// the loss. If `view` renders a grid of pixels, the image has the size of the grid, and the derivatives are those
+    /// of the loss of these pixels alone. Results have the same bits for any number of threads. A pixel whose color or
+    /// derivative is not finite
     /// has no effect on gradients. Gaussians that are not visible get gradient 0.
     ///
     /// # Panics
