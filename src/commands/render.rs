@@ -33,7 +33,7 @@ pub enum RenderSelection {
     One {
         /// Frame of the sequence.
         frame: usize,
-        /// Number of the view (of the camera that shows it).
+        /// View number of the camera, as in the list of cameras.
         view: u32,
     },
     /// Every view of the set, to a folder, as files named `tNNN_vNN` (frame, view).

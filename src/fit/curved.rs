@@ -59,7 +59,7 @@ impl CurveForm {
     pub const CUBIC: CurveForm = CurveForm { is_linear: false, min_width: 0.0, max_intervals: 32 };
 
     /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
-    /// The higher coefficients of such a [`CubicTrack`] are 0.
+    /// A [`CubicTrack`] of this form has quadratic and cubic coefficients of 0.
     pub fn linear(min_width: f64) -> CurveForm {
         CurveForm { is_linear: true, min_width, max_intervals: 32 }
     }

@@ -101,7 +101,8 @@ fn side(count: usize) -> usize {
     (root + usize::from(root * root < count)).max(1)
 }
 
-/// Textures of one frame, with shuffled bytes.
+/// One frame of a `.gsd` before LZ4 compression. The bytes of its textures (images of the attributes of all Gaussians)
+/// are shuffled.
 struct PackedFrame {
     textures: Vec<u8>,
     /// Number of Gaussians in the textures.

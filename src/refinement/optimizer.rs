@@ -33,7 +33,7 @@ pub struct RateSchedule {
 
 impl RateSchedule {
     /// Creates the schedule of `steps` steps, at the end of which the rates have fallen to the fraction `last` of those
-    /// at the beginning. `error`: typical root mean square error of the renders at the start.
+    /// at the beginning. `error`: geometric mean of the root mean square errors of the views at the start.
     pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
         RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
