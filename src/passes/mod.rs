@@ -7,6 +7,7 @@ mod held;
 mod parts;
 pub(crate) mod pictures;
 mod sample;
+mod some_frames;
 mod states;
 mod tracks;
 
@@ -17,6 +18,7 @@ pub use held::HeldFrames;
 pub use parts::BlockSlices;
 pub use pictures::{Batch, RenderedSource, VIEWS_PER_THREAD, ViewStates, show};
 pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, pixel_stride, spread, spread_over};
+pub use some_frames::SomeFrames;
 pub use states::States;
 pub use tracks::{TRACK_BLOCK, tracks};
 

@@ -66,6 +66,7 @@ pub fn open_to_measure(
         open_scene(options)?
     };
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
+    scene.add_outside_views(stages.measure.scan.recipe.outside);
     let plan =
         Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
@@ -187,6 +188,7 @@ fn receive_measured(
         Some(measuring) => finish_measuring(measuring, &stages.measure, &mut scene)?,
         None => None,
     };
+    scene.add_outside_views(stages.measure.scan.recipe.outside);
     let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))

@@ -145,7 +145,7 @@ impl CameraSummary {
     pub fn from_scene(scene: &Scene) -> CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),
-            cameras: scene.schedule.cameras.len(),
+            cameras: scene.rig.cameras.len(),
             pairs: scene.schedule.pairs(),
         }
     }

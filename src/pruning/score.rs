@@ -198,7 +198,7 @@ impl ScoreStage {
                 reference,
                 position_ulp,
             };
-            scored.record(scene, median_life, journal);
+            scored.record(scene, median_life, scanned.is_partial, journal);
             progress.advance(info.count as u64);
             Ok((scored, info.count))
         })
@@ -333,8 +333,9 @@ impl Scored {
     }
 
     /// Writes to the journal which parts of scanning and scoring the scene did not need, how many Gaussians have
-    /// unusual values, and what can be done about short life spans.
-    fn record(&self, scene: &Scene, median_life: u32, journal: &mut Journal) {
+    /// unusual values, and what can be done about short life spans. If the scan `is_partial`, terms of motion and opacity
+    /// are not mentioned, because they were not measured.
+    fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {
             journal.notes.push(format!(
@@ -357,7 +358,8 @@ impl Scored {
         if info.sh_degree == 0 {
             journal.leave_out("SH coefficients above degree 0", "SH degree 0");
         }
-        for term in self.terms.iter().filter(|term| !term.norm.is_active()) {
+        let was_measured = |term: &&Term| !(is_partial && term.of.describes_motion());
+        for term in self.terms.iter().filter(was_measured).filter(|term| !term.norm.is_active()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
             journal.leave_out(format!("grading by {}", term.of.property()), why);
         }

@@ -16,8 +16,8 @@ pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
 pub use sections::{
     Anisotropy, AttributeGroups, Coverage, FieldParams, LengthUnit, LowPriority, MergeParams, MergePass, MotionParams,
-    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanParams, ScoreParams, SelectParams, ShDegreeParams,
-    ShDegreeRule, ShHigh, StaticTerm, Trajectory,
+    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanFrames, ScanParams, ScoreParams, SelectParams,
+    ShDegreeParams, ShDegreeRule, ShHigh, StaticTerm, Trajectory,
 };
 
 /// Text of the preset `paper`, with a comment on every parameter.
@@ -133,6 +133,7 @@ impl Recipe {
             self.merge;
         let mut checks = vec![
             ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
+            ("scan.outside", self.scan.outside, in_unit(self.scan.outside), "0 to 1"),
             ("score.w_static", self.score.w_static, weight(self.score.w_static), "0 to 1e6"),
             ("score.w_dynamic", self.score.w_dynamic, weight(self.score.w_dynamic), "0 to 1e6"),
             ("score.lambda", self.score.lambda, weight(self.score.lambda), "0 to 1e6"),

@@ -12,6 +12,8 @@ use crate::model::{Attributes, MAX_SH_DEGREE};
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct ScanParams {
+    pub scan_frames: ScanFrames,
+    pub outside: f64,
     pub alpha_min: f64,
     pub motion: MotionParams,
     pub snap_noise: bool,
@@ -21,6 +23,16 @@ pub struct ScanParams {
     pub frame_stride: NonZeroU32,
     pub look_pictures: usize,
     pub non_finite: NonFinite,
+}
+
+/// Frames that the scan reads.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ScanFrames {
+    /// Every frame.
+    All,
+    /// Few evenly spaced frames if the statistics of motion and opacity decide nothing, otherwise every frame.
+    Needed,
 }
 
 /// Definition of the steps from one frame to the next that count as motion of a Gaussian, and of the number by which

@@ -12,6 +12,7 @@ use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, sp
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
 use crate::scene::between::{SplitMix64, between};
+use crate::scene::outside::outside;
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
@@ -62,6 +63,10 @@ pub(crate) struct Targets {
     /// from 0 to 1 as 16-bit integers.
     values: Vec<(Range<usize>, Spill)>,
 }
+
+/// Fraction of the views from other cameras than those of the scene that are outside the rig if the quality there counts
+/// fully.
+const OUTSIDE_SHARE: f64 = 0.5;
 
 /// Purpose of a target view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -182,8 +187,8 @@ pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
-/// Chooses the cameras, and the views sorted by frame: views by which Gaussians are scored, and views from cameras in
-/// between.
+/// Chooses the cameras, and the views sorted by frame: views by which Gaussians are scored, views from cameras in
+/// between, and views outside the rig if these count ([`Scene::outside`]).
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
     let mut pictures = spread(&scene.schedule, scene_views, VIEWS_PER_FRAME);
@@ -193,7 +198,11 @@ fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>
         picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
     }
     let (seen, mut random) = (pictures.len(), SplitMix64(2));
-    for camera in between(&cameras, if seen == 0 { 0 } else { between_views }) {
+    let rig = scene.used_cameras();
+    let more_views = if seen == 0 { 0 } else { between_views };
+    let outer = outside(&rig, (OUTSIDE_SHARE * scene.outside * more_views as f64) as usize, 1.0 + scene.outside);
+    let inner = between(&rig, more_views - outer.len());
+    for camera in outer.into_iter().chain(inner) {
         let frame = pictures[random.below(seen)].frame;
         pictures.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);

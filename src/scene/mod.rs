@@ -6,6 +6,7 @@ mod compressed;
 mod frames;
 mod input;
 mod open;
+pub mod outside;
 pub mod path;
 pub mod photographs;
 pub mod pictures;
@@ -39,8 +40,10 @@ pub struct Scene {
     pub input: Box<dyn InputModel>,
     /// Cameras and the views they took, of all splits (training, validation, test).
     pub rig: Rig,
-    /// Views at each frame, from the cameras of the chosen split.
+    /// Views at each frame, from the cameras of the chosen split, and from cameras outside the rig if these were added.
     pub schedule: ViewSchedule,
+    /// How far outside the rig the quality of renders counts, see [`Scene::add_outside_views`]; 0: not at all.
+    pub outside: f64,
     /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside
     /// of a wall.
@@ -83,6 +86,7 @@ impl Scene {
             input,
             rig,
             schedule,
+            outside: 0.0,
             has_cameras: true,
             background,
             limits: Limits::NONE,

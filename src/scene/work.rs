@@ -26,6 +26,11 @@ impl Scene {
         Ok(())
     }
 
+    /// Makes the keys of cache entries depend on the views of the schedule, which changed after the cache was opened.
+    pub(super) fn depend_on_views(&mut self) {
+        self.work.follow_from(CacheKey::new(&self.schedule));
+    }
+
     /// Returns the digest (hash of the content) of the input.
     pub fn digest(&self) -> Result<String> {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)

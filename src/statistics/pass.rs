@@ -28,6 +28,9 @@ pub struct ScanResult {
     pub alive_per_frame: Vec<u32>,
     /// Largest |coordinate| of all positions in all frames, scene units.
     pub largest_coordinate: f32,
+    /// Whether only some frames were read. The trajectory magnitude D, the curvature κ and the opacity variance V are
+    /// then 0 for all Gaussians.
+    pub is_partial: bool,
 }
 
 /// Scans all frames of `source`: computes the statistics of all Gaussians, as seen by the cameras of `schedule`. Blocks
@@ -70,6 +73,20 @@ pub fn scan_blocks(
 }
 
 impl ScanResult {
+    /// Turns the result of a scan of the frames `frames` (increasing) into one for all `all` frames of the sequence. Life
+    /// spans grow in proportion. Frames that were not read have no Gaussians alive. Sets D, κ and V to 0, because steps
+    /// between the frames that were read are not the steps of the sequence.
+    pub fn for_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
+        let mut alive_per_frame = vec![0; all];
+        frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
+        let in_all = |life: u32| (life as usize * all).div_ceil(frames.len().max(1)) as u32;
+        self.rows.life.iter_mut().for_each(|life| *life = in_all(*life));
+        for values in [&mut self.rows.d, &mut self.rows.kappa, &mut self.rows.v] {
+            values.fill(0.0);
+        }
+        ScanResult { alive_per_frame, is_partial: true, ..self }
+    }
+
     /// Appends the result of a scan of the Gaussians that follow these, at the same frames.
     pub fn join(&mut self, mut other: ScanResult) {
         self.rows.append(&mut other.rows);
@@ -86,7 +103,7 @@ fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u3
         rows.append(&mut block);
         largest_coordinate = largest_coordinate.max(largest);
     }
-    ScanResult { rows, alive_per_frame, largest_coordinate }
+    ScanResult { rows, alive_per_frame, largest_coordinate, is_partial: false }
 }
 
 /// Scan of frames that arrive over time. It gives the same result as [`scan`], and takes the frames in groups, each of

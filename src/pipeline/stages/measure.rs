@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use super::rounds::Rounds;
 use super::scan::{self, ScanStage};
 use crate::error::Result;
 use crate::journal::Journal;
@@ -15,7 +16,7 @@ use crate::pipeline::stage::{
 use crate::pruning::score;
 use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
 use crate::pruning::visible::{self, Visible};
-use crate::recipe::{Coverage, Recipe};
+use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
 
@@ -44,14 +45,21 @@ pub struct Measure {
 impl Measure {
     /// Returns the stages for the request and the input of `planning`.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Measure {
-        Measure::new(&planning.request.recipe, planning.input.has_cameras, planning.user.clone())
+        let recipe = &planning.request.recipe;
+        let mut measure = Measure::new(recipe, planning.input.has_cameras, planning.user.clone());
+        // If rounds rank the Gaussians and their number is given, no threshold of the scores decides which of them stay.
+        measure.scan.can_be_partial = recipe.scan.scan_frames == ScanFrames::Needed
+            && planning.target.is_some()
+            && planning.prunes_by_views()
+            && Rounds::from_recipe(&recipe.select, planning.part()).is_some();
+        measure
     }
 
     /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own; `user` holds
     /// Gaussians that the user keeps or drops.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
-            scan: ScanStage { recipe: recipe.scan.clone() },
+            scan: ScanStage { recipe: recipe.scan.clone(), can_be_partial: false },
             visible: Visible::from_recipe(&recipe.scan, has_cameras),
             score: ScoreStage {
                 snap_noise: recipe.scan.snap_noise,
@@ -79,7 +87,7 @@ impl Measure {
         scene.set_absent(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
         let key = scene.work.key(&(
-            (&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user),
+            (&self.scan.recipe, self.scan.can_be_partial, self.visible.is_some(), snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
         let scored =

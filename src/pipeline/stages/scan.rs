@@ -4,10 +4,11 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::model::{Attributes, Rows};
-use crate::passes::BLOCK;
+use crate::model::{Attributes, Rows, ViewSchedule};
+use crate::passes::{BLOCK, SomeFrames};
 use crate::recipe;
 use crate::scene::Scene;
+use crate::source::FrameSource;
 use crate::statistics;
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::{ScanResult, scan_blocks, scan_units};
@@ -20,14 +21,27 @@ const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
 /// Processor time of projecting one Gaussian at one frame to a view, seconds (`benches/projection.rs`).
 const SECONDS_TO_PROJECT: f64 = 8e-9;
 
+/// Maximum number of frames that a partial scan reads. They give the bounds of positions and the fraction of views in
+/// which a Gaussian is on screen; neither decides which Gaussians stay.
+const PARTIAL_FRAMES: usize = 24;
+
 /// Stage that gathers the statistics of all Gaussians.
 #[derive(Debug, Clone)]
 pub struct ScanStage {
     /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
+    /// Whether the statistics of motion and opacity (D, κ and V) decide nothing in this run. If a deformation field also
+    /// gives the frames, few of them are read: its values change smoothly with time.
+    pub can_be_partial: bool,
 }
 
 impl ScanStage {
+    /// Returns the number of frames that the scan of a sequence of `frames` frames reads. `is_deformed`: whether a
+    /// deformation field gives the frames.
+    fn frames_read(&self, frames: usize, is_deformed: bool) -> usize {
+        if self.can_be_partial && is_deformed { frames.min(PARTIAL_FRAMES) } else { frames }
+    }
+
     /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
     /// statistics rows (one per Gaussian) of all blocks.
     pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
@@ -35,14 +49,15 @@ impl ScanStage {
         let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
+        let frames_read = self.frames_read(work.frames as usize, work.input.jacobian > 0) as f64;
         ResourceEstimate {
             stage: NAME,
-            reads: 1.0,
+            reads: if work.frames == 0 { 1.0 } else { frames_read / work.frames as f64 },
             seconds: work.pace.states
                 * work.count()
-                * work.frames as f64
+                * frames_read
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
-                + work.reading(work.count(), work.frames as f64),
+                + work.reading(work.count(), frames_read),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
                 ("blocks", work.threads * work.at_most(BLOCK as u64) * block),
@@ -52,18 +67,49 @@ impl ScanStage {
         }
     }
 
-    /// Reads all frames of `scene` and returns the statistics of every Gaussian.
+    /// Reads the frames of `scene` and returns the statistics of every Gaussian.
     ///
     /// # Errors
     /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
-        let source = scene.source();
+        let (source, info) = (scene.source(), scene.source().info());
+        let is_deformed = source.deformation().is_some();
+        let frames_read = self.frames_read(info.times.len(), is_deformed);
+        let with_views: Vec<usize> =
+            (0..).zip(scene.schedule.iter()).filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect();
+        let frames = evenly_spaced(&with_views, frames_read);
+        if frames.is_empty() || frames_read == info.times.len() {
+            let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
+            return self.scan_frames(scene, source, &scene.schedule, &plan, journal);
+        }
+        let some = SomeFrames::new(source, frames.clone());
+        let schedule = some.views(&scene.schedule);
+        let plan = ScanPlan::new(&self.recipe, &some.info().times, &schedule)?;
+        let found = self.scan_frames(scene, &some, &schedule, &plan, journal)?;
+        let why = format!(
+            "they decide nothing here; the scan read {} of {} frames, which give life spans, bounds and the check for NaN \
+             (--set scan_frames=all reads all)",
+            some.info().times.len(),
+            info.times.len()
+        );
+        journal.leave_out("statistics of motion and opacity (D, kappa, V)", why);
+        Ok(found.for_all_frames(&frames, info.times.len()))
+    }
+
+    /// Reads all frames of `source`, which are frames of `scene`, seen by the cameras of `schedule`.
+    fn scan_frames(
+        &self,
+        scene: &Scene,
+        source: &dyn FrameSource,
+        schedule: &ViewSchedule,
+        plan: &ScanPlan,
+        journal: &mut Journal,
+    ) -> Result<ScanResult> {
         let info = source.info();
-        let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
-        let compute = |blocks| scan_blocks(source, &scene.schedule, &plan, blocks, &scene.events);
+        let compute = |blocks| scan_blocks(source, schedule, plan, blocks, &scene.events);
         journal.stage(NAME, info.count, source, |_| {
             let units = scan_units(info);
-            let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
+            let found = scene.work.divided(NAME, scene.work.key(&(plan, &info.times)), units, compute, |parts| {
                 let mut all = ScanResult { alive_per_frame: vec![0; info.times.len()], ..ScanResult::default() };
                 for part in parts {
                     all.join(part?);
@@ -73,6 +119,12 @@ impl ScanStage {
             Ok((found, info.count))
         })
     }
+}
+
+/// Returns at most `count` of the frames `frames`, evenly spaced, the first and the last among them.
+fn evenly_spaced(frames: &[usize], count: usize) -> Vec<usize> {
+    let (count, last) = (count.min(frames.len()), frames.len().saturating_sub(1));
+    (0..count).map(|k| frames[k * last / (count - 1).max(1)]).collect()
 }
 
 #[cfg(test)]
@@ -85,7 +137,7 @@ mod tests {
     fn every_gaussian_gets_a_row_and_the_stage_is_recorded() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
+        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: false };
         let mut journal = Journal::default();
         let found = scan.run(&scene, &mut journal).unwrap();
         assert_eq!((found.rows.len(), found.alive_per_frame.len()), (1500, 6));
@@ -94,8 +146,39 @@ mod tests {
     }
 
     #[test]
+    fn chosen_frames_are_evenly_spaced() {
+        let all: Vec<usize> = (0..60).collect();
+        assert_eq!(evenly_spaced(&all, 4), [0, 19, 39, 59]);
+        assert_eq!(evenly_spaced(&all[..3], 24), [0, 1, 2]);
+        assert_eq!(evenly_spaced(&[7, 9, 30], 2), [7, 30]);
+        assert_eq!(
+            (evenly_spaced(&[5], 24), evenly_spaced(&all, 1), evenly_spaced(&[], 24)),
+            (vec![5], vec![0], vec![])
+        );
+    }
+
+    #[test]
+    fn only_frames_of_fields_are_scanned_partly() {
+        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: true };
+        assert_eq!([scan.frames_read(300, true), scan.frames_read(10, true)], [PARTIAL_FRAMES, 10]);
+        assert_eq!(scan.frames_read(300, false), 300);
+        assert_eq!(ScanStage { can_be_partial: false, ..scan }.frames_read(300, true), 300);
+    }
+
+    #[test]
+    fn partial_scan_stands_for_all_frames() {
+        let rows =
+            Rows { life: vec![3, 1, 0], d: vec![2.0; 3], kappa: vec![1.0; 3], v: vec![0.1; 3], ..Rows::default() };
+        let found = ScanResult { rows, alive_per_frame: vec![1, 2, 1], ..ScanResult::default() };
+        let all = found.for_all_frames(&[0, 5, 9], 10);
+        assert_eq!(all.alive_per_frame, [1, 0, 0, 0, 0, 2, 0, 0, 0, 1]);
+        assert_eq!((all.rows.life, all.rows.d, all.rows.v), (vec![10, 4, 0], vec![0.0; 3], vec![0.0; 3]));
+        assert!(all.is_partial);
+    }
+
+    #[test]
     fn memory_beside_rows_is_bounded_by_one_block() {
-        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
+        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: false };
         let need = |count| {
             let need = scan.need(&work(count), &Limits::NONE);
             (need.per_gaussian, need.fixed)

@@ -83,6 +83,12 @@ impl Quantity {
         }
     }
 
+    /// Returns whether the quantity describes how a Gaussian moves or how its opacity changes.
+    pub fn describes_motion(self) -> bool {
+        use Statistic::{D, Kappa, V};
+        matches!(self, Quantity::By(D | Kappa | V) | Quantity::Dynamic)
+    }
+
     /// Returns in words which property of a Gaussian the quantity measures.
     pub fn property(self) -> &'static str {
         match self {

@@ -1,0 +1,61 @@
+//! Some frames of a source, seen as a sequence of their own.
+
+use crate::error::Result;
+use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
+
+/// Source of some frames of another source. Frame k of this source is the k-th of the chosen frames.
+pub struct SomeFrames<'a> {
+    source: &'a dyn FrameSource,
+    /// Chosen frames of `source`, increasing.
+    frames: Vec<usize>,
+    info: SequenceInfo,
+}
+
+impl<'a> SomeFrames<'a> {
+    /// Creates a source of the frames `frames` of `source`, which must increase.
+    pub fn new(source: &'a dyn FrameSource, frames: Vec<usize>) -> SomeFrames<'a> {
+        let times = frames.iter().map(|&frame| source.info().times[frame]).collect();
+        SomeFrames { source, info: SequenceInfo { times, ..source.info().clone() }, frames }
+    }
+
+    /// Returns the views of `schedule`, a schedule for all frames of the other source, at the chosen frames.
+    pub fn views(&self, schedule: &ViewSchedule) -> ViewSchedule {
+        let mut chosen = ViewSchedule::default();
+        chosen.cameras.clone_from(&schedule.cameras);
+        for (frame, views) in schedule.iter().enumerate() {
+            if self.frames.binary_search(&frame).is_ok() {
+                chosen.push(1, views);
+            }
+        }
+        chosen
+    }
+}
+
+impl FrameSource for SomeFrames<'_> {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let mut reader = self.source.open(ids)?;
+        reader.expect(&ReadPlan::new(self.frames.iter().copied()));
+        Ok(Box::new(SomeFramesReader { reader, frames: &self.frames }))
+    }
+
+    fn reads(&self) -> Reads {
+        self.source.reads()
+    }
+}
+
+/// Reader of a block of Gaussians at the chosen frames.
+struct SomeFramesReader<'a> {
+    reader: Box<dyn BlockReader + 'a>,
+    frames: &'a [usize],
+}
+
+impl BlockReader for SomeFramesReader<'_> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+        self.reader.read(self.frames[frame], want, out)
+    }
+}

@@ -1,0 +1,231 @@
+//! Cameras outside the rig of a scene: viewing directions that none of its cameras, and no path between two of them,
+//! has. In a player or in VR, people move there.
+
+use std::f64::consts::PI;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::Scene;
+use super::between::{SplitMix64, between, meeting_point};
+use crate::model::{Camera, ViewSchedule};
+
+/// View number of the views from cameras outside the rig, which no data set has.
+const VIEW_NUMBER: u32 = u32::MAX;
+/// Number of different cameras outside the rig for each of them that a frame has, and their maximum number.
+const CAMERAS_PER_VIEW: usize = 8;
+const MAX_CAMERAS: usize = 64;
+/// Angle outside the rig from which a camera counts as outside, radians (2°).
+const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
+/// Number of random cameras that are tried for each new camera.
+const TRIES: usize = 64;
+/// Maximum number of directions that the search for the nearest direction of a rig tries, and the gain below which it
+/// ends.
+const MAX_DIRECTIONS: usize = 64;
+const EXACT_ENOUGH: f64 = 1e-12;
+
+/// Directions in which the cameras of a rig see the scene: the convex cone of the directions from the point where their
+/// optical axes meet to the cameras.
+pub struct RigCone {
+    focus: DVec3,
+    directions: Vec<DVec3>,
+}
+
+impl RigCone {
+    /// Returns the cone of the directions of `cameras`.
+    pub fn new(cameras: &[Camera]) -> RigCone {
+        let focus = meeting_point(cameras);
+        let direction = |camera: &Camera| (camera.center() - focus).try_normalize();
+        RigCone { focus, directions: cameras.iter().filter_map(direction).collect() }
+    }
+
+    /// Returns the angle in radians, 0 to π/2, between the direction of `camera` and the nearest direction of the cone.
+    /// It is 0 inside the cone, and for a camera at the point where the optical axes meet.
+    pub fn angle_outside(&self, camera: &Camera) -> f64 {
+        (camera.center() - self.focus).try_normalize().map_or(0.0, |direction| self.angle(direction))
+    }
+
+    /// Returns the angle in radians between the unit vector `direction` and the cone.
+    ///
+    /// The nearest point of the cone is Σ wᵢ·dᵢ for the weights wᵢ ≥ 0 that minimize ‖direction − Σ wᵢ·dᵢ‖, found by
+    /// the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23). At most three
+    /// weights are above 0. The remainder is perpendicular to the nearest point.
+    fn angle(&self, direction: DVec3) -> f64 {
+        let mut used: Vec<(DVec3, f64)> = Vec::new();
+        let mut rest = direction;
+        for _ in 0..MAX_DIRECTIONS {
+            let gain = |own: &&DVec3| own.dot(rest);
+            let best = self.directions.iter().max_by(|a, b| gain(a).total_cmp(&gain(b)));
+            let Some(best) = best.filter(|own| gain(own) > EXACT_ENOUGH) else { break };
+            let before = used.clone();
+            used.push((*best, 0.0));
+            if !fit_weights(&mut used, direction) {
+                used = before;
+                break;
+            }
+            rest = direction - used.iter().map(|(own, weight)| *own * *weight).sum::<DVec3>();
+        }
+        rest.length().atan2((direction - rest).length())
+    }
+}
+
+/// Sets the weights of the unit vectors `used` so that their weighted sum is as near to `direction` as weights above 0
+/// allow, and removes vectors without a weight. Returns false if the vectors are linearly dependent.
+fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
+    loop {
+        let Some(free) = least_squares(used, direction) else { return false };
+        // Fraction of the way from the present weights to the free ones at which the first weight becomes 0.
+        let limit = |(&(_, weight), &free): (&(DVec3, f64), &f64)| (free <= 0.0).then(|| weight / (weight - free));
+        let step = used.iter().zip(&free).filter_map(limit).fold(1.0, f64::min);
+        used.iter_mut().zip(&free).for_each(|((_, weight), free)| *weight += step * (free - *weight));
+        used.retain(|&(_, weight)| weight > 0.0);
+        if step >= 1.0 {
+            return true;
+        }
+    }
+}
+
+/// Returns the weights, of any sign, with which the sum of the unit vectors `used` is nearest to `direction`; `None` if
+/// the vectors are linearly dependent or more than three.
+fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
+    match *used {
+        [(a, _)] => Some(vec![a.dot(direction)]),
+        [(a, _), (b, _)] => {
+            let (cosine, to_a, to_b) = (a.dot(b), a.dot(direction), b.dot(direction));
+            let determinant = 1.0 - cosine * cosine;
+            let weights = || vec![(to_a - cosine * to_b) / determinant, (to_b - cosine * to_a) / determinant];
+            (determinant > EXACT_ENOUGH).then(weights)
+        }
+        [(a, _), (b, _), (c, _)] => {
+            let matrix = DMat3::from_cols(a, b, c);
+            let weights = || (matrix.inverse() * direction).to_array().to_vec();
+            (matrix.determinant().abs() > EXACT_ENOUGH).then(weights)
+        }
+        _ => None,
+    }
+}
+
+/// Returns at most `count` cameras outside the rig of `cameras`. Each is one of `cameras`, or a camera between two of
+/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from the
+/// mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly anything
+/// outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every run.
+pub fn outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
+    let cone = RigCone::new(cameras);
+    let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
+    let bases = [cameras, &between(cameras, count)].concat();
+    let mut random = SplitMix64(3);
+    let mut found = Vec::with_capacity(count);
+    for _ in 0..count * TRIES {
+        if found.len() == count {
+            break;
+        }
+        let base = &bases[random.below(bases.len())];
+        let offset = base.center() - cone.focus;
+        let factor = 1.0 + (max_factor - 1.0) * random.unit();
+        let Some(axis) = middle.cross(offset).try_normalize() else { continue };
+        let angle = middle.angle_between(offset);
+        let more = angle.min(PI - angle).min((factor - 1.0) * angle);
+        let turned = turned_about(base, cone.focus, DQuat::from_axis_angle(axis, more));
+        if cone.angle_outside(&turned) >= MIN_ANGLE {
+            found.push(turned);
+        }
+    }
+    found
+}
+
+/// Returns `camera` turned by `turn` about the point `focus`. The scene looks from there as it does from `camera` after
+/// a turn the other way.
+fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
+    let center = focus + turn * (camera.center() - focus);
+    let rotation = camera.rotation * DMat3::from_quat(turn).transpose();
+    Camera { rotation, translation: -(rotation * center), ..camera.clone() }
+}
+
+impl Scene {
+    /// Adds cameras outside the rig, so that Gaussians that only these see are kept, and refined. `reach`, from 0 to 1,
+    /// states how far outside the quality counts: the angles of the rig from its mean direction grow up to the factor
+    /// 1 + `reach`, and every frame gets `reach` times as many views outside the rig as it has inside. Adds none if
+    /// `reach` is 0 or the rig has no outside (see [`outside`]).
+    pub fn add_outside_views(&mut self, reach: f64) {
+        let most = self.schedule.max_views_per_frame();
+        let cameras = match reach > 0.0 {
+            true => outside(&self.used_cameras(), (CAMERAS_PER_VIEW * most).min(MAX_CAMERAS), 1.0 + reach),
+            false => Vec::new(),
+        };
+        if cameras.is_empty() {
+            if reach > 0.0 {
+                self.notes.push("outside: the cameras leave no views outside their rig to be added".to_owned());
+            }
+            return;
+        }
+        let (first, count) = (self.schedule.cameras.len(), cameras.len());
+        let mut schedule = ViewSchedule::new([&self.schedule.cameras[..], &cameras].concat());
+        let mut taken = 0;
+        for views in self.schedule.iter() {
+            let more = taken..taken + (reach * views.len() as f64).ceil() as usize;
+            taken = more.end;
+            let outside = more.map(|k| (VIEW_NUMBER, (first + k % count) as u32));
+            schedule.push(1, &views.iter().copied().chain(outside).collect::<Vec<_>>());
+        }
+        let rig_cameras = self.used_cameras().len();
+        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {rig_cameras}"));
+        (self.schedule, self.outside) = (schedule, reach);
+        self.depend_on_views();
+    }
+
+    /// Returns the cameras of the rig that take views of the schedule.
+    pub fn used_cameras(&self) -> Vec<Camera> {
+        let used = self.schedule.used().into_iter().map(|index| index as usize);
+        used.filter(|&index| index < self.rig.cameras.len()).map(|index| self.schedule.cameras[index].clone()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns cameras on an arc of `degrees` degrees around the origin, all at the height 1.
+    fn arc(count: usize, degrees: f64) -> Vec<Camera> {
+        let eye = |k: usize| {
+            let angle = (degrees * (k as f64 / (count - 1) as f64 - 0.5)).to_radians();
+            DVec3::new(4.0 * angle.sin(), -4.0 * angle.cos(), 1.0)
+        };
+        (0..count).map(|k| Camera::look_at(eye(k), DVec3::ZERO, 0.8, (64, 48))).collect()
+    }
+
+    #[test]
+    fn angle_is_zero_inside_and_exact_outside() {
+        let cameras = arc(5, 60.0);
+        let cone = RigCone::new(&cameras);
+        let between_two = between(&cameras, 20);
+        assert!(cameras.iter().chain(&between_two).all(|camera| cone.angle_outside(camera) < 1e-6));
+        // Beyond the end of the arc, the last camera of the arc is nearest.
+        let beyond = Camera::look_at(DVec3::new(4.0, 0.0, 1.0), DVec3::ZERO, 0.8, (64, 48));
+        let [a, b] = [&beyond, &cameras[4]].map(|camera| camera.center().normalize());
+        assert!((cone.angle_outside(&beyond) - a.angle_between(b)).abs() < 1e-6);
+        let below = Camera::look_at(DVec3::new(0.0, -1.0, -4.0), DVec3::ZERO, 0.8, (64, 48));
+        assert!((cone.angle_outside(&below) - PI / 2.0).abs() < 1e-6, "the cone ends at a right angle");
+    }
+
+    #[test]
+    fn new_cameras_are_outside_and_see_the_focus() {
+        let cameras = arc(7, 60.0);
+        let (cone, found) = (RigCone::new(&cameras), outside(&cameras, 40, 2.0));
+        assert_eq!((found.len(), &found), (40, &outside(&cameras, 40, 2.0)));
+        let widest = found.iter().map(|camera| cone.angle_outside(camera).to_degrees()).fold(0.0, f64::max);
+        assert!((20.0..=30.0).contains(&widest), "{widest}");
+        for camera in &found {
+            assert!(cone.angle_outside(camera) >= MIN_ANGLE);
+            assert!((camera.center().length() - 17f64.sqrt()).abs() < 1e-9);
+            let ahead = (camera.rotation * -camera.center()).normalize();
+            assert!(ahead.z > 1.0 - 1e-9, "turned away from the scene: {ahead}");
+        }
+    }
+
+    #[test]
+    fn rigs_all_around_have_no_outside() {
+        let eyes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
+        let around = eyes.map(|eye| Camera::look_at(3.0 * eye + DVec3::splat(0.01), DVec3::ZERO, 0.8, (64, 48)));
+        assert!(outside(&around, 5, 2.0).is_empty());
+        assert!(outside(&[], 5, 2.0).is_empty() && outside(&around[..1], 5, 2.0).is_empty());
+    }
+}
