@@ -18,7 +18,7 @@ use std::path::Path;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
 use splatsieve::model::Attributes;
-use splatsieve::outputs::bounds::{Bounds, MaxError};
+use splatsieve::outputs::bounds::{ErrorBounds, MaxError};
 use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
 use splatsieve::passes::HeldFrames;
 use splatsieve::source::FrameSource;
@@ -76,7 +76,7 @@ fn benches(criterion: &mut Criterion) {
         write(&scene, &raw_path, Compression::Raw);
         let bounds: Vec<MaxError> =
             Attributes::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
-        write(&scene, &within_path, Packing::within(Bounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
+        write(&scene, &within_path, Packing::with_bounds(ErrorBounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
         let [reader, raw_reader, within] = [&path, &raw_path, &within_path].map(|path| Reader::open(path).unwrap());
         let most = raw.iter().map(Vec::len).max().unwrap_or(0);
         let (mut copy, mut buffer) = (vec![0; most], TileBuffer::default());

@@ -63,7 +63,7 @@ impl FittedTrack {
     }
 
     /// Returns whether the Gaussian is visible at `frame` and its values are finite.
-    pub fn is_seen(&self, frame: usize) -> bool {
+    pub fn is_visible(&self, frame: usize) -> bool {
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
         self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }

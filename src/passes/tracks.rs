@@ -18,7 +18,7 @@ pub const TRACK_BLOCK: usize = 64;
 /// in the order of the Gaussians. `times` holds the times of the frames, in any unit.
 ///
 /// Memory: the results; on every thread a reader and the attributes of [`TRACK_BLOCK`] Gaussians at all frames.
-pub fn tracks<R: Send>(
+pub fn map_tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
     progress: &Progress,
@@ -49,17 +49,17 @@ pub fn tracks<R: Send>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::opacity;
     use crate::passes::gather_all;
 
     #[test]
     fn tracks_equal_the_frames_for_any_thread_count() {
-        let scene = Scene::new(3 * TRACK_BLOCK + 5, 7);
+        let scene = DemoScene::new(3 * TRACK_BLOCK + 5, 7);
         let progress = Progress::IGNORED;
         let all = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()
+            pool.install(|| map_tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()
         };
         let (one, three) = (all(1), all(3));
         assert_eq!(one.len(), scene.info().count);

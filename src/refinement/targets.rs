@@ -8,10 +8,10 @@ use rayon::prelude::*;
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
-use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
-use crate::scene::between::{SplitMix64, between};
+use crate::scene::between::{SplitMix64, cameras_between};
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
@@ -84,18 +84,24 @@ impl Targets {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all(scene.source())];
             let mut next = some.start;
-            show(subject, &targets.cameras, &targets.pictures[some], Batch::one_frame(&scene.limits), |views| {
-                let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
-                    let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
-                    narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
-                };
-                let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
-                next += views.len();
-                made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
-            })
+            for_each_view_batch(
+                subject,
+                &targets.cameras,
+                &targets.pictures[some],
+                BatchLimits::one_frame(&scene.limits),
+                |views| {
+                    let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
+                        let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
+                        narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
+                    };
+                    let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
+                    next += views.len();
+                    made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
+                },
+            )
         };
         let key = scene.work.key(&(&targets.cameras, &targets.pictures, stride, has_test_views));
-        targets.values = scene.work.sharded_spill(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
+        targets.values = scene.work.spill_in_shards(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
         Ok(targets)
     }
 
@@ -186,15 +192,15 @@ pub(super) fn validation_every(views: usize) -> usize {
 /// between.
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
-    let mut pictures = spread(&scene.schedule, scene_views, VIEWS_PER_FRAME);
-    let used = scene.schedule.used();
+    let mut pictures = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
+    let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for picture in &mut pictures {
         picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
     }
     let (seen, mut random) = (pictures.len(), SplitMix64(2));
-    for camera in between(&cameras, if seen == 0 { 0 } else { between_views }) {
-        let frame = pictures[random.below(seen)].frame;
+    for camera in cameras_between(&cameras, if seen == 0 { 0 } else { between_views }) {
+        let frame = pictures[random.next_below(seen)].frame;
         pictures.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);
     }

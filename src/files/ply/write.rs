@@ -53,7 +53,7 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
 /// # Errors
 /// Fails if a source or proxy does not exist, if the proxies have another SH degree, if `change` has another number of
 /// rows, if the template was truncated since it was opened, or if the file cannot be written.
-pub fn write_like(
+pub fn write_like_template(
     template: &Ply,
     rows: &[OutRow],
     proxies: &Gaussians,
@@ -258,7 +258,7 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
 
 /// Checks that all rows and proxies named in `rows` exist, and that the shapes of `proxies` and `change` match them.
 fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
-    for column in change.columns().iter() {
+    for column in change.attributes().iter() {
         let changes = change.0.column(column).len();
         if changes != rows.len() {
             let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
@@ -298,7 +298,7 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
 /// Adds the parameter delta (change of the stored values) of output row `place` to the bytes `row` of this row.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
-    for column in change.columns().iter() {
+    for column in change.attributes().iter() {
         let by = change.0.column(column);
         for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
             let by = by.plane(c)[place];

@@ -5,7 +5,7 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Attributes, Rows};
-use crate::passes::BLOCK;
+use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::recipe;
 use crate::scene::Scene;
 use crate::statistics;
@@ -30,23 +30,24 @@ pub struct ScanStage {
 impl ScanStage {
     /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
     /// statistics rows (one per Gaussian) of all blocks.
-    pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
+    pub fn resource_estimate(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
         // Frames held by readers count twice, because a second reader may decode while the first is read.
-        let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
+        let block =
+            statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.kept_frames_bytes(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
-            seconds: work.pace.states
-                * work.count()
+            seconds: work.throughput.states
+                * work.gaussian_count()
                 * work.frames as f64
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
-                + work.reading(work.count(), work.frames as f64),
+                + work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
-                ("blocks", work.threads * work.at_most(BLOCK as u64) * block),
-                work.arriving(),
+                ("blocks", work.threads * work.largest_block(GAUSSIANS_PER_BLOCK as u64) * block),
+                work.filling_blocks(),
                 ("frames", frames),
             ],
         }
@@ -61,9 +62,9 @@ impl ScanStage {
         let info = source.info();
         let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
         let compute = |blocks| scan_blocks(source, &scene.schedule, &plan, blocks, &scene.events);
-        journal.stage(NAME, info.count, source, |_| {
+        journal.run_stage(NAME, info.count, source, |_| {
             let units = scan_units(info);
-            let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
+            let found = scene.work.compute_in_shards(NAME, scene.work.key(&plan), units, compute, |parts| {
                 let mut all = ScanResult { alive_per_frame: vec![0; info.times.len()], ..ScanResult::default() };
                 for part in parts {
                     all.join(part?);
@@ -97,7 +98,7 @@ mod tests {
     fn memory_beside_rows_is_bounded_by_one_block() {
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
         let need = |count| {
-            let need = scan.need(&work(count), &Limits::NONE);
+            let need = scan.resource_estimate(&work(count), &Limits::NONE);
             (need.per_gaussian, need.fixed)
         };
         assert_eq!(need(1_024), need(1_000_000));

@@ -84,10 +84,10 @@ impl Quantity {
     }
 
     /// Returns in words which property of a Gaussian the quantity measures.
-    pub fn property(self) -> &'static str {
+    pub fn measured_property(self) -> &'static str {
         match self {
-            Quantity::By(statistic) => statistic.property(),
-            Quantity::Geometric => Statistic::C.property(),
+            Quantity::By(statistic) => statistic.measured_property(),
+            Quantity::Geometric => Statistic::C.measured_property(),
             Quantity::Static => "the static score",
             Quantity::Dynamic => "the dynamic score",
         }

@@ -26,7 +26,7 @@ impl TempPly {
     }
 
     fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Vec<u8> {
-        write_like(template, rows, proxies, change, NO_SH_LIMIT, &self.path("out.ply")).unwrap();
+        write_like_template(template, rows, proxies, change, NO_SH_LIMIT, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
 }
@@ -184,7 +184,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
         assert_eq!(fewer.sh_degree(), degree.min(3));
         let [expected, found] = ["expected.ply", "found.ply"].map(|name| temp.path(name));
         write_inria(&fewer, ply.comments(), &expected).unwrap();
-        write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
+        write_like_template(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
     // Proxies and deltas contain all SH coefficients, and extra properties keep their place.
@@ -192,7 +192,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
     let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&temp.open(&temp.write_changed(&ply, &rows, &proxies(1, 1), &change)));
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    write_like(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
+    write_like_template(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
     let found = Ply::open(&temp.path("out.ply")).unwrap();
     expected.truncate_sh(0);
     assert!(all(&found) == expected);
@@ -223,7 +223,7 @@ fn missing_rows_and_proxies_are_refused() {
     let temp = TempPly::new();
     let ply = temp.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &ParamDelta::default(), NO_SH_LIMIT, &temp.path("none.ply"))
+        write_like_template(&ply, rows, proxies, &ParamDelta::default(), NO_SH_LIMIT, &temp.path("none.ply"))
             .unwrap_err()
             .to_string()
     };
@@ -232,7 +232,7 @@ fn missing_rows_and_proxies_are_refused() {
     assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = ParamDelta(Gaussians::zeros(1, 1));
     let path = temp.path("none.ply");
-    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
+    let message = write_like_template(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
     assert!(!temp.path("none.ply").exists());
 }
