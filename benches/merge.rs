@@ -248,7 +248,7 @@ fn motion(criterion: &mut Criterion) {
                 source: &container,
                 scan: &recipe.scan,
                 gate: MotionThresholds::new(&recipe.merge, 4.0),
-                frames_held: usize::MAX,
+                max_kept_frames: usize::MAX,
                 scratch: folder.path().to_owned(),
                 events: Events::IGNORED,
                 gathered: None,

@@ -20,14 +20,14 @@ use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
 use splatsieve::model::Attributes;
 use splatsieve::outputs::bounds::{ErrorBounds, MaxError};
 use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
-use splatsieve::passes::HeldFrames;
+use splatsieve::passes::FramesInMemory;
 use splatsieve::source::FrameSource;
 
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
 /// Returns every tile of the varying attributes, with its width.
-fn all_tiles(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
+fn all_tiles(scene: &FramesInMemory) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
     let tiles_with_width = |column: Attributes| {
         trajectories::tiles(scene, column).into_iter().map(move |tile| (column.width(info.sh_degree) as u32, tile))
@@ -35,7 +35,7 @@ fn all_tiles(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
     info.varying.iter().flat_map(tiles_with_width).collect()
 }
 
-fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
+fn write(scene: &FramesInMemory, path: &Path, packing: impl Into<Packing>) {
     write_container(scene, path, packing, BTreeMap::new(), |_| ()).unwrap();
 }
 

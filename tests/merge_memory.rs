@@ -50,7 +50,7 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         source: &container,
         scan: &recipe.scan,
         gate: MotionThresholds::new(&recipe.merge, 4.0),
-        frames_held: FRAMES_HELD,
+        max_kept_frames: FRAMES_HELD,
         scratch: folder.to_owned(),
         events: Events::IGNORED,
         gathered: None,

@@ -16,8 +16,8 @@ use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::outputs::kind::{OutputKind, check_folder_name};
-use crate::outputs::windows::{MAX_SINGLE_FRAME_GAUSSIANS, is_windowed};
-use crate::passes::TRACK_BLOCK;
+use crate::outputs::time_windows::{MAX_SINGLE_FRAME_GAUSSIANS, is_windowed};
+use crate::passes::TRACKS_PER_BLOCK;
 use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
@@ -105,7 +105,7 @@ pub fn convert(
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let state_bytes = work.state_bytes(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs) || is_windowed(kind);
-    let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * state_bytes;
+    let tracked = work.threads * TRACKS_PER_BLOCK as u64 * work.frames * state_bytes;
     let mut fixed = work.write_buffers();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));
     let single =

@@ -16,8 +16,8 @@ use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::progress::Events;
 use crate::render::Image;
+use crate::scene::camera_path::cameras_along;
 use crate::scene::open_compressed;
-use crate::scene::path::cameras_along;
 use crate::scene::pictures::{self, ViewSet, render_background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 

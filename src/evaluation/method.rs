@@ -3,7 +3,7 @@
 use super::baseline::Baseline;
 use crate::error::{Error, Result};
 use crate::pipeline::PruneOrMerge;
-use crate::recipe::{Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticTerm};
+use crate::recipe::{Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticScoreTerm};
 
 /// Compression method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,7 +78,7 @@ impl Method {
             recipe.field.field = FieldPrecision::Exact;
             recipe.bands.bands = ShDegreeRule::All;
             recipe.scan.coverage = coverage;
-            recipe.score.static_term = StaticTerm::Mean;
+            recipe.score.static_term = StaticScoreTerm::Mean;
             // S = C without clipping, so that Gaussians with different C never tie.
             recipe.score.w_dynamic = 0.0;
             recipe.score.clip_norm = false;

@@ -193,7 +193,7 @@ impl ModelPair {
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
     pub fn evaluate(&self) -> Result<Evaluation> {
-        let evaluation = self.compare()?;
+        let evaluation = self.evaluate_as_first_stage()?;
         self.scene.work.end_shard_before("averaging")?;
         Ok(evaluation)
     }
@@ -203,7 +203,7 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
-    pub fn compare(&self) -> Result<Evaluation> {
+    pub fn evaluate_as_first_stage(&self) -> Result<Evaluation> {
         let compute = |range| Ok(self.scores(range, |_, _, _| ())?.0);
         self.evaluation(self.compute_sharded(NAME, compute)?)
     }

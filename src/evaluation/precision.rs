@@ -146,7 +146,7 @@ pub const PERCENTILE_ERROR: &str = "percentiles";
 /// Error name: 1 if the bytes of the result differ from those of the first run, else 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
-/// Maximum of the error [`ADDED_ERROR`] at the value [`PrecisionCurve::max_setting_seconds`] and all finer values.
+/// Maximum of the error [`ADDED_ERROR`] at the value [`PrecisionCurve::sufficient_value`] and all finer values.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of the error called `error`.

@@ -257,7 +257,7 @@ pub struct Forecast {
 /// Percentiles, over all Gaussians, of one term of the score by which Gaussians are ranked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::Quantity::name).
+    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::ScoredQuantity::name).
     pub name: String,
     /// Value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]

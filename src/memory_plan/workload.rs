@@ -228,7 +228,7 @@ impl Workload {
 
     /// Returns [`Workload::full_reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians of
     /// two blocks is read for each of the two.
-    pub fn scattered_reads(&self, frames: u64, limits: &Limits) -> f64 {
+    pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
     }

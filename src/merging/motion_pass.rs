@@ -45,7 +45,7 @@ pub struct PairMeter<'a> {
     pub gate: MotionThresholds,
     /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
     /// time.
-    pub frames_held: usize,
+    pub max_kept_frames: usize,
     /// Folder in which the scratch file for trajectories is created.
     pub scratch: PathBuf,
     /// Receiver of progress events.
@@ -129,7 +129,7 @@ impl PairMeter<'_> {
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
         let ordered_ids: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
         let trajectories =
-            Trajectories::gather(self.source, &ordered_ids, self.frames_held, &self.scratch, &self.events)?;
+            Trajectories::gather(self.source, &ordered_ids, self.max_kept_frames, &self.scratch, &self.events)?;
         let mut place = rows;
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
@@ -144,7 +144,7 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = self.events.task("merge", "states", (ids.len() * frames) as u64);
-        let wanted = ReadPlan::new(0..frames).keeping_at_most(self.frames_held);
+        let wanted = ReadPlan::new(0..frames).keeping_at_most(self.max_kept_frames);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state_buffer();
         for frame in 0..frames {
@@ -214,7 +214,7 @@ mod tests {
                 source,
                 scan: &self.recipe.scan,
                 gate: MotionThresholds::new(&self.recipe.merge, 4.0),
-                frames_held: 4,
+                max_kept_frames: 4,
                 scratch: folder.path().to_owned(),
                 events: Events::IGNORED,
                 gathered: None,

@@ -147,7 +147,7 @@ impl NeighborSearch<'_> {
                 [0.0, gap(inside), gap(1.0 - inside)]
             });
             for &(step, occupied) in &self.around {
-                if self.nearest.accepts_distance((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
+                if self.nearest.could_improve_at((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
                     let points = &index.points[occupied.points()];
                     match index.trees.get(occupied.tree as usize) {
                         Some(tree) => tree.search(points, &mut self.nearest),

@@ -63,7 +63,7 @@ impl NearestPoints {
     }
 
     /// Returns whether a point could still be among the nearest if its squared distance is `bound` or more.
-    pub fn accepts_distance(&self, bound: f64) -> bool {
+    pub fn could_improve_at(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
 

@@ -24,7 +24,7 @@ use crate::model::{Attributes, Gaussians};
 use crate::models::input_model::{InputModel, LinkMode, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{HeldFrames, gather_all};
+use crate::passes::{FramesInMemory, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, compare_order};
@@ -202,7 +202,7 @@ impl InputModel for PlySequence {
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
-        let mut frames = HeldFrames::new(count, degree, Attributes::empty(), content.cloud.clone());
+        let mut frames = FramesInMemory::new(count, degree, Attributes::empty(), content.cloud.clone());
         self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
         Ok(Box::new(frames))
     }

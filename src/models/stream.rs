@@ -20,7 +20,7 @@ use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
 use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, Packing};
-use crate::passes::HeldFrames;
+use crate::passes::FramesInMemory;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -52,7 +52,7 @@ impl ReceivedStream {
         stream: FrameStream<impl Read + Send + 'static>,
         folder: &Path,
         events: &Events,
-        take: impl FnMut(&HeldFrames) -> Result<()>,
+        take: impl FnMut(&FramesInMemory) -> Result<()>,
     ) -> Result<ReceivedStream> {
         let scratch = ScratchFile::new(folder)?;
         let received = pack_stream(stream, scratch.path(), COMPRESSION, events, take)?;
@@ -114,14 +114,14 @@ pub fn pack_stream(
     path: &Path,
     packing: impl Into<Packing>,
     events: &Events,
-    mut take: impl FnMut(&HeldFrames) -> Result<()>,
+    mut take: impl FnMut(&FramesInMemory) -> Result<()>,
 ) -> Result<u64> {
     let StreamHeader { count, sh_degree, varying, .. } = *stream.header();
     let block = frames_per_tile(stream.header());
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
-    let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant_attributes());
+    let mut held = FramesInMemory::new(count, sh_degree, varying, stream.take_constant_attributes());
     let progress = events.counting_task("receive", "frames");
-    let mut flush = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
+    let mut flush = |held: &mut FramesInMemory| -> Result<Vec<Gaussians>> {
         writer.append_block(held, 0..held.len(), |_| ())?;
         take(held)?;
         Ok(held.drain().collect())

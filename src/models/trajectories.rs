@@ -22,8 +22,8 @@ use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::gsd::write_gsd;
 use crate::outputs::kind::OutputKind;
-use crate::outputs::windows::write_fitted_windows;
-use crate::passes::{FrameStates, HeldFrames, SourceWithDeltas, gather_all};
+use crate::outputs::time_windows::write_fitted_windows;
+use crate::passes::{FrameStates, FramesInMemory, SourceWithDeltas, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -116,7 +116,7 @@ fn write_merged(
             if start == 0 {
                 frames.read(start, Attributes::all().difference(*varying), &mut constant)?;
             }
-            let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
+            let mut held = FramesInMemory::new(part.len(), *sh_degree, *varying, constant);
             for frame in of_block.clone() {
                 let mut state = Gaussians::zeros(0, *sh_degree);
                 frames.read(frame, *varying, &mut state)?;

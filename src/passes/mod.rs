@@ -13,7 +13,7 @@ mod tracks;
 pub use changed::SourceWithDeltas;
 pub use frames::FrameReaders;
 pub use gather::{BlockwiseReader, gather, gather_all};
-pub use held::HeldFrames;
+pub use held::FramesInMemory;
 pub use parts::BlockSlices;
 pub use pictures::{BatchLimits, RenderedSource, VIEWS_PER_THREAD, ViewStates, for_each_view_batch};
 pub use sample::{
@@ -21,7 +21,7 @@ pub use sample::{
     select_evenly_over_frames,
 };
 pub use states::FrameStates;
-pub use tracks::{TRACK_BLOCK, map_tracks};
+pub use tracks::{TRACKS_PER_BLOCK, map_tracks};
 
 /// Number of Gaussians per unit of parallel work: their attributes at one frame and the sums computed from them fit
 /// into the processor's caches. No result depends on this number.

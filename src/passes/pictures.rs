@@ -57,7 +57,7 @@ pub struct BatchLimits {
     /// Maximum number of different frames. For each of them, the Gaussians of every rendered source are in memory.
     pub frames: usize,
     /// Maximum number of views in a batch.
-    pub pictures: usize,
+    pub views: usize,
     /// Maximum number of frames that a reader keeps in memory of those that it decodes together.
     pub held: usize,
 }
@@ -67,14 +67,14 @@ impl BatchLimits {
     /// all threads busy.
     fn many_views(limits: &Limits) -> BatchLimits {
         let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
-        BatchLimits { frames: limits.frames_together, pictures, held: limits.max_kept_frames }
+        BatchLimits { frames: limits.frames_together, views: pictures, held: limits.max_kept_frames }
     }
 
     /// Returns the batch size for views whose renders stay in memory until the batch ends: one frame, one view per
     /// thread.
     pub fn one_frame(limits: &Limits) -> BatchLimits {
         let pictures = rayon::current_num_threads().min(limits.views_together);
-        BatchLimits { frames: 1, pictures, held: limits.max_kept_frames }
+        BatchLimits { frames: 1, views: pictures, held: limits.max_kept_frames }
     }
 
     /// Returns how many of the views at the start of `pictures` form a batch.
@@ -85,7 +85,7 @@ impl BatchLimits {
             last = Some(picture.frame);
             frames <= self.frames.max(1)
         };
-        pictures.iter().take(self.pictures.max(1)).take_while(fits).count()
+        pictures.iter().take(self.views.max(1)).take_while(fits).count()
     }
 }
 
@@ -290,7 +290,7 @@ mod tests {
             (0..9).map(|frame| gather_all(&scene, frame, Attributes::all()).unwrap()).collect();
         for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
             let mut seen = Vec::new();
-            let batch = BatchLimits { frames, pictures: max_batch, held: 4 };
+            let batch = BatchLimits { frames, views: max_batch, held: 4 };
             let position = RenderedSource { source: &scene, ids: None, columns: Attributes::POSITION };
             for_each_view_batch([RenderedSource::all(&scene), position], &rig.cameras, &all, batch, |views| {
                 assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
@@ -344,7 +344,7 @@ mod tests {
         let scene = RayScene(DemoScene::new(200, 3));
         let rig = scene.0.rig();
         let some: Vec<u32> = (0..200).collect();
-        let batch = BatchLimits { frames: 2, pictures: 4, held: 4 };
+        let batch = BatchLimits { frames: 2, views: 4, held: 4 };
         let few = RenderedSource { source: &scene, ids: Some(Ids::List(&some)), columns: Attributes::all() };
         for_each_view_batch([RenderedSource::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
             for view in views {
@@ -377,7 +377,7 @@ mod tests {
         let rig = scene.rig();
         let reads = |views: u32| {
             let before = container.reads();
-            let batch = BatchLimits { frames: 1, pictures: 2, held: usize::MAX };
+            let batch = BatchLimits { frames: 1, views: 2, held: usize::MAX };
             for_each_view_batch(
                 [RenderedSource::all(&container)],
                 &rig.cameras,

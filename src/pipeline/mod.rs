@@ -112,7 +112,7 @@ fn run_stages(
     plan.check(scene)?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.full_read()?;
-    let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_kinds).unwrap_or_default());
+    let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default());
     let _numbered =
         scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
     let input = InputSummary::from_scene(scene)?.without_folders();

@@ -22,7 +22,7 @@ use crate::model::RobustBox;
 use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
 use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
 use crate::models::trajectories::DEFAULT_OUTPUT;
-use crate::passes::{HeldFrames, ViewSampler};
+use crate::passes::{FramesInMemory, ViewSampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
@@ -192,7 +192,7 @@ fn receive_measured(
         Some(measuring) => finish_measuring(measuring, &stages.measure, &mut scene)?,
         None => None,
     };
-    let measured = arrived.as_ref().map(Measured::measured_kinds).unwrap_or_default();
+    let measured = arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
 }
@@ -239,7 +239,7 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &m
 }
 
 /// Returns a virtual rig (cameras placed by the program) around the first of the frames `held` in memory.
-fn rig_around(held: &HeldFrames) -> Rig {
+fn rig_around(held: &FramesInMemory) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.median, bounds.extent())
 }
@@ -274,7 +274,7 @@ impl<'a> Measuring<'a> {
         }
     }
 
-    fn add(&mut self, held: &HeldFrames) -> Result<()> {
+    fn add(&mut self, held: &FramesInMemory) -> Result<()> {
         let new: Vec<Vec<(u32, u32)>> = held.info().times.iter().map(|&time| self.assumed.at(time)).collect();
         new.iter().for_each(|views| self.schedule.push_frames(1, views));
         let cameras: Vec<Vec<&Camera>> =

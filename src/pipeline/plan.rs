@@ -245,7 +245,7 @@ impl RunPlan {
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
-        let left_out = self.stages.left_out();
+        let left_out = self.stages.omitted_stages_text();
         let lines = parameters.chain(search).chain(left_out).map(|line| format!("\n  {line}"));
         self.counts_text() + &lines.collect::<String>()
     }

@@ -120,7 +120,7 @@ impl SearchStage {
         let frames = work.frames.min(128);
         let measured = ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_reads(frames, limits),
+            reads: work.scattered_full_reads(frames, limits),
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
                 + work.render_seconds(self.pictures as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [

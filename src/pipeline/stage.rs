@@ -121,7 +121,7 @@ pub struct Measured {
 
 impl Measured {
     /// Returns the kinds of statistics that were computed.
-    pub fn measured_kinds(&self) -> MeasuredOnArrival {
+    pub fn measured_statistics(&self) -> MeasuredOnArrival {
         MeasuredOnArrival { scanned: true, visible_contribution: self.visible_contribution.is_some() }
     }
 }
@@ -253,7 +253,7 @@ impl StageList {
     }
 
     /// Returns the omitted stages for display, one line each.
-    pub fn left_out(&self) -> impl Iterator<Item = String> {
+    pub fn omitted_stages_text(&self) -> impl Iterator<Item = String> {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
@@ -273,7 +273,7 @@ impl StageList {
 
 /// Content of an archive (compact file of the result, with quantized values).
 #[derive(Debug, Serialize, Deserialize)]
-pub enum Archived {
+pub enum PreparedArchive {
     /// Encoded model or point cloud, ready to be written.
     Content(EncodedArchive),
     /// Error bounds of the values, within which the frames are written later.
@@ -328,7 +328,7 @@ pub struct RunState<'a> {
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
     /// Content of the archive, if the output is an archive.
-    pub archived: Option<Archived>,
+    pub archived: Option<PreparedArchive>,
     /// Quality and size of the archive, if the output is an archive.
     pub archive: Option<ArchiveSummary>,
     /// Quality of the result, if it was measured.

@@ -34,7 +34,7 @@ impl VisibleContribution {
     /// `pixel_stride`-th pixel in each direction was sampled.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
-        let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+        let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();
         VisibleContribution { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
     }
 }
@@ -177,7 +177,7 @@ mod tests {
                 };
                 let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
-                    let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
+                    let expected = plain.in_pixels(i) * f64::from(pixel * pixel) / pictures as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
                     assert_eq!(seen.peak[i], f64::from(plain.max[i]), "W of {i} on {threads} threads");
                 }

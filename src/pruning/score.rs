@@ -68,7 +68,8 @@ pub struct Scored {
     frames: usize,
     /// Number of frames that must be rendered so that Gaussians with short life spans are seen too; see
     /// [`frames_to_cover`].
-    pub frames_to_see: usize,
+    #[serde(rename = "frames_to_see")]
+    pub frames_to_cover: usize,
     /// Normalization of every term of the scores: percentiles and weight.
     pub terms: Vec<Term>,
     /// Numbers of Gaussians with unusual values, such as NaN.
@@ -185,7 +186,7 @@ impl ScoreStage {
             let median_life = median_life(&rows.life);
             let scored = Scored {
                 frames: info.times.len(),
-                frames_to_see: frames_to_cover(&rows.life, info.times.len()),
+                frames_to_cover: frames_to_cover(&rows.life, info.times.len()),
                 terms: scores.terms,
                 flags: flags(&rows),
                 statistics: match scene.limits.statistics_on_disk {
@@ -327,7 +328,7 @@ impl Scored {
             name: term.of.name().to_owned(),
             p1: term.norm.p1,
             p99: term.norm.p99,
-            active: term.norm.is_active(),
+            active: term.norm.has_spread(),
         };
         self.terms.iter().map(summarize).collect()
     }
@@ -357,7 +358,7 @@ impl Scored {
         if info.sh_degree == 0 {
             journal.leave_out("SH coefficients above degree 0", "SH degree 0");
         }
-        for term in self.terms.iter().filter(|term| !term.norm.is_active()) {
+        for term in self.terms.iter().filter(|term| !term.norm.has_spread()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
             journal.leave_out(format!("grading by {}", term.of.measured_property()), why);
         }

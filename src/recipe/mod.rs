@@ -17,7 +17,7 @@ pub use parameters::{Parameter, parameters};
 pub use sections::{
     Anisotropy, AttributeGroups, Coverage, FieldParams, FieldPrecision, LengthUnit, LowScorePolicy, MergeParams,
     MergePass, MotionParams, MotionSimilarity, NonFinite, ProxyHigherSh, ProxyOpacity, ProxyPosition, RefineParams,
-    ScanParams, ScoreParams, SelectParams, ShDegreeParams, ShDegreeRule, StaticTerm,
+    ScanParams, ScoreParams, SelectParams, ShDegreeParams, ShDegreeRule, StaticScoreTerm,
 };
 
 /// Text of the preset `paper`, with a comment on every parameter.

@@ -64,7 +64,7 @@ pub enum NonFinite {
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct ScoreParams {
-    pub static_term: StaticTerm,
+    pub static_term: StaticScoreTerm,
     pub w_static: f64,
     pub w_dynamic: f64,
     pub lambda: f64,
@@ -80,7 +80,7 @@ pub struct ScoreParams {
 /// First term of the static score S_static (importance of a Gaussian without regard to its motion).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum StaticTerm {
+pub enum StaticScoreTerm {
     /// Mean contribution C of the Gaussian per view.
     Mean,
     /// Peak contribution W: the largest alpha · transmittance in any pixel.

@@ -246,7 +246,7 @@ impl RefineStage {
         let stored = on_grid(self.stored_stride(work.pixels, first as usize));
         ResourceEstimate {
             stage: NAME,
-            reads: 2.0 * work.scattered_reads(frames, limits),
+            reads: 2.0 * work.scattered_full_reads(frames, limits),
             seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
                 + stored.render_seconds(pictures, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),

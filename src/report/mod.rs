@@ -152,7 +152,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         needs
     })?;
     let in_parts = side.scene.work.is_enabled();
-    let compared = if in_parts { Some(side.compare()?) } else { None };
+    let compared = if in_parts { Some(side.evaluate_as_first_stage()?) } else { None };
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     if in_parts {
         // The comparison above has the key of `evaluate`; the keys of later stages also depend on the recipe.

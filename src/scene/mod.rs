@@ -2,11 +2,11 @@
 
 mod absent;
 pub mod between;
+pub mod camera_path;
 mod compressed;
 mod frames;
 mod input;
 mod open;
-pub mod path;
 pub mod photographs;
 pub mod pictures;
 mod stream;

@@ -134,7 +134,7 @@ impl<'a> RunningScan<'a> {
                     reader.read(t, want, &mut state)?;
                     scan.add_frame(first + t, &state, cameras, changed);
                 }
-                Ok(scan.take_alive())
+                Ok(scan.take_alive_counts())
             })
             .collect::<Result<_>>()?;
         self.alive_per_frame.resize(first + cameras.len(), 0);

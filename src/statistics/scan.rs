@@ -62,7 +62,7 @@ pub struct BlockStatistics {
     /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a Gaussian with
     /// [`Flags::NON_FINITE`] are 0.
     pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive`] has not
+    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has not
     /// returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
@@ -120,7 +120,7 @@ impl<'a> BlockScan<'a> {
 
     /// Returns how many of the block's Gaussians are alive in each frame added since the last call, and forgets these
     /// numbers.
-    pub fn take_alive(&mut self) -> Vec<u32> {
+    pub fn take_alive_counts(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
     }
 

@@ -79,9 +79,9 @@ fn opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
         let expected = oracle::render_view(&one, &camera, [0.0; 3], 1);
         let got = measure_contribution(&one, &camera, 1);
         assert!(
-            (got.pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
+            (got.in_pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
             "step {step}: got {}, expected {}",
-            got.pixels(0),
+            got.in_pixels(0),
             expected.sum[0]
         );
         // Extent without the rule, in pixels of the middle row of the image.
@@ -106,9 +106,9 @@ fn contributions_match_the_oracle_at_every_stride() {
             let (sum, max) = (expected.sum[i], expected.max[i]);
             let tolerance = 1e-5 * sum + 1e-7 + if s < 3 { doubtful / 255.0 } else { 2.0 / 255.0 };
             assert!(
-                (got.pixels(i) - sum).abs() <= tolerance,
+                (got.in_pixels(i) - sum).abs() <= tolerance,
                 "seed {seed} Gaussian {i}: sum {} for {sum}",
-                got.pixels(i)
+                got.in_pixels(i)
             );
             assert!(
                 (f64::from(got.max[i]) - max).abs() <= 1e-5 + 1.0 / 255.0,
@@ -117,7 +117,7 @@ fn contributions_match_the_oracle_at_every_stride() {
             );
         }
         let (total, expected) =
-            ((0..scene.len()).map(|i| got.pixels(i)).sum::<f64>(), expected.sum.iter().sum::<f64>());
+            ((0..scene.len()).map(|i| got.in_pixels(i)).sum::<f64>(), expected.sum.iter().sum::<f64>());
         assert!((total / expected - 1.0).abs() < 1e-4, "seed {seed}: total {total}, expected {expected}");
     }
 }
@@ -129,7 +129,7 @@ fn weights_and_transmittance_add_up_to_every_pixel() {
     (0..3).for_each(|c| scene.sh.plane_mut(c).fill(0.5 / 0.282_094_8));
     let light: f64 = render(&scene, &camera, [0.0; 3]).data.iter().map(|&v| f64::from(v)).sum::<f64>() / 3.0;
     let contribution = measure_contribution(&scene, &camera, 1);
-    let weights: f64 = (0..scene.len()).map(|i| contribution.pixels(i)).sum();
+    let weights: f64 = (0..scene.len()).map(|i| contribution.in_pixels(i)).sum();
     assert!((light / weights - 1.0).abs() < 1e-6, "light {light}, weights {weights}");
 }
 
@@ -205,7 +205,7 @@ fn giant_across_the_near_plane_covers_just_the_image() {
     for log_scale in [7.0, 14.0, 80.0, 1e3, 3e38] {
         let mut giant = single_gaussian(0.21, 1.0, 0.9);
         giant.log_scale.set_row(0, [log_scale; 3]);
-        let pixels = measure_contribution(&giant, &plain_camera(40), 1).pixels(0);
+        let pixels = measure_contribution(&giant, &plain_camera(40), 1).in_pixels(0);
         assert!(
             (pixels - 0.9 * 1600.0).abs() < 1e-2,
             "scale e^{log_scale}: {pixels} pixels, expected {}",
@@ -242,10 +242,10 @@ fn giant_background_is_visible_around_the_foreground() {
     both.opacity_logit.set_row(1, [1.0]);
     let contribution = measure_contribution(&both, &plain_camera(64), 1);
     assert!(
-        contribution.pixels(0) > 3900.0 && contribution.pixels(1) > 5.0,
+        contribution.in_pixels(0) > 3900.0 && contribution.in_pixels(1) > 5.0,
         "got {} and {}",
-        contribution.pixels(0),
-        contribution.pixels(1)
+        contribution.in_pixels(0),
+        contribution.in_pixels(1)
     );
 }
 

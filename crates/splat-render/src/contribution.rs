@@ -40,7 +40,7 @@ impl Contribution {
     }
 
     /// Returns the contribution of Gaussian `i`, alpha · transmittance summed over all pixels, in pixels.
-    pub fn pixels(&self, i: usize) -> f64 {
+    pub fn in_pixels(&self, i: usize) -> f64 {
         self.sum[i] as f64 * Self::SUM_UNIT
     }
 

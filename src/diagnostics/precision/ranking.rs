@@ -19,7 +19,7 @@ use crate::pruning::visible::VisibilityStage;
 use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
-use crate::statistics::score::{PercentilePasses, Quantity, Scores, score_with_passes};
+use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_with_passes};
 
 /// Numbers of views that are tried, in the first ranking and in a pruning round. Numbers above that of the existing
 /// views are skipped.
@@ -290,7 +290,7 @@ fn relative_error(count: usize, expected: usize) -> f64 {
 /// of combined scores are skipped, because the values themselves differ there.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
-    let pairs = pairs.filter(|(term, _)| !matches!(term.of, Quantity::Static | Quantity::Dynamic));
+    let pairs = pairs.filter(|(term, _)| !matches!(term.of, ScoredQuantity::Static | ScoredQuantity::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {
         [(rough.norm.p1, exact.norm.p1), (rough.norm.p99, exact.norm.p99)]
             .map(|(rough, exact)| if exact == 0.0 { 0.0 } else { (rough / exact - 1.0).abs() })

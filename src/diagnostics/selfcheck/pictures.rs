@@ -65,7 +65,7 @@ pub(super) fn weights() -> CaseResult {
         Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
         let mut worst = LargestError::default();
         for i in 0..scene.len() {
-            worst.near(seen.pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
+            worst.near(seen.in_pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
             worst.near(seen.max[i].into(), expected.max[i], 1.0);
         }
         Ok(worst)

@@ -17,7 +17,7 @@ use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// One row (Gaussian) of a compressed PLY file.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct OutRow {
+pub struct OutputRow {
     /// Index of the Gaussian in the original file (template) whose row is copied: the Gaussian itself, or the leader
     /// (most important Gaussian) of its merged cluster.
     pub source: u32,
@@ -27,8 +27,8 @@ pub struct OutRow {
 }
 
 /// Returns the rows of the PLY file to be written for the compressed model `reduction`.
-pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
-    let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
+pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
+    let mut rows: Vec<OutputRow> = reduction.kept.iter().map(|&source| OutputRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
     }
@@ -55,7 +55,7 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
 /// rows, if the template was truncated since it was opened, or if the file cannot be written.
 pub fn write_like_template(
     template: &Ply,
-    rows: &[OutRow],
+    rows: &[OutputRow],
     proxies: &Gaussians,
     change: &ParamDelta,
     sh_degree: usize,
@@ -257,7 +257,7 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
 }
 
 /// Checks that all rows and proxies named in `rows` exist, and that the shapes of `proxies` and `change` match them.
-fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
+fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.attributes().iter() {
         let changes = change.0.column(column).len();
         if changes != rows.len() {

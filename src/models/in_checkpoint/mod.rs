@@ -27,7 +27,7 @@ use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::outputs::windows::{can_store, is_windowed, write_timed};
+use crate::outputs::time_windows::{can_store, is_windowed, write_timed};
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;

@@ -23,7 +23,7 @@ use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
-use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
     ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
     OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, pictures,
@@ -151,18 +151,18 @@ impl ArchiveStage {
         compressed: &CompressedModel,
         asked: ArchiveTarget,
         journal: &mut Journal,
-    ) -> Result<(Archived, ArchiveSummary)> {
+    ) -> Result<(PreparedArchive, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, compressed));
         let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_as_frames() {
                 true => {
                     let left = scene.input.reduced(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
-                    (Archived::Frames(bounds), summary)
+                    (PreparedArchive::Frames(bounds), summary)
                 }
                 false => {
                     let (encoded, summary) = self.make(scene, compressed, asked)?;
-                    (Archived::Content(encoded), summary)
+                    (PreparedArchive::Content(encoded), summary)
                 }
             };
             Ok(((archived, AsToml(summary)), compressed.len()))

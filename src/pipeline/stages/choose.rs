@@ -90,7 +90,7 @@ impl Choose {
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64) + made,
-            reads: work.full_reads(frames, limits) + work.scattered_reads(frames, limits),
+            reads: work.full_reads(frames, limits) + work.scattered_full_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.filling_blocks(), ("views", pictures)],
         }
@@ -142,7 +142,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let pictures_together = VIEWS_PER_BATCH.min(scene.limits.views_together);
-    let batch = BatchLimits { pictures: pictures_together, ..BatchLimits::one_frame(&scene.limits) };
+    let batch = BatchLimits { views: pictures_together, ..BatchLimits::one_frame(&scene.limits) };
     let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(&*result)];
     for_each_view_batch(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);

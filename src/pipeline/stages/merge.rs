@@ -157,10 +157,10 @@ impl MergeStage {
         // States are read once. Every pass of every trial follows its pairs over all frames twice, because coinciding
         // pairs, if there are any, are merged first.
         let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
-        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
+        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_full_reads(work.frames, limits);
         ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_reads(1, limits) + followed,
+            reads: work.scattered_full_reads(1, limits) + followed,
             seconds: SECONDS_TO_MERGE * work.gaussian_count()
                 + FOLLOWED_FRACTION * work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
@@ -291,7 +291,7 @@ impl<'a> Trial<'a> {
             source,
             scan: &stage.scan,
             gate: MotionThresholds::new(&merge, unit),
-            frames_held: scene.limits.max_kept_frames,
+            max_kept_frames: scene.limits.max_kept_frames,
             scratch: scene.scratch.clone(),
             events: scene.events.clone(),
             gathered: None,

@@ -22,7 +22,7 @@ use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::FrameView;
 use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::planning::Planning;
-use crate::pipeline::stage::{Archived, EstimateInput, MeasuredOnArrival, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
 use crate::scene::pictures::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
@@ -133,7 +133,7 @@ impl QualityStage {
                 reduced = scene.input.reduced(&run.result)?;
                 &*reduced
             }
-            Some(Archived::Content(encoded)) => {
+            Some(PreparedArchive::Content(encoded)) => {
                 folder = ScratchFolder::new(&scene.scratch)?;
                 let path = folder.path().join("result.gsz");
                 fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
@@ -141,7 +141,7 @@ impl QualityStage {
                 opened.source()
             }
             // Frames with error bounds exist only once they are written.
-            Some(Archived::Frames(_)) => return Ok(None),
+            Some(PreparedArchive::Frames(_)) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {

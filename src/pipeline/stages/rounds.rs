@@ -124,7 +124,8 @@ impl Rounds {
         // The first round renders the views of all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
-        let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
+        let reads =
+            work.scattered_full_reads(frames * turns, limits) + later * work.scattered_full_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
@@ -146,7 +147,7 @@ impl Rounds {
     /// Returns the views divided into groups (turns). Views of a frame stay together if there are enough frames,
     /// otherwise views are divided one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
-        let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_see);
+        let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
         let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
         let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
@@ -377,7 +378,7 @@ mod tests {
         for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
             let rounds = Rounds { turns, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             let parts = rounds.turns(&scene, &scored);
-            let all = select_evenly_over_frames(&scene.schedule, rounds.pictures, scored.frames_to_see);
+            let all = select_evenly_over_frames(&scene.schedule, rounds.pictures, scored.frames_to_cover);
             assert_eq!(parts.len(), turns.min(all.len()));
             let mut together: Vec<FrameView> = parts.concat();
             together.sort_by_key(|picture| (picture.frame, picture.view));

@@ -26,7 +26,7 @@ use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::pipeline::planning::Planning;
-use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, Summary};
 use crate::progress::{Events, Progress};
 use crate::pruning::score::scored_memory;
@@ -100,7 +100,7 @@ impl Stage for WriteStage {
         run.scene.work.end_shard_before("writing")?;
         let scored = run.scored()?;
         let mut map = run.result.index_map(run.scene.source().info().count);
-        if let Some(Archived::Content(encoded)) = &run.archived {
+        if let Some(PreparedArchive::Content(encoded)) = &run.archived {
             reorder(&mut map, &encoded.order);
         }
         if self.kind == OutputKind::Sog {
@@ -232,7 +232,7 @@ impl WriteStage {
         };
         let reads = match is_solved && !self.kind.stores_frames() {
             true => 0.0,
-            false => parts as f64 * work.scattered_reads(work.frames, limits),
+            false => parts as f64 * work.scattered_full_reads(work.frames, limits),
         };
         let frames = if is_solved && !self.kind.stores_frames() { 0.0 } else { work.frames as f64 };
         let left = USUAL_LEFT * work.gaussian_count();
@@ -264,7 +264,7 @@ impl WriteStage {
         &self,
         scene: &Scene,
         compressed: &CompressedModel,
-        (map, archive): (&[Option<u32>], Option<&Archived>),
+        (map, archive): (&[Option<u32>], Option<&PreparedArchive>),
         recipe: &str,
         mut journal: Journal,
         summarize: impl FnOnce(Journal, ModelSize) -> Summary,
@@ -273,17 +273,17 @@ impl WriteStage {
             journal.run_stage(NAME, compressed.len(), scene.source(), |journal| {
                 let count = compressed.len() as u64;
                 // Outputs that hold frames report their own progress.
-                let has_frames = self.kind.stores_frames() || matches!(archive, Some(Archived::Frames(_)));
+                let has_frames = self.kind.stores_frames() || matches!(archive, Some(PreparedArchive::Frames(_)));
                 let progress = match has_frames {
                     true => Progress::IGNORED,
                     false => scene.events.task(NAME, "Gaussians", count),
                 };
                 let size = match archive {
-                    Some(Archived::Content(encoded)) => {
+                    Some(PreparedArchive::Content(encoded)) => {
                         fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
                         encoded.parts.into()
                     }
-                    Some(Archived::Frames(bounds)) => {
+                    Some(PreparedArchive::Frames(bounds)) => {
                         write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
                         ModelSize::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
