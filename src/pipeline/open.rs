@@ -172,14 +172,12 @@ fn receive_measured(
     let opened = OpenedInput { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = from_input(opened, options)?;
     // The number of frames is known now.
-    let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
-    if !MemoryPlan::fits_budget(scene.workload(), counted, |work, limits| stages.estimates(work, limits)) {
+    let (now, counted) = (scene.workload(), Budget { tell: Verbosity::Nothing, ..options.memory });
+    if !MemoryPlan::fits_budget(now, counted, |work, limits| stages.estimates(work, limits)) {
         stages.stages.remove_optional();
         quality::leave_out(&mut stages.stages);
     }
-    let later = MemoryPlan::fit_budget(scene.workload(), counted, &options.events, |work, limits| {
-        stages.estimates(work, limits)
-    })?;
+    let later = MemoryPlan::fit_budget(now, counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.apply_plan(&later);
     if measures && measuring.is_none() && frames_arrived > 0 {
         let note = format!(
