@@ -10,7 +10,7 @@
 use std::path::Path;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use splatsieve::deform::{Deltas, Field, FieldConfig, Scratch, Tensor, Tensors};
+use splatsieve::deform::{Deltas, Field, FieldConfig, LayerBuffers, Tensor, Tensors};
 use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 
 const BLOCK: usize = 1024;
@@ -48,7 +48,7 @@ fn field(width: usize, channels: usize, active: Attributes) -> Field {
     let aabb = Tensor { shape: vec![2, 3], data: vec![1.0, 1.0, 1.0, -1.0, -1.0, -1.0] };
     tensors.insert("deformation_net.grid.aabb".into(), aabb);
     let config = FieldConfig {
-        active,
+        deformed_attributes: active,
         static_mlp: false,
         empty_voxel: false,
         grid_pe: 0,
@@ -72,7 +72,7 @@ fn deform(criterion: &mut Criterion) {
         ("dynerf_position_opacity", field(128, 16, Attributes::all()), Attributes::POSITION | Attributes::OPACITY),
     ] {
         let prepared = field.prepare(&position);
-        let mut scratch = Scratch::default();
+        let mut scratch = LayerBuffers::default();
         let mut out = Deltas::new(3);
         let mut frame = 0;
         group.bench_function(name, |bencher| {

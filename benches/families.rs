@@ -147,7 +147,7 @@ fn networks(criterion: &mut Criterion<Processor>) {
     group.bench_function("bare_product", |bencher| {
         bencher.iter(|| all.iter().zip(&weights).for_each(|(shape, weight)| product(*shape, weight, &x, &mut y)));
     });
-    group.bench_function("d3g_slopes", |bencher| bencher.iter(|| network.slopes(&position, 0.4)));
+    group.bench_function("d3g_slopes", |bencher| bencher.iter(|| network.warp_jacobian(&position, 0.4)));
     group.finish();
 }
 

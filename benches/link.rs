@@ -51,7 +51,7 @@ fn linked(frames: &[Gaussians]) -> usize {
     let (mut linker, mut joiner) = (Linker::default(), Joiner::default());
     let link = |frame| {
         let linked = linker.link(frame).linked;
-        joiner.see(&linker);
+        joiner.add_frame(&linker);
         linked
     };
     frames.iter().map(link).sum()

@@ -24,11 +24,11 @@ use gseq::Compression;
 use splatsieve::diagnostics::demo_scene;
 use splatsieve::files::container::Container;
 use splatsieve::merging;
-use splatsieve::merging::motion::{MotionGate, PairMotion};
+use splatsieve::merging::motion::{MotionThresholds, PairMotion};
 use splatsieve::merging::motion_pass::PairMeter;
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::proxy::Importance;
-use splatsieve::merging::tree::{Nearest, Tree, TreePoint};
+use splatsieve::merging::tree::{NearestPoints, Tree, TreePoint};
 use splatsieve::merging::voxels::voxel_order;
 use splatsieve::merging::{RequestedPairs, Survivors};
 use splatsieve::model::hash_id;
@@ -79,9 +79,9 @@ fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
     let order = voxel_order(&rows, |row| position.row(row as usize), epsilon);
     let mut points = points(position);
     let tree = Tree::new(&mut points);
-    let mut nearest = Nearest::default();
+    let mut nearest = NearestPoints::default();
     let mut count_neighbors = |row: u32| {
-        nearest.start(row, position.row(row as usize), NEIGHBORS + 1, epsilon);
+        nearest.start_query(row, position.row(row as usize), NEIGHBORS + 1, epsilon);
         tree.search(&points, &mut nearest);
         nearest.sorted().len().min(NEIGHBORS)
     };
@@ -224,7 +224,7 @@ fn motion(criterion: &mut Criterion) {
                 let reference = (0..position.len()).map(|i| position.row(i));
                 let mut motion = PairMotion::new(pairs.iter().copied(), reference, MotionParams::Runs);
                 for frame in 0..frames {
-                    motion.frame(|i| (position.row::<3>(i).map(|x| x + 0.01 * frame as f32), true));
+                    motion.add_frame(|i| (position.row::<3>(i).map(|x| x + 0.01 * frame as f32), true));
                 }
                 motion.finish().map(|pair| pair.drift).fold(0.0, f64::max)
             })
@@ -232,7 +232,7 @@ fn motion(criterion: &mut Criterion) {
     });
     group.finish();
 
-    let scene = demo_scene::Scene::new(20_000, 48);
+    let scene = demo_scene::DemoScene::new(20_000, 48);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.gseq");
     write_container(&scene, &path, Compression::Zstd(1), BTreeMap::new(), |_| ()).unwrap();
@@ -247,8 +247,8 @@ fn motion(criterion: &mut Criterion) {
             let mut meter = PairMeter {
                 source: &container,
                 scan: &recipe.scan,
-                gate: MotionGate::new(&recipe.merge, 4.0),
-                frames_held: usize::MAX,
+                gate: MotionThresholds::new(&recipe.merge, 4.0),
+                max_kept_frames: usize::MAX,
                 scratch: folder.path().to_owned(),
                 events: Events::IGNORED,
                 gathered: None,

@@ -18,16 +18,16 @@ use std::path::Path;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
 use splatsieve::model::Attributes;
-use splatsieve::outputs::bounds::{Bounds, MaxError};
+use splatsieve::outputs::bounds::{ErrorBounds, MaxError};
 use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
-use splatsieve::passes::HeldFrames;
+use splatsieve::passes::FramesInMemory;
 use splatsieve::source::FrameSource;
 
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
 /// Returns every tile of the varying attributes, with its width.
-fn all_tiles(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
+fn all_tiles(scene: &FramesInMemory) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
     let tiles_with_width = |column: Attributes| {
         trajectories::tiles(scene, column).into_iter().map(move |tile| (column.width(info.sh_degree) as u32, tile))
@@ -35,7 +35,7 @@ fn all_tiles(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
     info.varying.iter().flat_map(tiles_with_width).collect()
 }
 
-fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
+fn write(scene: &FramesInMemory, path: &Path, packing: impl Into<Packing>) {
     write_container(scene, path, packing, BTreeMap::new(), |_| ()).unwrap();
 }
 
@@ -76,7 +76,7 @@ fn benches(criterion: &mut Criterion) {
         write(&scene, &raw_path, Compression::Raw);
         let bounds: Vec<MaxError> =
             Attributes::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
-        write(&scene, &within_path, Packing::within(Bounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
+        write(&scene, &within_path, Packing::with_bounds(ErrorBounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
         let [reader, raw_reader, within] = [&path, &raw_path, &within_path].map(|path| Reader::open(path).unwrap());
         let most = raw.iter().map(Vec::len).max().unwrap_or(0);
         let (mut copy, mut buffer) = (vec![0; most], TileBuffer::default());

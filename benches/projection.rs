@@ -53,7 +53,7 @@ fn projection(c: &mut Criterion) {
     for (views, changed) in [(16, Attributes::POSITION), (1, Attributes::all())] {
         let cameras = cameras(views);
         let mut schedule = ViewSchedule::new(cameras.clone());
-        schedule.push(1, &(0..views as u32).map(|v| (v, v)).collect::<Vec<_>>());
+        schedule.push_frames(1, &(0..views as u32).map(|v| (v, v)).collect::<Vec<_>>());
         let plan = ScanPlan::new(&scan, &[0.0], &schedule).unwrap();
         let seen: Vec<&Camera> = cameras.iter().collect();
         let mut running = BlockScan::new(GAUSSIANS, 0, &plan);
@@ -61,7 +61,7 @@ fn projection(c: &mut Criterion) {
         group.throughput(Throughput::Elements((GAUSSIANS * views) as u64));
         group.bench_function(BenchmarkId::from_parameter(format!("{views} views")), |bencher| {
             bencher.iter(|| {
-                running.frame(t, &block, &seen, changed);
+                running.add_frame(t, &block, &seen, changed);
                 t += 1;
             });
         });

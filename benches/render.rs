@@ -31,7 +31,7 @@ use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3, Quat, Vec3};
-use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
@@ -49,7 +49,7 @@ const LANES: f64 = 16.0;
 
 /// Renders and scores one view.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
-    let events = oracle::picture(state, camera, [0.0; 3], 1).events;
+    let events = oracle::render_view(state, camera, [0.0; 3], 1).events;
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
     let mut renderer = Renderer::new();
     let target = renderer.render(state, camera, [0.5; 3]);
@@ -176,10 +176,10 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 fn pictures(criterion: &mut Criterion) {
-    let demo = Scene::new(Scene::COUNT, Scene::FRAMES);
+    let demo = DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES);
     let mut state = Gaussians::zeros(0, demo.info().sh_degree);
     let everything = Ids::Range(0..demo.info().count);
-    demo.open(everything).unwrap().read(Scene::FRAMES / 2, Attributes::all(), &mut state).unwrap();
+    demo.open(everything).unwrap().read(DemoScene::FRAMES / 2, Attributes::all(), &mut state).unwrap();
     measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
     let Some(folder) = models::found() else { return };
     for name in models::NAMES {

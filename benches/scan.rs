@@ -104,7 +104,7 @@ fn benches(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
     let mut schedule = ViewSchedule::default();
-    schedule.push(FRAMES, &[]);
+    schedule.push_frames(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
@@ -280,7 +280,7 @@ fn read_ahead(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
     let mut schedule = ViewSchedule::default();
-    schedule.push(FRAMES, &[]);
+    schedule.push_frames(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     // A folder for temporary files may be in memory, so this one is in the target folder.
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();

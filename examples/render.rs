@@ -12,7 +12,7 @@ use splatsieve::files::image::write::{ImageFormat, write_image};
 use splatsieve::model::Attributes;
 use splatsieve::passes::gather_all;
 use splatsieve::render::render;
-use splatsieve::scene::pictures::{ViewSet, pictures};
+use splatsieve::scene::pictures::{ViewSet, select_views};
 use splatsieve::scene::{InputOptions, open_scene};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let [model, cameras, output] = &arguments[..] else { return Err("expected: MODEL CAMERAS OUTPUT.png".into()) };
     let input = InputOptions { path: model.clone(), cameras: Some(cameras.clone()), ..InputOptions::default() };
     let scene = open_scene(&input)?;
-    let views = pictures(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
+    let views = select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
     let view = views.first().ok_or("the cameras have no view")?;
     let state = gather_all(scene.source(), view.frame, Attributes::all())?;
     let start = Instant::now();

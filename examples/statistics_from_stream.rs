@@ -29,7 +29,7 @@ struct PathStatistics {
 fn main() -> Result<(), Box<dyn Error>> {
     let mut stream = FrameStream::open(std::io::stdin(), Path::new("standard input"), ReadLimit::NONE)?;
     let count = stream.header().count;
-    let mut state: Gaussians = stream.take_constant();
+    let mut state: Gaussians = stream.take_constant_attributes();
     let mut statistics = vec![PathStatistics::default(); count];
     let mut frames = 0;
     while stream.next_frame(&mut state)?.is_some() {

@@ -4,11 +4,11 @@
 use serde::{Deserialize, Serialize};
 
 use crate::model::{AttributeValues, Attributes, Gaussians, NO_SH_LIMIT, StoredParams};
-use crate::recipe::{MergeParams, Precision};
+use crate::recipe::{FieldPrecision, MergeParams};
 
 /// Reference frame, at which Gaussians are compared for merging, and the extent of the scene at this frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Reference {
+pub struct ReferenceFrame {
     /// Index of the frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
     pub frame: usize,
     /// Longest side of the box between the 1st and the 99th percentile of the positions at this frame, scene units.
@@ -51,20 +51,20 @@ pub struct ParamDelta(pub Gaussians);
 
 impl ParamDelta {
     /// Returns the attributes for which this delta has values.
-    pub fn columns(&self) -> Attributes {
+    pub fn attributes(&self) -> Attributes {
         let changes = |&column: &Attributes| !self.0.column(column).is_empty();
         Attributes::all().iter().filter(changes).collect()
     }
 
     /// Returns whether this delta has no values for any attribute.
     pub fn is_empty(&self) -> bool {
-        self.columns().is_empty()
+        self.attributes().is_empty()
     }
 
     /// Returns the delta of the Gaussians at the output indices `places`, in the order of `places`.
     pub fn pick(&self, places: &[u32]) -> ParamDelta {
         let mut picked = ParamDelta::default();
-        for column in self.columns().iter() {
+        for column in self.attributes().iter() {
             *picked.0.column_mut(column) = self.0.column(column).pick(places);
         }
         picked
@@ -77,8 +77,8 @@ impl ParamDelta {
 
     /// Returns the sum of this delta and `more`. If both have SH coefficients, the SH degree of `more` must be at least
     /// that of this delta.
-    pub fn and(self, mut more: ParamDelta) -> ParamDelta {
-        for column in self.columns().iter() {
+    pub fn plus(self, mut more: ParamDelta) -> ParamDelta {
+        for column in self.attributes().iter() {
             let (from, to) = (self.0.column(column), more.0.column_mut(column));
             if to.is_empty() {
                 *to = from.clone();
@@ -90,16 +90,16 @@ impl ParamDelta {
     }
 
     /// Returns the difference `self - before`.
-    pub fn since(&self, before: &ParamDelta) -> ParamDelta {
+    pub fn minus(&self, before: &ParamDelta) -> ParamDelta {
         let mut back = before.clone();
         back.scale(-1.0);
-        back.and(self.clone())
+        back.plus(self.clone())
     }
 
     /// Adds this delta to the values in `state`, for the attributes `attributes` only. Row i of the delta belongs to
     /// row i of `state`. Adding 0 leaves the bits of a value unchanged.
     pub fn add_to(&self, state: &mut Gaussians, attributes: Attributes) {
-        for column in (self.columns() & attributes).iter() {
+        for column in (self.attributes() & attributes).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
             for c in 0..by.width().min(values.width()) {
                 for (value, &by) in values.plane_mut(c).iter_mut().zip(by.plane(c)) {
@@ -119,7 +119,7 @@ pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 impl TrajectoryDelta {
     /// Returns the indices of the two of `knots` keyframes (2 or more) between which frame `frame` of `frames` lies,
     /// each with its weight in the linear interpolation.
-    pub fn weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
+    pub fn keyframe_weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
         let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
         let first = (along as usize).min(knots - 2);
         let part = (along - first as f64) as f32;
@@ -132,20 +132,20 @@ impl TrajectoryDelta {
     }
 
     /// Returns the attributes for which the keyframes have values.
-    pub fn columns(&self) -> Attributes {
-        self.0.first().map_or(Attributes::empty(), ParamDelta::columns)
+    pub fn attributes(&self) -> Attributes {
+        self.0.first().map_or(Attributes::empty(), ParamDelta::attributes)
     }
 
     /// Returns the delta interpolated at frame `frame` of `frames`.
-    pub fn at(&self, frame: usize, frames: usize) -> ParamDelta {
+    pub fn at_frame(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
             return ParamDelta::default();
         }
-        let [(first, before), (second, after)] = TrajectoryDelta::weights(self.0.len(), frame, frames);
+        let [(first, before), (second, after)] = TrajectoryDelta::keyframe_weights(self.0.len(), frame, frames);
         let [mut change, mut more] = [first, second].map(|knot| self.0[knot].clone());
         change.scale(before);
         more.scale(after);
-        change.and(more)
+        change.plus(more)
     }
 
     /// Returns the trajectory delta of the Gaussians at the output indices `places`, in the order of `places`.
@@ -155,11 +155,11 @@ impl TrajectoryDelta {
 
     /// Returns the sum of this trajectory delta and `more`. If both have keyframes, their numbers of keyframes must be
     /// equal.
-    pub fn and(self, more: TrajectoryDelta) -> TrajectoryDelta {
+    pub fn plus(self, more: TrajectoryDelta) -> TrajectoryDelta {
         match (self.is_empty(), more.is_empty()) {
             (_, true) => self,
             (true, _) => more,
-            _ => TrajectoryDelta(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.and(more)).collect()),
+            _ => TrajectoryDelta(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.plus(more)).collect()),
         }
     }
 }
@@ -173,17 +173,20 @@ pub struct CompressedModel {
     /// Clusters of input Gaussians that are merged, in increasing order of their proxy's index in the output.
     pub clusters: Vec<Cluster>,
     /// Merge parameters by which proxies are computed from the members of their clusters.
-    pub rule: MergeParams,
+    #[serde(rename = "rule")]
+    pub merge_params: MergeParams,
     /// Proxies, which replace the merged clusters.
     pub proxies: Proxies,
     /// Parameter delta: values that refinement adds to the stored parameters, constant in time.
-    pub change: ParamDelta,
+    #[serde(rename = "change")]
+    pub delta: ParamDelta,
     /// Trajectory delta: values, varying in time, that refinement adds to the attributes at each frame, on top of the
-    /// constant `change`. Empty unless the model format stores the state of every Gaussian for every frame, and empty
+    /// constant `delta`. Empty unless the model format stores the state of every Gaussian for every frame, and empty
     /// if there are proxies.
-    pub course: TrajectoryDelta,
+    #[serde(rename = "course")]
+    pub trajectory_delta: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.
-    pub field: Precision,
+    pub field: FieldPrecision,
     /// Highest SH degree in the output. SH coefficients above it are dropped.
     pub sh_degree: usize,
 }
@@ -195,24 +198,24 @@ impl CompressedModel {
         CompressedModel {
             kept,
             clusters: Vec::new(),
-            rule: rule.clone(),
+            merge_params: rule.clone(),
             proxies: Proxies::default(),
-            change: ParamDelta::default(),
-            course: TrajectoryDelta::default(),
-            field: Precision::Exact,
+            delta: ParamDelta::default(),
+            trajectory_delta: TrajectoryDelta::default(),
+            field: FieldPrecision::Exact,
             sh_degree: NO_SH_LIMIT,
         }
     }
 
     /// Returns a copy of this model with `kept` (increasing ids of the input) in place of its own list of kept
     /// Gaussians.
-    pub fn with(&self, kept: Vec<u32>) -> Self {
+    pub fn with_kept(&self, kept: Vec<u32>) -> Self {
         CompressedModel { kept, ..self.clone() }
     }
 
     /// Sets the computed `proxies`. Dissolves every refused cluster: its leader stays unchanged, its other members are
     /// removed.
-    pub fn make(&mut self, mut proxies: Proxies) {
+    pub fn set_proxies(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
             let is_made: Vec<bool> = (0..self.clusters.len()).map(|k| refused.binary_search(&k).is_err()).collect();
@@ -242,15 +245,21 @@ impl CompressedModel {
     pub fn pick(&self, places: &[u32]) -> CompressedModel {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
-        let (change, course) = (self.change.pick(places), self.course.pick(places));
+        let (change, course) = (self.delta.pick(places), self.trajectory_delta.pick(places));
         let (field, sh_degree) = (self.field, self.sh_degree);
-        CompressedModel { change, course, field, sh_degree, ..CompressedModel::pruned(kept, &self.rule) }
+        CompressedModel {
+            delta: change,
+            trajectory_delta: course,
+            field,
+            sh_degree,
+            ..CompressedModel::pruned(kept, &self.merge_params)
+        }
     }
 
     /// Returns the sum of the constant and the trajectory delta at frame `frame` of `frames`.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
-        self.course.at(frame, frames).and(self.change.clone())
+        self.trajectory_delta.at_frame(frame, frames).plus(self.delta.clone())
     }
 
     /// Returns for each of the `count` input Gaussians its index in the output, or `None` if it was removed. All
@@ -283,9 +292,9 @@ mod tests {
         by.position.set_row(1, [1.0, 0.0, -2.0]);
         by.sh.set_row(0, [0.5, 0.0, 0.25]);
         let change = ParamDelta(by);
-        assert_eq!(change.columns(), Attributes::all().difference(Attributes::ROTATION));
+        assert_eq!(change.attributes(), Attributes::all().difference(Attributes::ROTATION));
         let mut changed = state.clone();
-        change.add_to(&mut changed, change.columns().difference(Attributes::LOG_SCALE));
+        change.add_to(&mut changed, change.attributes().difference(Attributes::LOG_SCALE));
         assert_eq!(changed.opacity_logit.row::<1>(0)[0].to_bits(), (-0.0f32).to_bits());
         assert_eq!(changed.position.row(1), [1.0, 0.0, -2.0]);
         assert_eq!(changed.sh.row(0), [0.5, 0.0, 0.25, 0.0, 0.0]);
@@ -304,20 +313,21 @@ mod tests {
             ParamDelta(by)
         };
         let course = TrajectoryDelta(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
-        assert_eq!(course.columns(), Attributes::POSITION | Attributes::OPACITY);
+        assert_eq!(course.attributes(), Attributes::POSITION | Attributes::OPACITY);
         for (frame, x, logit) in [(0, 1.0, 0.0), (1, 1.5, 1.0), (4, 3.0, 4.0), (7, 0.0, 4.0), (8, -1.0, 4.0)] {
-            assert_eq!(course.at(frame, 9), knot(x, logit), "frame {frame}");
-            assert_eq!(course.pick(&[1, 0, 1]).at(frame, 9), knot(x, logit).pick(&[1, 0, 1]));
-            assert_eq!(course.clone().and(course.clone()).at(frame, 9), knot(x, logit).and(knot(x, logit)));
+            assert_eq!(course.at_frame(frame, 9), knot(x, logit), "frame {frame}");
+            assert_eq!(course.pick(&[1, 0, 1]).at_frame(frame, 9), knot(x, logit).pick(&[1, 0, 1]));
+            assert_eq!(course.clone().plus(course.clone()).at_frame(frame, 9), knot(x, logit).plus(knot(x, logit)));
         }
-        assert_eq!(course.at(0, 1), knot(1.0, 0.0));
+        assert_eq!(course.at_frame(0, 1), knot(1.0, 0.0));
         assert!(
-            TrajectoryDelta::default().at(3, 9).is_empty() && TrajectoryDelta::default().and(course.clone()) == course
+            TrajectoryDelta::default().at_frame(3, 9).is_empty()
+                && TrajectoryDelta::default().plus(course.clone()) == course
         );
         let mut of_all = Gaussians::zeros(2, 1);
         of_all.sh.planes_mut().fill(0.5);
         let mut reduction = CompressedModel::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
-        (reduction.change, reduction.course) = (ParamDelta(of_all), course);
+        (reduction.delta, reduction.trajectory_delta) = (ParamDelta(of_all), course);
         let both = reduction.delta_at(4, 9);
         assert_eq!((both.0.position.row(0), both.0.sh.row::<12>(1)), ([3.0, 6.0, 0.0], [0.5; 12]));
         assert_eq!(reduction.pick(&[1]).delta_at(4, 9), both.pick(&[1]));
@@ -335,7 +345,7 @@ mod tests {
         reduction.clusters = vec![cluster(0, 1, 2), cluster(1, 4, 5), cluster(2, 6, 7)];
         let mut raw = StoredParams::from(Gaussians::zeros(3, 0));
         (0..3).for_each(|row| raw.gaussians.position.set_row(row, [row as f32; 3]));
-        reduction.make(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
+        reduction.set_proxies(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
         assert_eq!(reduction.index_map(8), [None, Some(0), Some(0), None, Some(1), None, Some(2), Some(2)]);
         assert_eq!(reduction.proxies.raw.unwrap().gaussians.position.plane(0), [0.0, 2.0]);
         assert!(reduction.proxies.refused.is_empty());

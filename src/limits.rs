@@ -9,32 +9,32 @@ use crate::error::{Error, Result};
 pub struct Limits {
     /// Maximum number of decoded frames that a reader of consecutive frames keeps in memory, at least 1. A tile of a
     /// container holds several frames, which are decoded together.
-    pub frames_held: usize,
+    pub max_kept_frames: usize,
     /// Maximum number of frames of which the states of all Gaussians are in memory, ready to be rendered; at least 1.
     pub frames_together: usize,
     /// Maximum number of views rendered at the same time; at least 1.
-    pub pictures_together: usize,
+    pub views_together: usize,
     /// Maximum number of output Gaussians whose values at all frames are in memory until they are written.
     pub gaussians_together: usize,
     /// Maximum number of pairs of Gaussians whose motion is compared at the same time; at least 1.
     pub pairs_together: usize,
     /// Whether the statistics of the Gaussians are moved to a scratch file after scoring.
-    pub rows_aside: bool,
+    pub statistics_on_disk: bool,
     /// Whether all decoded tiles of a container stay in memory. A tile holds some Gaussians and frames of one
     /// attribute.
-    pub tiles_held: bool,
+    pub keeps_tiles: bool,
 }
 
 impl Limits {
     /// No limits: everything stays in memory, for the fastest run.
     pub const NONE: Limits = Limits {
-        frames_held: usize::MAX,
+        max_kept_frames: usize::MAX,
         frames_together: usize::MAX,
-        pictures_together: usize::MAX,
+        views_together: usize::MAX,
         gaussians_together: usize::MAX,
         pairs_together: usize::MAX,
-        rows_aside: false,
-        tiles_held: false,
+        statistics_on_disk: false,
+        keeps_tiles: false,
     };
 }
 

@@ -89,11 +89,11 @@ impl Events {
     }
 
     /// Announces the start of a run of `stages`. The run ends when the returned value is dropped.
-    pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunOfStages {
+    pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunGuard {
         if let Some(sink) = &self.0 {
             sink.run_begun(stages);
         }
-        RunOfStages(self.clone())
+        RunGuard(self.clone())
     }
 
     /// Begins the task `name` of `total` units and returns its progress. `unit` names the units in the plural
@@ -123,9 +123,9 @@ impl Events {
 /// Guard of an announced run. Dropping it announces the end of the run.
 #[must_use = "the run ends when this is dropped"]
 #[derive(Debug)]
-pub struct RunOfStages(Events);
+pub struct RunGuard(Events);
 
-impl Drop for RunOfStages {
+impl Drop for RunGuard {
     fn drop(&mut self) {
         if let Some(sink) = &self.0.0 {
             sink.run_ended();
@@ -158,7 +158,7 @@ impl Progress {
 }
 
 /// Formats a duration in seconds for display: "59.4 s", "1 min 00 s", "2 h 01 min".
-pub fn duration(seconds: f64) -> String {
+pub fn format_duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
     match whole {
         0..60 => format!("{seconds:.1} s"),
@@ -238,7 +238,7 @@ mod tests {
     #[test]
     fn durations_are_rounded_for_display() {
         for (seconds, text) in [(0.04, "0.0 s"), (59.4, "59.4 s"), (60.0, "1 min 00 s"), (7261.0, "2 h 01 min")] {
-            assert_eq!(duration(seconds), text);
+            assert_eq!(format_duration(seconds), text);
         }
     }
 }

@@ -56,7 +56,7 @@ pub struct ReadPlan {
 
 impl ReadPlan {
     /// Creates the plan to read every frame in order. Readers without a plan assume it.
-    pub fn every() -> ReadPlan {
+    pub fn all_frames() -> ReadPlan {
         ReadPlan { frames: None, held: usize::MAX }
     }
 
@@ -71,19 +71,19 @@ impl ReadPlan {
 
     /// Sets the maximum number of frames that a reader keeps of the frames decoded together, at least 1. A small
     /// maximum saves memory but makes the reader decode tiles repeatedly.
-    pub fn holding(self, frames: usize) -> ReadPlan {
+    pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
     /// Returns the maximum number of frames that a reader keeps in memory after it has decoded a tile, for later reads.
     /// Decoding a tile gives the values of several consecutive frames at once.
-    pub fn held(&self) -> usize {
+    pub fn max_kept_frames(&self) -> usize {
         self.held
     }
 
     /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive), or `frame` alone if it is not in the
     /// plan.
-    pub fn between(&self, frame: usize, end: usize) -> Vec<usize> {
+    pub fn frames_between(&self, frame: usize, end: usize) -> Vec<usize> {
         match &self.frames {
             None => (frame..end).collect(),
             Some(frames) => match frames.binary_search(&frame) {
@@ -94,7 +94,7 @@ impl ReadPlan {
     }
 
     /// Returns the first planned frame at or after `frame`; `None` if there is none.
-    pub fn next(&self, frame: usize) -> Option<usize> {
+    pub fn next_planned(&self, frame: usize) -> Option<usize> {
         match &self.frames {
             None => Some(frame),
             Some(frames) => frames.get(frames.partition_point(|&wanted| wanted < frame)).copied(),
@@ -136,9 +136,9 @@ impl Sub for Reads {
 
 /// Counter that many threads add to. A clone starts from zero, because it belongs to another source.
 #[derive(Debug, Default)]
-pub struct Count(AtomicU64);
+pub struct SharedCounter(AtomicU64);
 
-impl Count {
+impl SharedCounter {
     /// Adds `more` to the count.
     pub fn add(&self, more: u64) {
         // Relaxed ordering suffices: the sum is read after reading has finished.
@@ -151,9 +151,9 @@ impl Count {
     }
 }
 
-impl Clone for Count {
-    fn clone(&self) -> Count {
-        Count::default()
+impl Clone for SharedCounter {
+    fn clone(&self) -> SharedCounter {
+        SharedCounter::default()
     }
 }
 
@@ -263,13 +263,16 @@ mod tests {
 
     #[test]
     fn unplanned_frames_are_read_alone() {
-        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).holding(0);
-        assert_eq!(wanted.held(), 1);
-        assert_eq!(wanted.between(3, 32), [3, 9, 31]);
-        assert_eq!(wanted.between(9, 32), [9, 31]);
-        assert_eq!(wanted.between(4, 32), [4]);
-        assert_eq!([wanted.next(0), wanted.next(32), wanted.next(41)], [Some(3), Some(40), None]);
-        assert_eq!(ReadPlan::every().between(30, 32), [30, 31]);
-        assert_eq!(ReadPlan::every().next(64), Some(64));
+        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).keeping_at_most(0);
+        assert_eq!(wanted.max_kept_frames(), 1);
+        assert_eq!(wanted.frames_between(3, 32), [3, 9, 31]);
+        assert_eq!(wanted.frames_between(9, 32), [9, 31]);
+        assert_eq!(wanted.frames_between(4, 32), [4]);
+        assert_eq!(
+            [wanted.next_planned(0), wanted.next_planned(32), wanted.next_planned(41)],
+            [Some(3), Some(40), None]
+        );
+        assert_eq!(ReadPlan::all_frames().frames_between(30, 32), [30, 31]);
+        assert_eq!(ReadPlan::all_frames().next_planned(64), Some(64));
     }
 }

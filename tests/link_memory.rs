@@ -51,7 +51,7 @@ fn memory_of_opening_matches_the_estimate() {
     let (input, peak) = memory::peak(|| open(folder.path(), &options).unwrap());
     let tracks = input.source().info().count;
     assert!((LIVING * FRAMES / LIFE..LIVING * FRAMES / LIFE * 6 / 5).contains(&tracks), "{tracks}");
-    let residence = input.residence();
+    let residence = input.memory_profile();
     let estimated = tracks as u64 * (residence.opening + residence.per_gaussian);
     eprintln!("{tracks} tracks: at most {peak} bytes, {estimated} stated");
     // The estimate also counts pages of files and the memory of a render.

@@ -7,10 +7,10 @@ mod memory;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::files::container::Container;
-use splatsieve::merging::known::KNOWN_BYTES;
-use splatsieve::merging::motion::MotionGate;
+use splatsieve::merging::known::BYTES_PER_CACHED_PAIR;
+use splatsieve::merging::motion::MotionThresholds;
 use splatsieve::merging::motion_pass::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::tree::TreePoint;
@@ -31,7 +31,7 @@ const FRAMES_HELD: usize = 2;
 fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let path = folder.join(format!("{frames}.gseq"));
     if !path.exists() {
-        let scene = Scene::new(COUNT, frames);
+        let scene = DemoScene::new(COUNT, frames);
         write_container(&scene, &path, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ()).unwrap();
     }
     let container = Container::open(&path).unwrap();
@@ -49,8 +49,8 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let mut meter = PairMeter {
         source: &container,
         scan: &recipe.scan,
-        gate: MotionGate::new(&recipe.merge, 4.0),
-        frames_held: FRAMES_HELD,
+        gate: MotionThresholds::new(&recipe.merge, 4.0),
+        max_kept_frames: FRAMES_HELD,
         scratch: folder.to_owned(),
         events: Events::IGNORED,
         gathered: None,
@@ -80,7 +80,7 @@ fn memory_of_pairs_is_estimated_and_ignores_frame_count() {
     let together = pairs / 64 + 1;
     // The results; order and place of every Gaussian and the gathered frames; one partition; the buffers of two
     // threads.
-    let stated = KNOWN_BYTES * pairs
+    let stated = BYTES_PER_CACHED_PAIR * pairs
         + (12 + 8 + 16 * FRAMES_HELD) * COUNT
         + (BYTES_PER_PAIR + 2 * bytes_per_gaussian(FRAMES_HELD)) * together;
     let buffers = 3 << 20;

@@ -7,7 +7,7 @@ use std::fs;
 use std::hint::black_box;
 
 use gseq::{Compression, TileBuffer, TileId};
-use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::files::container::Container;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::container::{FRAME_BLOCK, write_container};
@@ -28,7 +28,7 @@ fn status(line: &str) -> usize {
 fn reading_raw_tiles_keeps_no_pages_resident() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("raw.gseq");
-    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
+    write_container(&DemoScene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
     let file = fs::metadata(&path).unwrap().len() as usize;
     let container = Container::open(&path).unwrap();
     let varying = container.info().varying;
@@ -46,8 +46,9 @@ fn reading_raw_tiles_keeps_no_pages_resident() {
     }
     // Frame by frame.
     let mut frames =
-        FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::every().holding(1)).unwrap();
-    let mut state = frames.state();
+        FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::all_frames().keeping_at_most(1))
+            .unwrap();
+    let mut state = frames.state_buffer();
     for frame in 0..FRAMES {
         frames.read(frame, varying, &mut state).unwrap();
         most = most.max(status("RssFile:"));
@@ -57,7 +58,7 @@ fn reading_raw_tiles_keeps_no_pages_resident() {
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(7).collect();
     let wanted = ReadPlan::new((0..FRAMES).step_by(5));
     let mut frames = FrameReaders::open(&container, Ids::List(&scattered), varying, &wanted).unwrap();
-    let mut state = frames.state();
+    let mut state = frames.state_buffer();
     for frame in (0..FRAMES).step_by(5) {
         frames.read(frame, varying, &mut state).unwrap();
         most = most.max(status("RssFile:"));
@@ -67,8 +68,8 @@ fn reading_raw_tiles_keeps_no_pages_resident() {
     assert!(grown < 6 << 20, "{grown} bytes more of files resident while reading {file}");
 
     // Frame by frame, when a frame block of all Gaussians may be held.
-    let mut frames = FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::every()).unwrap();
-    let mut state = frames.state();
+    let mut frames = FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::all_frames()).unwrap();
+    let mut state = frames.state_buffer();
     for frame in 0..FRAMES {
         frames.read(frame, varying, &mut state).unwrap();
         most = most.max(status("RssFile:"));

@@ -5,7 +5,7 @@ use std::path::Path;
 use splatsieve::model::hash_id;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models::ModelFolder;
-use splatsieve::passes::HeldFrames;
+use splatsieve::passes::FramesInMemory;
 use splatsieve::source::{FrameSource, Ids};
 
 #[path = "../../tests/models/mod.rs"]
@@ -17,7 +17,7 @@ const FRAMES: usize = 32;
 const TIMES: usize = 60;
 
 /// Returns every scene by name: generated curves, and the trained models if they are available.
-pub(crate) fn scenes() -> Vec<(&'static str, HeldFrames)> {
+pub(crate) fn scenes() -> Vec<(&'static str, FramesInMemory)> {
     let models =
         models::found().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
     std::iter::once(("curves", curves())).chain(models).collect()
@@ -25,7 +25,7 @@ pub(crate) fn scenes() -> Vec<(&'static str, HeldFrames)> {
 
 /// Returns the states of a trained model for Gaussians evenly spread over the point cloud, without attributes that do
 /// not vary.
-fn trained(folder: &Path, name: &str) -> HeldFrames {
+fn trained(folder: &Path, name: &str) -> FramesInMemory {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
     let info = model.info();
@@ -34,7 +34,7 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
     let ids = (0..GAUSSIANS).map(|i| ((i / 64) * (info.count - 64) / runs + i % 64) as u32).collect::<Vec<_>>();
     let mut reader = model.open(Ids::List(&ids)).unwrap();
     let constant = Gaussians::zeros(GAUSSIANS, info.sh_degree);
-    let mut held = HeldFrames::new(GAUSSIANS, info.sh_degree, info.varying, constant);
+    let mut held = FramesInMemory::new(GAUSSIANS, info.sh_degree, info.varying, constant);
     for frame in 0..FRAMES {
         let mut state = Gaussians::zeros(GAUSSIANS, info.sh_degree);
         reader.read(frame, info.varying, &mut state).unwrap();
@@ -44,10 +44,10 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
 }
 
 /// Returns smooth curves with 1e-4 of noise in every attribute except SH.
-fn curves() -> HeldFrames {
+fn curves() -> FramesInMemory {
     let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
     let varying = Attributes::all().difference(Attributes::SH);
-    let mut held = HeldFrames::new(GAUSSIANS, 0, varying, Gaussians::zeros(GAUSSIANS, 0));
+    let mut held = FramesInMemory::new(GAUSSIANS, 0, varying, Gaussians::zeros(GAUSSIANS, 0));
     for frame in 0..FRAMES {
         let mut state = Gaussians::zeros(GAUSSIANS, 0);
         for (c, column) in varying.iter().enumerate() {
@@ -62,7 +62,7 @@ fn curves() -> HeldFrames {
 }
 
 /// Returns the values of an attribute in the tiles of a container: for each block of Gaussians `[frames][width][len]`.
-pub(crate) fn tiles(scene: &HeldFrames, column: Attributes) -> Vec<Vec<f32>> {
+pub(crate) fn tiles(scene: &FramesInMemory, column: Attributes) -> Vec<Vec<f32>> {
     const BLOCK: usize = splatsieve::outputs::container::GAUSSIAN_BLOCK;
     let mut state = Gaussians::zeros(0, scene.info().sh_degree);
     let block = |start: usize| {

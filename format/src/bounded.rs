@@ -22,7 +22,7 @@
 
 use std::io;
 
-use crate::codec::{Stats, order_at, predict, shuffle_into, stats, zigzag};
+use crate::codec::{TileStats, order_at, predict, shuffle_into, stats, zigzag};
 
 /// Error bounds that a column may have. For all of them the quantization step is a finite number above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
@@ -42,7 +42,7 @@ const TRIAL_LEVEL: i32 = 1;
 pub(crate) struct BoundedTile {
     pub(crate) order: u8,
     pub(crate) constant: bool,
-    pub(crate) stats: Stats,
+    pub(crate) stats: TileStats,
     pub(crate) bytes: Vec<u8>,
 }
 

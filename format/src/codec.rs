@@ -78,7 +78,7 @@ impl fmt::Display for Encoding {
 
 /// Statistics of the stored values of a tile; of a constant tile (all frames equal), those of its one stored frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Stats {
+pub struct TileStats {
     /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
     pub min: f32,
     /// Largest finite value, with −0 counted as +0; −∞ if no value is finite.
@@ -87,9 +87,9 @@ pub struct Stats {
     pub non_finite: u32,
 }
 
-impl fmt::Display for Stats {
+impl fmt::Display for TileStats {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Stats { min, max, non_finite } = self;
+        let TileStats { min, max, non_finite } = self;
         write!(f, "values from {min} to {max}, {non_finite} of them not finite")
     }
 }
@@ -104,7 +104,7 @@ pub struct EncodedTile {
     pub(crate) encoding: Encoding,
     /// Maximum absolute error of the decoded values; 0 if they are exact.
     pub(crate) max_error: f64,
-    pub(crate) stats: Stats,
+    pub(crate) stats: TileStats,
     pub(crate) checksum: u64,
     pub(crate) bytes: Vec<u8>,
 }
@@ -122,7 +122,7 @@ impl EncodedTile {
     }
 
     /// Returns minimum, maximum and number of non-finite values of the tile.
-    pub fn stats(&self) -> Stats {
+    pub fn stats(&self) -> TileStats {
         self.stats
     }
 }
@@ -437,9 +437,9 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     out
 }
 
-/// Computes the [`Stats`] of values given as bits. Minimum and maximum are those of [`ordered`] integers, so the
+/// Computes the [`TileStats`] of values given as bits. Minimum and maximum are those of [`ordered`] integers, so the
 /// compiler can vectorize them and the order of the values does not matter.
-pub(crate) fn stats(bits: &[u32]) -> Stats {
+pub(crate) fn stats(bits: &[u32]) -> TileStats {
     const EXPONENT: u32 = 0x7f80_0000;
     let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);
     for &bits in bits {
@@ -450,10 +450,10 @@ pub(crate) fn stats(bits: &[u32]) -> Stats {
         non_finite += u32::from(!finite);
     }
     if non_finite as usize == bits.len() {
-        return Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite };
+        return TileStats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite };
     }
     // Adding +0 turns −0 into +0 and leaves every other value as it is.
-    Stats { min: f32::from_bits(unordered(min)) + 0.0, max: f32::from_bits(unordered(max)) + 0.0, non_finite }
+    TileStats { min: f32::from_bits(unordered(min)) + 0.0, max: f32::from_bits(unordered(max)) + 0.0, non_finite }
 }
 
 #[cfg(test)]

@@ -53,7 +53,7 @@ mod tile_bytes;
 mod verify;
 mod writer;
 
-pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
+pub use codec::{Compression, EncodedTile, Encoding, TileStats, encode_tile};
 pub use error::{Error, Result};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
 pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TileReadCounts, TouchedPages};

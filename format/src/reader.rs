@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 use zstd::bulk::Decompressor;
 
-use crate::codec::{Encoding, Stats, StoredTile, TileDecoder};
+use crate::codec::{Encoding, StoredTile, TileDecoder, TileStats};
 use crate::error::{Error, Fault, Result};
 use crate::file::MappedFile;
 use crate::index::{Index, check_memory};
@@ -90,7 +90,7 @@ pub struct TileInfo {
     /// Checksum (xxh3-64) of the tile's stored bytes.
     pub checksum: u64,
     /// Minimum, maximum and number of non-finite values of the tile.
-    pub stats: Stats,
+    pub stats: TileStats,
 }
 
 impl<'a> Tile<'a> {
@@ -316,7 +316,7 @@ impl Reader {
 
     /// Tells the operating system that the stored bytes of tiles will be read soon, so that it reads them from disk
     /// meanwhile. Takes no memory of this process. Read errors are ignored here; they appear when the tiles are read.
-    pub fn expect(&self, tiles: impl IntoIterator<Item = TileId>) {
+    pub fn prefetch_in_background(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut pending = 0..0;
         for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
             let end = tile.offset + u64::from(tile.stored_bytes);
@@ -333,7 +333,7 @@ impl Reader {
     /// Reads the stored bytes of tiles from disk into the page cache of the operating system and waits for them, so
     /// that threads that decode these tiles need not wait. Takes a small buffer. Read errors are ignored here; they
     /// appear when the tiles are read.
-    pub fn fetch(&self, tiles: impl IntoIterator<Item = TileId>) {
+    pub fn prefetch_and_wait(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut chunk = Vec::new();
         for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
             _ = self.file.fetch(tile.offset..tile.offset + u64::from(tile.stored_bytes), &mut chunk);

@@ -5,7 +5,7 @@ use std::fmt;
 
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-use crate::codec::{Encoding, Stats};
+use crate::codec::{Encoding, TileStats};
 use crate::error::Fault;
 use crate::layout::{Layout, TileId};
 
@@ -34,7 +34,7 @@ pub(crate) struct TileRecord {
     pub(crate) offset: u64,
     pub(crate) stored_bytes: u32,
     pub(crate) checksum: u64,
-    pub(crate) stats: Stats,
+    pub(crate) stats: TileStats,
 }
 
 /// Record whose payload contains the time stamps of one frame block.
@@ -153,7 +153,7 @@ impl Record {
                     offset: u64_at(24),
                     checksum: u64_at(32),
                     stored_bytes: u32_at(40),
-                    stats: Stats {
+                    stats: TileStats {
                         min: f32::from_bits(u32_at(44)),
                         max: f32::from_bits(u32_at(48)),
                         non_finite: u32_at(52),

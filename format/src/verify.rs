@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use crate::codec::{Stats, stats};
+use crate::codec::{TileStats, stats};
 use crate::error::{Fault, Result};
 use crate::index::check_memory;
 use crate::reader::{Reader, TileBuffer};
@@ -130,7 +130,7 @@ impl Reader {
 pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
     let found = stats(bytemuck::cast_slice(values));
     // Bits are compared: a forged NaN must not pass, and −0 must not pass for +0.
-    let bits = |stats: Stats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
+    let bits = |stats: TileStats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
     if bits(found) != bits(tile.stats) {
         return Err(Fault::new(position + 44, format!("{found}, as the values are"), tile.stats));
     }

@@ -20,7 +20,7 @@ use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coe
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
-/// Quantization step of each attribute of [`ATTRIBUTES`], as an exponent; see [`super::step()`].
+/// Quantization step of each attribute of [`ATTRIBUTES`], as an exponent; see [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
 /// Number of known values from which a value is predicted: the value of the previous Gaussian, the mean of the previous
@@ -64,7 +64,7 @@ impl PointCloudShape {
         self.sh_degree <= MAX_SH_DEGREE
             && self.means.len() == planes(self.sh_degree).len()
             && self.parts.len() == self.means.len()
-            && self.steps.iter().all(|step| super::STEPS.contains(step))
+            && self.steps.iter().all(|step| super::STEP_NUMBERS.contains(step))
             && self.loose <= 32
             && self.gaussians <= u32::MAX as usize
     }

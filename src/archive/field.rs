@@ -29,7 +29,7 @@ const ZERO_OFFSET_CLASS: u8 = 100;
 /// Way in which the deformation field uses a tensor. It decides how an archive stores the tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Role {
+pub enum TensorRole {
     /// Feature plane `[1, channels, size_b, size_a]` over two spatial axes (a, b).
     Plane([usize; 2]),
     /// Feature plane `[1, channels, times, size]` over one spatial axis and time.
@@ -48,8 +48,8 @@ pub enum Role {
 pub(super) struct TensorEntry {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
-    pub(super) role: Role,
-    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
+    pub(super) role: TensorRole,
+    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step_size()`].
     pub(super) step: i32,
     /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
     /// column; any other tensor of weights has one per element. Empty if there are no corrections.
@@ -68,7 +68,7 @@ pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 /// Quantization step of a tensor, with offsets for its channels, or for its rows and columns.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TensorSteps {
-    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step()`].
+    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step_size()`].
     pub step: i32,
     /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
     /// column; any other tensor of weights has one per element. Empty if there are no corrections.
@@ -86,7 +86,7 @@ pub(super) struct Readers<'a> {
 
 impl TensorEntry {
     /// Returns the table entry of a tensor; its mean and predictor weights are still zero.
-    pub(super) fn new(name: &str, tensor: &Tensor, role: Role, steps: Option<&TensorSteps>) -> TensorEntry {
+    pub(super) fn new(name: &str, tensor: &Tensor, role: TensorRole, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
         TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBORS] }
@@ -100,7 +100,9 @@ impl TensorEntry {
     /// Returns the numbers of channels, rows and columns as which the tensor is coded.
     fn extents(&self) -> [usize; 3] {
         match (self.role, &self.shape[..]) {
-            (Role::Plane(_) | Role::TimePlane(_), &[_, channels, rows, columns]) => [channels, rows, columns],
+            (TensorRole::Plane(_) | TensorRole::TimePlane(_), &[_, channels, rows, columns]) => {
+                [channels, rows, columns]
+            }
             (_, &[rows, columns]) => [1, rows, columns],
             _ => [1, 1, self.values().unwrap_or(0)],
         }
@@ -116,26 +118,26 @@ impl TensorEntry {
                 && self.shape.iter().all(|extent| (1..=1 << 24).contains(extent))
         };
         let fits = match self.role {
-            Role::Plane(axes) => plane(&axes),
-            Role::TimePlane(axis) => plane(&[axis]),
+            TensorRole::Plane(axes) => plane(&axes),
+            TensorRole::TimePlane(axis) => plane(&[axis]),
             _ => true,
         };
         let [channels, rows, columns] = self.extents();
         let wanted = match self.role {
-            Role::Weights if self.shape.len() == 2 => rows.saturating_add(columns),
-            Role::Weights => columns,
+            TensorRole::Weights if self.shape.len() == 2 => rows.saturating_add(columns),
+            TensorRole::Weights => columns,
             _ => channels,
         };
         let channels = self.channels.is_empty() || self.channels.len() == wanted;
-        fits && channels && super::STEPS.contains(&self.step)
+        fits && channels && super::STEP_NUMBERS.contains(&self.step)
     }
 
     /// Returns the key of the family of tensors that share entropy models: planes of the same kind and size, matrices,
     /// or vectors.
     fn family(&self) -> (u8, usize) {
         match self.role {
-            Role::Plane(_) => (0, self.shape[3]),
-            Role::TimePlane(_) => (1, self.shape[3]),
+            TensorRole::Plane(_) => (0, self.shape[3]),
+            TensorRole::TimePlane(_) => (1, self.shape[3]),
             _ if self.shape.len() == 2 => (2, 0),
             _ => (3, 0),
         }
@@ -145,7 +147,7 @@ impl TensorEntry {
     /// its row and column offsets; of a texel, the octave of its summed squared read weights.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
-            Role::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
+            TensorRole::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
             _ => {
                 let channel_offset = i32::from(self.channels.get(channel).copied().unwrap_or(0));
                 self.step + channel_offset - FINER_PER_OCTAVE * texels::octaves(class)
@@ -180,17 +182,17 @@ impl TensorEntry {
         }
         let [channels, rows, columns] = self.extents();
         let (classes, stored) = match (self.role, readers.space) {
-            (Role::Plane(axes), Some(space)) => {
+            (TensorRole::Plane(axes), Some(space)) => {
                 (texels::plane_classes(readers.position, &space, axes, [columns, rows]), 0..rows)
             }
-            (Role::TimePlane(axis), Some(space)) => {
+            (TensorRole::TimePlane(axis), Some(space)) => {
                 let [first, last] = readers.times;
                 (
                     texels::time_plane_classes(readers.position, &space, axis, columns),
                     texels::time_rows(first, last, rows),
                 )
             }
-            (Role::Weights, _) => (self.weight_classes(), 0..rows),
+            (TensorRole::Weights, _) => (self.weight_classes(), 0..rows),
             _ => return None,
         };
         Some(with(&QuantizedTensor {
@@ -200,7 +202,7 @@ impl TensorEntry {
             stored,
             classes: &classes,
             grids: &|channel, class| self.grid(channel, class),
-            class_count: if self.role == Role::Weights {
+            class_count: if self.role == TensorRole::Weights {
                 2 * usize::from(ZERO_OFFSET_CLASS) + 1
             } else {
                 texels::CLASSES
@@ -226,7 +228,7 @@ impl SharedModels {
 }
 
 /// Encodes the tensors of `entries`, and sets the means and predictor weights in the entries. Returns the symbols of
-/// the quantized tensors and the values of tensors with [`Role::Exact`]. Adds the approximate number of bits of every
+/// the quantized tensors and the values of tensors with [`TensorRole::Exact`]. Adds the approximate number of bits of every
 /// tensor to `bits`.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
@@ -238,10 +240,10 @@ pub(super) fn encode(
     let mut shared = SharedModels(Vec::new());
     for entry in entries {
         let Some(tensor) = tensors.get(&entry.name) else { continue };
-        if entry.role == Role::Exact {
+        if entry.role == TensorRole::Exact {
             exact.extend(&tensor.data);
         }
-        if matches!(entry.role, Role::Plane(_) | Role::TimePlane(_)) {
+        if matches!(entry.role, TensorRole::Plane(_) | TensorRole::TimePlane(_)) {
             let mean = entry.with_quantized(readers, |quantized| quantized.mean(&tensor.data)).unwrap_or(0.0);
             entry.mean = QuantizationGrid::new(entry.step).nearest(mean);
         }
@@ -270,7 +272,7 @@ pub(super) fn decode(
     let mut tensors = Tensors::new();
     for entry in entries {
         let count = entry.values()?;
-        let data = if entry.role == Role::Exact {
+        let data = if entry.role == TensorRole::Exact {
             let (own, rest) = exact.split_at_checked(count)?;
             exact = rest;
             own.to_vec()
@@ -288,9 +290,9 @@ pub(super) fn decode(
 
 /// Returns a tensor rounded with `steps`, as an archive would restore it. The only difference: rows of a plane over
 /// time that are read at no time keep their values.
-pub fn rounded(
+pub fn round_tensor(
     tensor: &Tensor,
-    role: Role,
+    role: TensorRole,
     steps: &TensorSteps,
     position: &AttributeValues,
     space: Option<Box3>,

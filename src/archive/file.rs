@@ -23,7 +23,7 @@ const SECTIONS: usize = 4;
 const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
 /// Length of the header in bytes: magic, version and two zero bytes; for each section its length in the file, the
 /// length of its content and a checksum; checksum of the header.
-pub const HEAD: usize = 12 + SECTIONS * 24 + 8;
+pub const HEADER_BYTES: usize = 12 + SECTIONS * 24 + 8;
 /// Compression level of zstd for the table of contents and the plain bytes (`blobs`), which are small sections.
 const ZSTD_LEVEL: i32 = 19;
 /// Maximum number of bytes of content per byte of the file. The contents of trained models are 20 to 60 times as large
@@ -107,7 +107,7 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let (table, blobs) = (pack(&sections.table)?, pack(&sections.blobs)?);
     let stored = [&table, &sections.cloud, &sections.field, &blobs];
     let lengths = [sections.table.len(), sections.cloud.len(), sections.field.len(), sections.blobs.len()];
-    let mut out = Vec::with_capacity(HEAD + stored.iter().map(|bytes| bytes.len()).sum::<usize>());
+    let mut out = Vec::with_capacity(HEADER_BYTES + stored.iter().map(|bytes| bytes.len()).sum::<usize>());
     out.extend(MAGIC);
     out.extend(VERSION.to_le_bytes());
     out.extend([0; 2]);
@@ -132,7 +132,7 @@ pub(super) struct ArchiveHeader {
 }
 
 impl ArchiveHeader {
-    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEAD`] bytes of the file or more, or the
+    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more, or the
     /// whole file if it is shorter.
     pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
@@ -147,15 +147,15 @@ impl ArchiveHeader {
                 format!("version {found}, of another version of splatsieve"),
             ));
         }
-        let Some(head) = head.get(..HEAD) else {
-            return Err(Damage::new("head", format!("{HEAD} bytes"), format!("{whole} bytes")));
+        let Some(head) = head.get(..HEADER_BYTES) else {
+            return Err(Damage::new("head", format!("{HEADER_BYTES} bytes"), format!("{whole} bytes")));
         };
         let number = |at: usize| head[at..at + 8].iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte));
-        if number(HEAD - 8) != xxh3_64(&head[..HEAD - 8]) {
+        if number(HEADER_BYTES - 8) != xxh3_64(&head[..HEADER_BYTES - 8]) {
             return Err(Damage::new("head", "its checksum", "another"));
         }
         let sections = std::array::from_fn(|k| [0, 8, 16].map(|field| number(12 + 24 * k + field)));
-        let mut rest = whole.saturating_sub(HEAD as u64);
+        let mut rest = whole.saturating_sub(HEADER_BYTES as u64);
         for ([stored, content, _], name) in sections.into_iter().zip(NAMES) {
             let place = format!("section {name}");
             let Some(after) = rest.checked_sub(stored) else {
@@ -190,7 +190,7 @@ impl ArchiveHeader {
 
 /// Returns the sections of an archive with header `head`, after verifying their checksums, and its size by purpose.
 pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
-    let mut rest = &bytes[HEAD..];
+    let mut rest = &bytes[HEADER_BYTES..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
     for (k, name) in NAMES.iter().enumerate() {
         let [stored, _, checksum] = head.sections[k];

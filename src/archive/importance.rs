@@ -9,7 +9,7 @@
 
 use std::collections::BTreeMap;
 
-use super::field::Role;
+use super::field::TensorRole;
 use crate::deform::{Box3, Tap, Tensor, Tensors, tap};
 use crate::model::AttributeValues;
 
@@ -25,8 +25,8 @@ const MAX_OFFSET: f64 = 6.0;
 /// Returns for each tensor the offsets added to its quantization step, in eighths of an octave: one per channel of a
 /// plane; for a matrix one per row, followed by one per column. Returns an empty map if the field has no planes or an
 /// unknown structure.
-pub fn offsets(
-    field: &BTreeMap<String, Role>,
+pub fn step_offsets(
+    field: &BTreeMap<String, TensorRole>,
     tensors: &Tensors,
     position: &AttributeValues,
     space: Option<Box3>,
@@ -105,10 +105,11 @@ fn importance_offsets(importance: &[f64]) -> Vec<i8> {
 }
 
 /// Returns the names of the heads (output networks) that the field uses.
-fn heads(field: &BTreeMap<String, Role>) -> Vec<String> {
-    let head_name = |(name, role): (&String, &Role)| {
-        let head =
-            name.strip_suffix(".1.weight").filter(|head| *role == Role::Weights && !head.ends_with("feature_out"));
+fn heads(field: &BTreeMap<String, TensorRole>) -> Vec<String> {
+    let head_name = |(name, role): (&String, &TensorRole)| {
+        let head = name
+            .strip_suffix(".1.weight")
+            .filter(|head| *role == TensorRole::Weights && !head.ends_with("feature_out"));
         head.map(str::to_owned)
     };
     field.iter().filter_map(head_name).collect()

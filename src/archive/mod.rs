@@ -1,7 +1,7 @@
 //! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
 //! that keep the renders good, and entropy coded.
 //!
-//! Input: [`Content`] and [`Steps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the
+//! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the
 //! content. Every quantized value is restored with an error of at most half a quantization step, every other byte
 //! exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors;
 //! tensors that nothing reads are restored as zeros.
@@ -26,10 +26,10 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) use cloud::spread;
 pub use cloud::{ATTRIBUTES, CloudSteps};
-pub use field::{FieldSteps, Role, TensorSteps, rounded};
-pub use file::{ArchiveSize, HEAD, MAGIC, VERSION};
-pub use importance::offsets;
-pub use step::{STEPS, nearest, step};
+pub use field::{FieldSteps, TensorRole, TensorSteps, round_tensor};
+pub use file::{ArchiveSize, HEADER_BYTES, MAGIC, VERSION};
+pub use importance::step_offsets;
+pub use step::{STEP_NUMBERS, nearest_step_number, step_size};
 
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::error::{Error, Result};
@@ -43,11 +43,11 @@ pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 
 /// Everything that an archive stores, in decoded form.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Content {
+pub struct ArchiveContent {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
     /// Use of each tensor by the deformation field, by name; empty if there is no field.
-    pub field: BTreeMap<String, Role>,
+    pub field: BTreeMap<String, TensorRole>,
     /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
     /// First and last time at which the deformation field is evaluated.
@@ -59,9 +59,9 @@ pub struct Content {
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// Quantization steps for encoding a [`Content`].
+/// Quantization steps for encoding a [`ArchiveContent`].
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Steps {
+pub struct QuantizationSteps {
     /// Quantization step of each attribute of the Gaussians.
     pub cloud: CloudSteps,
     /// Quantization step of each tensor of the deformation field.
@@ -70,12 +70,12 @@ pub struct Steps {
 
 /// Encoded archive and how its bytes are used.
 #[derive(Debug, Serialize, Deserialize)]
-pub struct Encoded {
+pub struct EncodedArchive {
     /// Bytes of the archive file.
     pub bytes: Vec<u8>,
     /// Size of the archive in bytes, divided by purpose.
     pub parts: ArchiveSize,
-    /// For each Gaussian in the order of the archive, its index in the encoded [`Content`].
+    /// For each Gaussian in the order of the archive, its index in the encoded [`ArchiveContent`].
     pub order: Vec<u32>,
     /// Approximate number of bits that each attribute and each quantized tensor take, by name.
     pub bits: BTreeMap<String, f64>,
@@ -91,7 +91,7 @@ struct Table {
     tensors: Vec<TensorEntry>,
     /// Number of extra bytes per Gaussian that are no attributes.
     beside: usize,
-    /// Name and length in bytes of each entry of [`Content::files`], in the order in which their bytes are stored.
+    /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are stored.
     files: Vec<(String, usize)>,
 }
 
@@ -99,16 +99,16 @@ struct Table {
 ///
 /// # Errors
 /// Fails if a value is not finite, or if a step or tensor is not allowed in an archive; the error names it.
-pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
+pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<EncodedArchive> {
     check(content, steps)?;
     let mut bits = BTreeMap::new();
     let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
     // Positions as a reader of the archive will decode them.
     let stored =
         cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
-    let readers = Readers { position: &stored.position, space: space(content), times: content.times };
+    let readers = Readers { position: &stored.position, space: field_box(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
-        let role = content.field.get(name).copied().unwrap_or(Role::Unread);
+        let role = content.field.get(name).copied().unwrap_or(TensorRole::Unread);
         TensorEntry::new(name, tensor, role, steps.field.0.get(name))
     };
     let mut entries: Vec<TensorEntry> = content.tensors.iter().map(entry).collect();
@@ -135,7 +135,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     content.files.values().for_each(|bytes| blobs.extend(bytes));
     let table = serde_json::to_vec(&table).map_err(|error| Error::internal(error.to_string()))?;
     let (bytes, parts) = file::write(&Sections { table, cloud, field, blobs })?;
-    Ok(Encoded { bytes, parts, order, bits })
+    Ok(EncodedArchive { bytes, parts, order, bits })
 }
 
 /// Decodes the archive `bytes`, read from `path`.
@@ -143,7 +143,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// # Errors
 /// Fails if the bytes are not an archive, are truncated or damaged, have another version, or declare more than they can
 /// hold or than `memory` allows. Declared sizes are checked before anything is allocated.
-pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
+pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveContent, ArchiveSize)> {
     let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
     head.check_memory(path, memory)?;
     let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
@@ -155,12 +155,12 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, 
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
-/// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the rest is read.
+/// Checks the first [`HEADER_BYTES`] bytes of the archive at `path`, which has `whole` bytes, before the rest is read.
 ///
 /// # Errors
 /// Fails if these bytes are not the header of an archive of this length, or if the archive and its content exceed
 /// `memory`.
-pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
+pub fn check_header(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
     ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.check_memory(path, memory)
 }
 
@@ -188,12 +188,12 @@ fn decoded(
     sections: Sections,
     table: Table,
     parts: ArchiveSize,
-) -> std::result::Result<(Content, ArchiveSize), Damage> {
+) -> std::result::Result<(ArchiveContent, ArchiveSize), Damage> {
     let Sections { cloud, field, blobs, .. } = sections;
     let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
     let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
 
-    let count = |entry: &&TensorEntry| entry.role == Role::Exact;
+    let count = |entry: &&TensorEntry| entry.role == TensorRole::Exact;
     let exact = table.tensors.iter().filter(count).filter_map(TensorEntry::values).sum::<usize>() * 4;
     let beside = table.beside.checked_mul(cloud.len());
     let files = table.files.iter().try_fold(0usize, |sum, &(_, length)| sum.checked_add(length));
@@ -204,7 +204,7 @@ fn decoded(
     let (exact, rest) = blobs.split_at(exact);
     let (planes, mut rest) = rest.split_at(beside.unwrap_or(0));
     let exact: Vec<f32> = exact.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
-    let mut content = Content { times: table.times.map(f32::from_bits), ..Content::default() };
+    let mut content = ArchiveContent { times: table.times.map(f32::from_bits), ..ArchiveContent::default() };
     if !content.times.iter().all(|time| time.is_finite()) {
         return Err(unsound("times"));
     }
@@ -222,9 +222,11 @@ fn decoded(
     // The box of space is one of the exact tensors; it is needed before planes are decoded.
     let before = table.tensors.iter().take_while(|entry| entry.name != BOX_TENSOR).filter(count);
     let start: usize = before.filter_map(TensorEntry::values).sum();
-    let has_box = table.tensors.iter().any(|entry| entry.name == BOX_TENSOR && entry.role == Role::Exact);
+    let has_box = table.tensors.iter().any(|entry| entry.name == BOX_TENSOR && entry.role == TensorRole::Exact);
     let space = exact.get(start..).filter(|_| has_box).and_then(|values| Box3::new(values.get(..6)?));
-    if space.is_none() && table.tensors.iter().any(|entry| matches!(entry.role, Role::Plane(_) | Role::TimePlane(_))) {
+    if space.is_none()
+        && table.tensors.iter().any(|entry| matches!(entry.role, TensorRole::Plane(_) | TensorRole::TimePlane(_)))
+    {
         return Err(unsound("box of the field"));
     }
     let readers = Readers { position: &cloud.position, space, times: content.times };
@@ -235,7 +237,7 @@ fn decoded(
 }
 
 /// Returns the box of space that the feature planes of the deformation field cover; `None` without such a field.
-pub fn space(content: &Content) -> Option<Box3> {
+pub fn field_box(content: &ArchiveContent) -> Option<Box3> {
     content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
 }
 
@@ -246,12 +248,12 @@ pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usiz
 }
 
 /// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
-pub fn attribute(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
+pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
     cloud::values(cloud, k)
 }
 
-/// Checks that every value is finite and that every quantization step is within [`STEPS`].
-fn check(content: &Content, steps: &Steps) -> Result<()> {
+/// Checks that every value is finite and that every quantization step is within [`STEP_NUMBERS`].
+fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
     for column in Attributes::all().iter() {
         let values = content.cloud.column(column);
         if let Some(at) = values.planes().iter().position(|value| !value.is_finite()) {
@@ -264,7 +266,7 @@ fn check(content: &Content, steps: &Steps) -> Result<()> {
         }
     }
     for (name, tensor) in &content.tensors {
-        if matches!(content.field.get(name), Some(Role::Exact | Role::Unread)) {
+        if matches!(content.field.get(name), Some(TensorRole::Exact | TensorRole::Unread)) {
             continue;
         }
         if let Some(value) = tensor.data.iter().find(|value| !value.is_finite()) {
@@ -272,10 +274,12 @@ fn check(content: &Content, steps: &Steps) -> Result<()> {
         }
     }
     let coarse = steps.cloud.iter().chain(steps.field.0.values().map(|steps| &steps.step));
-    match coarse.into_iter().find(|step| !STEPS.contains(step)) {
-        Some(step) => {
-            Err(Error::usage(format!("the steps of an archive are {} to {}; found {step}", STEPS.start(), STEPS.end())))
-        }
+    match coarse.into_iter().find(|step| !STEP_NUMBERS.contains(step)) {
+        Some(step) => Err(Error::usage(format!(
+            "the steps of an archive are {} to {}; found {step}",
+            STEP_NUMBERS.start(),
+            STEP_NUMBERS.end()
+        ))),
         None => Ok(()),
     }
 }

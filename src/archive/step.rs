@@ -18,7 +18,7 @@ const EIGHTHS: [f64; 8] = [
 ];
 
 /// Allowed step numbers `k`; the steps range from 2^−40 to 2^40.
-pub const STEPS: std::ops::RangeInclusive<i32> = -320..=320;
+pub const STEP_NUMBERS: std::ops::RangeInclusive<i32> = -320..=320;
 
 /// Maximum absolute value of a stored multiple of the step, so that multiples and sums of them are exact in an f64.
 const MAX_MULTIPLE: f64 = (1u64 << 50) as f64;
@@ -27,15 +27,15 @@ const MAX_MULTIPLE: f64 = (1u64 << 50) as f64;
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
 /// Returns the quantization step 2^(k/8).
-pub fn step(k: i32) -> f64 {
+pub fn step_size(k: i32) -> f64 {
     let whole = k.div_euclid(8).clamp(-1000, 1000);
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// Returns the number `k` in [`STEPS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size` must be
+/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size` must be
 /// positive.
-pub fn nearest(size: f64) -> i32 {
-    ((8.0 * size.log2()).round() as i32).clamp(*STEPS.start(), *STEPS.end())
+pub fn nearest_step_number(size: f64) -> i32 {
+    ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
 
 /// Uniform grid of the values to which quantization rounds: all multiples of a step.
@@ -48,7 +48,7 @@ pub(super) struct QuantizationGrid {
 impl QuantizationGrid {
     /// Returns the grid with the step 2^(k/8).
     pub(super) fn new(k: i32) -> QuantizationGrid {
-        let step = step(k);
+        let step = step_size(k);
         QuantizationGrid { step, inverse: 1.0 / step }
     }
 
@@ -96,10 +96,10 @@ mod tests {
 
     #[test]
     fn eight_steps_are_an_octave() {
-        for k in STEPS {
+        for k in STEP_NUMBERS {
             let expected = (f64::from(k) / 8.0).exp2();
-            assert!((step(k) / expected - 1.0).abs() < 1e-14, "{k}: {} of {expected}", step(k));
-            assert_eq!(nearest(step(k)), k);
+            assert!((step_size(k) / expected - 1.0).abs() < 1e-14, "{k}: {} of {expected}", step_size(k));
+            assert_eq!(nearest_step_number(step_size(k)), k);
         }
     }
 
@@ -107,7 +107,7 @@ mod tests {
         #[test]
         fn a_value_is_restored_within_half_a_step(value in -1e6f32..1e6, k in -100i32..60) {
             let back = QuantizationGrid::new(k).round(value);
-            let bound = step(k) / 2.0 + f64::from(value.abs()) * f64::from(f32::EPSILON);
+            let bound = step_size(k) / 2.0 + f64::from(value.abs()) * f64::from(f32::EPSILON);
             prop_assert!((f64::from(back) - f64::from(value)).abs() <= bound, "{value} {back} {bound}");
         }
 

@@ -24,42 +24,42 @@ fn tensor(noise: &mut NoiseGenerator, shape: &[usize]) -> Tensor {
 }
 
 /// Returns an archive content of `count` Gaussians with tensors of every role (plane, weights, exact, unread).
-fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
+fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     let mut noise = NoiseGenerator(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
     for column in cloud.columns_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
     }
-    let mut content = Content { cloud, times: [0.0, 1.0], ..Content::default() };
+    let mut content = ArchiveContent { cloud, times: [0.0, 1.0], ..ArchiveContent::default() };
     let plane = [1, 3, 7, 9];
     let line = [1, 3, 6, 9];
     for (name, shape, role) in [
-        ("a.plane.xy", &plane[..], Role::Plane([0, 1])),
-        ("a.plane.yz", &plane, Role::Plane([1, 2])),
-        ("a.plane.xt", &line, Role::TimePlane(0)),
-        ("a.plane.zt", &line, Role::TimePlane(2)),
-        ("a.matrix", &[5, 8], Role::Weights),
-        ("a.vector", &[8], Role::Weights),
-        ("a.scalar", &[], Role::Weights),
-        ("a.exact", &[2, 2, 2], Role::Exact),
-        ("a.unread", &[4, 4], Role::Unread),
+        ("a.plane.xy", &plane[..], TensorRole::Plane([0, 1])),
+        ("a.plane.yz", &plane, TensorRole::Plane([1, 2])),
+        ("a.plane.xt", &line, TensorRole::TimePlane(0)),
+        ("a.plane.zt", &line, TensorRole::TimePlane(2)),
+        ("a.matrix", &[5, 8], TensorRole::Weights),
+        ("a.vector", &[8], TensorRole::Weights),
+        ("a.scalar", &[], TensorRole::Weights),
+        ("a.exact", &[2, 2, 2], TensorRole::Exact),
+        ("a.unread", &[4, 4], TensorRole::Unread),
     ] {
         content.tensors.insert(name.to_owned(), tensor(&mut noise, shape));
         content.field.insert(name.to_owned(), role);
     }
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
     content.tensors.insert(BOX_TENSOR.to_owned(), corners);
-    content.field.insert(BOX_TENSOR.to_owned(), Role::Exact);
+    content.field.insert(BOX_TENSOR.to_owned(), TensorRole::Exact);
     content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.files.insert("empty".to_owned(), Vec::new());
     content
 }
 
-fn some_steps(content: &Content, octave: i32) -> Steps {
+fn some_steps(content: &ArchiveContent, octave: i32) -> QuantizationSteps {
     let step = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
     let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), step(k)));
-    let mut steps = Steps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
+    let mut steps = QuantizationSteps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
     steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
     steps
 }
@@ -77,7 +77,7 @@ proptest! {
     ) {
         let content = content(seed, count, degree);
         let steps = some_steps(&content, octave);
-        let Encoded { bytes, parts, order, .. } = encode(&content, &steps).unwrap();
+        let EncodedArchive { bytes, parts, order, .. } = encode(&content, &steps).unwrap();
         prop_assert_eq!(parts.total(), bytes.len() as u64);
         let (back, read) = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap();
         prop_assert_eq!(read, parts);
@@ -88,8 +88,8 @@ proptest! {
         prop_assert_eq!(sorted, (0..count as u32).collect::<Vec<_>>());
         let expected = content.cloud.pick(&order);
         for (k, name) in ATTRIBUTES.iter().enumerate().take(4 + degree + 1) {
-            let step = step(steps.cloud[k]);
-            for (a, b) in attribute(&expected, k).zip(attribute(&back.cloud, k)) {
+            let step = step_size(steps.cloud[k]);
+            for (a, b) in attribute_values(&expected, k).zip(attribute_values(&back.cloud, k)) {
                 prop_assert!(near(a, b, step), "{name}: {a} {b} of step {step}");
             }
         }
@@ -102,18 +102,18 @@ proptest! {
             let (a, b) = (&content.tensors[name], &back.tensors[name]);
             prop_assert_eq!(&a.shape, &b.shape);
             match role {
-                Role::Exact => prop_assert_eq!(a, b),
-                Role::Unread => prop_assert!(b.data.iter().all(|&value| value == 0.0)),
-                Role::Weights => {
-                    let step = step(steps.field.0[name].step);
+                TensorRole::Exact => prop_assert_eq!(a, b),
+                TensorRole::Unread => prop_assert!(b.data.iter().all(|&value| value == 0.0)),
+                TensorRole::Weights => {
+                    let step = step_size(steps.field.0[name].step);
                     prop_assert!(a.data.iter().zip(&b.data).all(|(&a, &b)| near(a, b, step)), "{name}");
                 }
-                Role::Plane(_) | Role::TimePlane(_) => (),
+                TensorRole::Plane(_) | TensorRole::TimePlane(_) => (),
             }
         }
         // The error of a plane at a Gaussian is at most half the coarsest quantization step that its read weight
         // allows.
-        let space = space(&content).unwrap();
+        let space = field_box(&content).unwrap();
         for (name, axes) in [("a.plane.xy", [0, 1]), ("a.plane.yz", [1, 2])] {
             let [rows, columns] = [7usize, 9];
             for i in 0..count {
@@ -125,7 +125,7 @@ proptest! {
                         for c in 0..3 {
                             let at = (c * rows + row as usize) * columns + column as usize;
                             let off = f64::from(content.tensors[name].data[at] - back.tensors[name].data[at]).abs();
-                            let step = step(steps.field.0[name].step);
+                            let step = step_size(steps.field.0[name].step);
                             // If the read weight of a texel is one octave less, its step is half an octave larger;
                             // classes are whole octaves.
                             prop_assert!(off * weight <= 0.75 * step + 1e-4 * weight, "{name} {off} x {weight} of {step}");
@@ -250,7 +250,7 @@ fn unread_texels_take_no_bits() {
     for i in 0..far.cloud.len() {
         far.cloud.position.set_row(i, [0.1, 0.2, 0.3]);
     }
-    let bits = |content: &Content, name: &str| encode(content, &some_steps(content, -6)).unwrap().bits[name];
+    let bits = |content: &ArchiveContent, name: &str| encode(content, &some_steps(content, -6)).unwrap().bits[name];
     assert!(bits(&far, "a.plane.xy") < 0.25 * bits(&all, "a.plane.xy"));
     // Rows of times before the first are not stored: of six rows for times -1 to 1, the first two.
     let mut never = all.clone();

@@ -42,12 +42,12 @@ impl CacheDir {
 
     /// Makes all keys used from now on depend on `context` as well.
     pub(super) fn depend_on(&mut self, context: CacheKey) {
-        self.context = self.context.and(&context);
+        self.context = self.context.extended_by(&context);
     }
 
     /// Returns `key` combined with the context, the key on which all keys of this run depend.
     pub(super) fn key(&self, key: CacheKey) -> CacheKey {
-        self.context.and(&key)
+        self.context.extended_by(&key)
     }
 
     /// Returns the indices of the stored shards (parts of a divided stage) of `stage` with the key `key`, grouped by

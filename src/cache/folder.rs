@@ -11,11 +11,11 @@ use serde::Serialize;
 use crate::cache::entry::{CacheEntry, EXTENSION, EntryName, names};
 use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
-use crate::model::ranges;
+use crate::model::format_ranges;
 
 /// Stored result of a stage in a work folder, complete or in shards (parts of a divided stage).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Listed {
+pub struct StoredResult {
     /// Name of the stage.
     pub stage: String,
     /// Cache key of the result, 32 hexadecimal digits.
@@ -37,12 +37,12 @@ pub struct Listed {
 ///
 /// # Errors
 /// Fails if the folder cannot be read.
-pub fn list(folder: &Path) -> Result<Vec<Listed>> {
-    let mut found: BTreeMap<(String, String, usize), Listed> = BTreeMap::new();
+pub fn list_results(folder: &Path) -> Result<Vec<StoredResult>> {
+    let mut found: BTreeMap<(String, String, usize), StoredResult> = BTreeMap::new();
     for name in names(folder)? {
         let path = folder.join(name.file());
         let EntryName { stage, key, part: (index, count) } = name;
-        let listed = found.entry((stage.clone(), key.clone(), count)).or_insert_with(|| Listed {
+        let listed = found.entry((stage.clone(), key.clone(), count)).or_insert_with(|| StoredResult {
             stage,
             key: key.clone(),
             parts: count,
@@ -58,23 +58,23 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
             Err(_) => listed.damaged.push(index),
         }
     }
-    let mut found: Vec<Listed> = found.into_values().collect();
+    let mut found: Vec<StoredResult> = found.into_values().collect();
     found.sort_by(|a, b| (&a.belongs_to, &a.stage, a.parts, &a.key).cmp(&(&b.belongs_to, &b.stage, b.parts, &b.key)));
     Ok(found)
 }
 
 /// Formats the listing of a work folder for display.
-pub fn text(listed: &[Listed]) -> String {
+pub fn format_list(listed: &[StoredResult]) -> String {
     let mut out = String::new();
     for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
         let bytes = ByteSize(run_entries.iter().map(|entry| entry.bytes).sum());
         let belongs_to = if run_entries[0].belongs_to.is_empty() { "damaged" } else { &run_entries[0].belongs_to };
         _ = writeln!(out, "{belongs_to}: {}", bytes.display().si());
-        for Listed { stage, key, parts, missing, damaged, bytes, .. } in run_entries {
+        for StoredResult { stage, key, parts, missing, damaged, bytes, .. } in run_entries {
             let mut state = if *parts == 1 { "whole".to_owned() } else { format!("{parts} parts") };
             for (what, which) in [("missing", missing), ("damaged", damaged)] {
                 if !which.is_empty() {
-                    _ = write!(state, ", {what}: {}", ranges(which).join(", "));
+                    _ = write!(state, ", {what}: {}", format_ranges(which).join(", "));
                 }
             }
             let bytes = ByteSize(*bytes).display().si().to_string();
@@ -92,7 +92,7 @@ pub fn text(listed: &[Listed]) -> String {
 ///
 /// # Errors
 /// Fails if the folder cannot be read or a file cannot be removed.
-pub fn clean(folder: &Path) -> Result<(usize, u64)> {
+pub fn remove_entries(folder: &Path) -> Result<(usize, u64)> {
     let (mut files, mut bytes) = (0, 0);
     for name in names(folder)? {
         let path = folder.join(name.file());

@@ -22,7 +22,7 @@ impl CacheKey {
     }
 
     /// Returns the key that depends on everything that this key depends on, and on `value`.
-    pub fn and(self, value: &impl Serialize) -> CacheKey {
+    pub fn extended_by(self, value: &impl Serialize) -> CacheKey {
         self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }
 

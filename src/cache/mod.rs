@@ -30,8 +30,8 @@ use crate::cache::entry::EntryName;
 use crate::cache::shard::MAX_SHARDS;
 pub use crate::cache::shard::{Completion, Shard};
 use crate::error::{Error, Result};
-use crate::model::ranges;
-pub use folder::{Listed, clean, list, text};
+use crate::model::format_ranges;
+pub use folder::{StoredResult, format_list, list_results, remove_entries};
 pub use key::CacheKey;
 pub use spill::{Spill, SpillWriter};
 
@@ -57,7 +57,7 @@ pub struct Cache {
 
 impl Cache {
     /// Returns a cache that stores nothing.
-    pub fn none() -> Cache {
+    pub fn disabled() -> Cache {
         Cache::default()
     }
 
@@ -71,14 +71,14 @@ impl Cache {
     }
 
     /// Makes all keys used from now on depend on `context` as well.
-    pub fn follow_from(&mut self, context: CacheKey) {
+    pub fn depend_on(&mut self, context: CacheKey) {
         if let Some(dir) = &mut self.dir {
             dir.depend_on(context);
         }
     }
 
     /// Returns whether results are stored, that is, whether there is a work folder.
-    pub fn keeps(&self) -> bool {
+    pub fn is_enabled(&self) -> bool {
         self.dir.is_some()
     }
 
@@ -86,17 +86,17 @@ impl Cache {
     /// are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
-            (self.keeps() && !ids.is_empty()).then(|| CacheKey::new(&ids));
+            (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
     /// Returns the cache key of `value`, a digest of its bits. Without a work folder returns [`CacheKey::NONE`] and
     /// does not hash.
     pub fn key(&self, value: &impl Serialize) -> CacheKey {
         let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
-        match (self.keeps(), absent) {
+        match (self.is_enabled(), absent) {
             (false, _) => CacheKey::NONE,
             (true, None) => CacheKey::new(value),
-            (true, Some(absent)) => CacheKey::new(value).and(&absent),
+            (true, Some(absent)) => CacheKey::new(value).extended_by(&absent),
         }
     }
 
@@ -113,7 +113,7 @@ impl Cache {
     ///
     /// # Errors
     /// Fails if the folder cannot be read. A damaged entry counts as missing and causes a note.
-    pub fn find<T: DeserializeOwned>(&self, stage: &str, key: CacheKey) -> Result<Option<T>> {
+    pub fn load<T: DeserializeOwned>(&self, stage: &str, key: CacheKey) -> Result<Option<T>> {
         self.read_shard(stage, key, Shard::WHOLE)
     }
 
@@ -121,7 +121,7 @@ impl Cache {
     ///
     /// # Errors
     /// Fails if the folder cannot be written.
-    pub fn keep<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
+    pub fn store<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
         self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
@@ -130,17 +130,17 @@ impl Cache {
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
-    pub fn known<T: Serialize + DeserializeOwned>(
+    pub fn get_or_compute<T: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
         key: CacheKey,
         compute: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
-        if let Some(found) = self.find(stage, key)? {
+        if let Some(found) = self.load(stage, key)? {
             return Ok(found);
         }
         let found = compute()?;
-        self.keep(stage, key, &found)?;
+        self.store(stage, key, &found)?;
         Ok(found)
     }
 
@@ -165,7 +165,7 @@ impl Cache {
     /// # Errors
     /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
     /// [`Error::ShardDone`] once this shard is stored.
-    pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
+    pub fn compute_in_shards<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
         key: CacheKey,
@@ -173,7 +173,7 @@ impl Cache {
         compute: impl Fn(Range<usize>) -> Result<T>,
         join: impl FnOnce(&mut dyn Iterator<Item = Result<T>>) -> Result<U>,
     ) -> Result<U> {
-        if let Some(whole) = self.find(stage, key)? {
+        if let Some(whole) = self.load(stage, key)? {
             return Ok(whole);
         }
         let find = |part| self.read_shard(stage, key, part);
@@ -187,17 +187,17 @@ impl Cache {
             1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
             _ => join(&mut Shard::all(count).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
         };
-        self.keep(stage, key, &whole)?;
+        self.store(stage, key, &whole)?;
         self.complete(stage, whole)
     }
 
-    /// Computes a stage in shards like [`Cache::divided`], for results that stay on disk. `write` writes the result of
+    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the result of
     /// a range of units. Without a work folder the results go to a scratch file in the folder `scratch`. Returns the
     /// units of every shard with the file content that holds their result.
     ///
     /// # Errors
-    /// Fails where [`Cache::divided`] fails.
-    pub fn sharded_spill(
+    /// Fails where [`Cache::compute_in_shards`] fails.
+    pub fn spill_in_shards(
         &self,
         stage: &str,
         key: CacheKey,
@@ -316,7 +316,7 @@ impl Cache {
 
 /// Returns the indices of the shards, of `count`, that are not in `stored`, as text.
 fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
-    ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
+    format_ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }
 
 #[cfg(test)]

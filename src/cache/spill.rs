@@ -62,7 +62,7 @@ impl Spill {
     }
 
     /// Returns the number of bytes that this process has read back from all spills so far.
-    pub fn read_back() -> u64 {
+    pub fn bytes_read_back() -> u64 {
         READ_BACK.load(Ordering::Relaxed)
     }
 }

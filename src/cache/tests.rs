@@ -26,7 +26,7 @@ fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
         }
         Ok(all)
     };
-    let found = work.divided("squares", CacheKey::new(&units), units, compute, join);
+    let found = work.compute_in_shards("squares", CacheKey::new(&units), units, compute, join);
     (found, computed.into_inner())
 }
 
@@ -89,7 +89,7 @@ fn shards_of_another_input_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let open_for = |about: &str, part: Option<&str>| {
         let mut work = Cache::open(&request(folder.path(), part), about.to_owned()).unwrap();
-        work.follow_from(CacheKey::new(&about));
+        work.depend_on(CacheKey::new(&about));
         work
     };
     _ = squares(&open_for("the first", Some("1/2")), 8);
@@ -106,15 +106,15 @@ fn other_inputs_and_parameters_do_not_find_the_result() {
     let folder = tempfile::tempdir().unwrap();
     let key = |number: f64| CacheKey::new(&("stage", number));
     let mut work = open_cache(folder.path(), None);
-    work.follow_from(CacheKey::new(&"an input"));
-    work.keep("stage", key(0.0), &7u32).unwrap();
-    assert_eq!(work.find("stage", key(0.0)).unwrap(), Some(7u32));
-    assert_eq!(work.find::<u32>("stage", key(-0.0)).unwrap(), None);
-    assert_eq!(work.find::<u32>("another", key(0.0)).unwrap(), None);
+    work.depend_on(CacheKey::new(&"an input"));
+    work.store("stage", key(0.0), &7u32).unwrap();
+    assert_eq!(work.load("stage", key(0.0)).unwrap(), Some(7u32));
+    assert_eq!(work.load::<u32>("stage", key(-0.0)).unwrap(), None);
+    assert_eq!(work.load::<u32>("another", key(0.0)).unwrap(), None);
     let mut other = open_cache(folder.path(), None);
-    assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
-    other.follow_from(CacheKey::new(&"another input"));
-    assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
+    assert_eq!(other.load::<u32>("stage", key(0.0)).unwrap(), None);
+    other.depend_on(CacheKey::new(&"another input"));
+    assert_eq!(other.load::<u32>("stage", key(0.0)).unwrap(), None);
 }
 
 #[test]
@@ -160,8 +160,8 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
-    let spilled = |work: &Cache| work.sharded_spill("bytes", CacheKey::new(&1), 50, folder.path(), write);
-    assert_eq!(read(spilled(&Cache::none()).unwrap()), expected);
+    let spilled = |work: &Cache| work.spill_in_shards("bytes", CacheKey::new(&1), 50, folder.path(), write);
+    assert_eq!(read(spilled(&Cache::disabled()).unwrap()), expected);
     assert!(names_in(folder.path()).is_empty());
     for index in 1..=3 {
         assert!(spilled(&open_cache(folder.path(), Some(&format!("{index}/3")))).is_err());
@@ -179,7 +179,7 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
 fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
     let run_undivided =
-        |work: &Cache| work.known("alone", CacheKey::new(&1), || work.end_shard_before("alone").map(|()| 5u8));
+        |work: &Cache| work.get_or_compute("alone", CacheKey::new(&1), || work.end_shard_before("alone").map(|()| 5u8));
     let message = run_undivided(&open_cache(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("the next stage, alone, is not divided"), "{message}");
     assert_eq!(run_undivided(&open_cache(folder.path(), None)).unwrap(), 5);
@@ -191,20 +191,20 @@ fn listing_names_contents_and_cleaning_keeps_other_files() {
     let folder = tempfile::tempdir().unwrap();
     let work = folder.path().join("work");
     _ = squares(&open_cache(folder.path(), Some("2/3")), 9);
-    open_cache(folder.path(), None).keep("stage", CacheKey::new(&1), &[1u64, 2]).unwrap();
-    let listed = list(&work).unwrap();
+    open_cache(folder.path(), None).store("stage", CacheKey::new(&1), &[1u64, 2]).unwrap();
+    let listed = list_results(&work).unwrap();
     assert_eq!(listed.len(), 2);
     let [squares, stage] = [0, 1].map(|k| &listed[k]);
     assert_eq!((&squares.stage[..], squares.parts, &squares.missing[..]), ("squares", 3, &[1, 3][..]));
     assert_eq!((&stage.stage[..], stage.parts, stage.missing.len(), stage.damaged.len()), ("stage", 1, 0, 0));
     assert!(listed.iter().all(|entry| entry.belongs_to == "a test" && entry.bytes > 48));
-    assert!(text(&listed).contains("3 parts, missing: 1, 3"), "{}", text(&listed));
+    assert!(format_list(&listed).contains("3 parts, missing: 1, 3"), "{}", format_list(&listed));
     fs::write(work.join("mine.txt"), "kept").unwrap();
-    assert_eq!(clean(&work).unwrap().0, 2);
+    assert_eq!(remove_entries(&work).unwrap().0, 2);
     assert_eq!(names_in(&work), ["mine.txt"]);
     fs::remove_file(work.join("mine.txt")).unwrap();
-    clean(&work).unwrap();
-    assert!(!work.exists() && list(&work).is_err());
+    remove_entries(&work).unwrap();
+    assert!(!work.exists() && list_results(&work).is_err());
 }
 
 #[test]
@@ -217,8 +217,8 @@ fn invalid_or_vanished_folder_is_an_error_that_names_it() {
     let work = open_cache(folder.path(), None);
     fs::remove_dir(folder.path().join("work")).unwrap();
     for message in [
-        work.keep("stage", CacheKey::new(&1), &1).unwrap_err(),
-        work.find::<i32>("stage", CacheKey::new(&1)).unwrap_err(),
+        work.store("stage", CacheKey::new(&1), &1).unwrap_err(),
+        work.load::<i32>("stage", CacheKey::new(&1)).unwrap_err(),
     ] {
         assert!(message.to_string().contains("work"), "{message}");
     }
@@ -244,6 +244,6 @@ fn no_key_is_hashed_without_a_work_folder() {
             unreachable!("it would be hashed for nothing")
         }
     }
-    assert_eq!(Cache::none().key(&Untouched), CacheKey::NONE);
-    assert_eq!(CacheKey::NONE.and(&Untouched), CacheKey::NONE);
+    assert_eq!(Cache::disabled().key(&Untouched), CacheKey::NONE);
+    assert_eq!(CacheKey::NONE.extended_by(&Untouched), CacheKey::NONE);
 }

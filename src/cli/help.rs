@@ -7,7 +7,7 @@ use clap::{Command, CommandFactory};
 
 use super::args::Cli;
 use splatsieve::error::{Error, Result, ShowPath};
-use splatsieve::files::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
+use splatsieve::files::atomic::{Replace, StagedFile, StagedFolder, TargetKind, check_target};
 
 /// Start of the title line in the source of every manual page; identifies pages that this program wrote.
 const PAGE_TITLE: &str = ".TH splatsieve";
@@ -190,7 +190,7 @@ fn pages() -> Result<Vec<(String, Vec<u8>)>> {
 
 /// Writes pages to a new folder.
 fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
-    check_target(folder, Kind::Folder, &[], Replace::Never)?;
+    check_target(folder, TargetKind::Folder, &[], Replace::Never)?;
     let staged = StagedFolder::new(folder, Replace::Never)?;
     for (name, text) in pages {
         let path = staged.path().join(name);

@@ -12,7 +12,7 @@ fn stderr() -> io::Stderr {
 
 /// Writes `text` and a line feed to standard error, with control characters replaced by their codes. Ignores failures
 /// to write: the exit code still tells how the run ended.
-pub(super) fn tell(text: &str) {
+pub(super) fn show(text: &str) {
     let line = format!("{}\n", printable(text));
     let mut stderr = stderr().lock();
     let _ = stderr.write_all(line.as_bytes()).and_then(|()| stderr.flush());

@@ -17,7 +17,7 @@ use std::process::ExitCode;
 use clap::FromArgMatches;
 
 use args::Cli;
-use message::tell;
+use message::show;
 use run::run;
 use splatsieve::error::{Error, ShowPath};
 use splatsieve::files::atomic::{take_warnings, with_user_path};
@@ -42,12 +42,12 @@ pub(crate) fn main() -> ExitCode {
     let result = run(cli);
     // The outputs that these warnings name are complete, so the exit code does not change.
     for warning in take_warnings() {
-        tell(&format!("warning: {warning}"));
+        show(&format!("warning: {warning}"));
     }
     match result {
         Ok(()) => {
-            if let Some(peak_memory) = memory_plan::taken().filter(|_| explains) {
-                tell(&peak_memory);
+            if let Some(peak_memory) = memory_plan::peak_memory_text().filter(|_| explains) {
+                show(&peak_memory);
             }
             ExitCode::SUCCESS
         }
@@ -66,6 +66,6 @@ fn ended_by(error: Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let error = with_user_path(error);
-    tell(&format!("splatsieve: {error}"));
+    show(&format!("splatsieve: {error}"));
     ExitCode::from(error.kind().exit_code())
 }

@@ -9,9 +9,9 @@ use super::args::{
 };
 use gseq::Compression;
 use splatsieve::cache::CacheRequest;
-use splatsieve::commands::container::Storing;
+use splatsieve::commands::container::StoragePrecision;
 use splatsieve::commands::render::{RenderOptions, RenderSelection};
-use splatsieve::commands::video::{FilmPath, VideoOptions};
+use splatsieve::commands::video::{VideoCamera, VideoOptions};
 use splatsieve::diagnostics::demo::DemoOptions;
 use splatsieve::diagnostics::precision::{Knob, PrecisionOptions};
 use splatsieve::diagnostics::sweep::SweepOptions;
@@ -20,14 +20,14 @@ use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation::EvaluateOptions;
 use splatsieve::evaluation::method::Method;
 use splatsieve::files::atomic::Replace;
-use splatsieve::files::cameras::Times;
+use splatsieve::files::cameras::TimesSource;
 use splatsieve::files::image::write::ImageFormat;
 use splatsieve::machine::return_freed_memory;
 use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
-use splatsieve::models::{Conventions, Link, ZeroRotation};
+use splatsieve::models::{LinkMode, TrainingConventions, ZeroRotation};
 use splatsieve::outputs::kind::OutputKind;
-use splatsieve::pipeline::{Only, Request, RunOptions, Target};
+use splatsieve::pipeline::{PruneOrMerge, Request, RunOptions, Target};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
@@ -66,9 +66,9 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
                 input.cameras = Some(cameras.clone());
             }
             input.size = input.size.or(run.size);
-            if let (Times::Own, Some(times)) = (&input.times, &run.times) {
-                input.times = Times::named(times);
-                if let Times::Table(table) = &input.times {
+            if let (TimesSource::Own, Some(times)) = (&input.times, &run.times) {
+                input.times = TimesSource::parse(times);
+                if let TimesSource::Table(table) = &input.times {
                     args.recipe.check_recorded_path("times", table)?;
                 }
             }
@@ -77,7 +77,7 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
             conventions.time_duration = conventions.time_duration.or(run.time_duration);
             conventions.rot4d_unflipped |= run.rot4d_unflipped && !is_flipped;
             conventions.zero_rotation = conventions.zero_rotation.or(run.zero_rotation);
-            if let (Link::Auto, Some(link)) = (input.link, run.link) {
+            if let (LinkMode::Auto, Some(link)) = (input.link, run.link) {
                 input.link = link;
             }
             run
@@ -109,8 +109,8 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
         archive_psnr: args.archive_psnr.or(run.archive_psnr),
         made_for: record.provenance.map(|from| from.input_digest),
         only: match (args.prune_only, args.merge_only) {
-            (true, _) => Only::Prune,
-            (_, true) => Only::Merge,
+            (true, _) => PruneOrMerge::Prune,
+            (_, true) => PruneOrMerge::Merge,
             _ => run.mode,
         },
         target,
@@ -158,8 +158,8 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
 /// Returns the options of `render --video`, with the video written to `output`.
 pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> VideoOptions {
     let (path, views) = match args.path {
-        Some(views) => (FilmPath::Path(views), ViewSet::HeldOut),
-        None => (FilmPath::View(args.view), ViewSet::All),
+        Some(views) => (VideoCamera::Path(views), ViewSet::HeldOut),
+        None => (VideoCamera::View(args.view), ViewSet::All),
     };
     let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
@@ -180,7 +180,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
-    original.link = args.link.map_or(Link::Auto, Link::from);
+    original.link = args.link.map_or(LinkMode::Auto, LinkMode::from);
     original.conventions = conventions(&args.trained);
     args.cameras.apply_to(&mut original);
     original.memory = memory_budget(args.memory);
@@ -320,11 +320,11 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
 }
 
 /// Returns how `convert` stores the values of a container.
-pub(super) fn storing(args: &Convert) -> Storing {
+pub(super) fn storing(args: &Convert) -> StoragePrecision {
     match (args.raw, args.max_error.clone()) {
-        (true, _) => Storing::Exact(Compression::Raw),
-        (_, bounds) if bounds.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
-        (_, bounds) => Storing::Within(bounds, args.level.unwrap_or(15)),
+        (true, _) => StoragePrecision::Exact(Compression::Raw),
+        (_, bounds) if bounds.is_empty() => StoragePrecision::Exact(Compression::Zstd(args.level.unwrap_or(1))),
+        (_, bounds) => StoragePrecision::Within(bounds, args.level.unwrap_or(15)),
     }
 }
 
@@ -391,13 +391,13 @@ fn memory_budget(memory: Memory) -> Budget {
 }
 
 /// Returns the facts about the training that the command line states.
-fn conventions(trained: &Trained) -> Conventions {
+fn conventions(trained: &Trained) -> TrainingConventions {
     let zero_rotation = trained.zero_rotation.map(|handling| match handling {
         ZeroRotationArg::Drop => ZeroRotation::Drop,
         ZeroRotationArg::Identity => ZeroRotation::Identity,
     });
     let rot4d_unflipped = trained.rot4d == Some(Rot4d::Unflipped);
-    Conventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
+    TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
 /// Returns the options by which an input is opened. Temporary files go to `--scratch-dir`, otherwise beside `output`.
@@ -412,7 +412,7 @@ pub(super) fn input_options(
     let mut options = InputOptions { path: input.input, iteration: input.iteration, events, ..InputOptions::default() };
     options.allow_gaps = input.allow_gaps;
     options.conventions = conventions(&input.trained);
-    options.link = input.link.map_or(Link::Auto, Link::from);
+    options.link = input.link.map_or(LinkMode::Auto, LinkMode::from);
     options.memory = memory_budget(input.memory);
     options.is_scratch_named = input.scratch_dir.is_some();
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));

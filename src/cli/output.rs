@@ -3,7 +3,7 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
 
-use super::message::tell;
+use super::message::show;
 use splatsieve::error::{Error, Result, printable};
 use splatsieve::files::atomic::is_standard_output_used;
 
@@ -39,7 +39,7 @@ pub(super) fn print_as(is_json: bool, json: impl FnOnce() -> String, text: impl 
 pub(super) fn write(bytes: &[u8]) -> Result<()> {
     // Text after a result on standard output would corrupt the result.
     if is_standard_output_used() {
-        tell(String::from_utf8_lossy(bytes).trim_end());
+        show(String::from_utf8_lossy(bytes).trim_end());
         return Ok(());
     }
     let mut out = stdout().lock();

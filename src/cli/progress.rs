@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use console::Term;
 use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use super::message::{is_terminal, tell};
+use super::message::{is_terminal, show};
 use splatsieve::error::printable;
-use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, duration};
+use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, format_duration};
 
 /// Minimum seconds between two log lines of one task.
 const LOG_INTERVAL_SECONDS: u64 = 60;
@@ -107,15 +107,15 @@ impl EventSink for Display {
 
     fn message(&self, message: Message<'_>) {
         match message {
-            Message::Plan(text) => tell(text),
-            Message::Warning(text) => tell(&format!("warning: {text}")),
+            Message::Plan(text) => show(text),
+            Message::Warning(text) => show(&format!("warning: {text}")),
             Message::Discarded { .. } if self.is_quiet => (),
             Message::Discarded { stage, why } => {
                 let line = format!("{stage}  left out: {why}");
                 match is_terminal() {
                     // A failure to write to the terminal is ignored, as for all progress.
                     true => drop(self.shared.bars.println(printable(&line))),
-                    false => tell(&line),
+                    false => show(&line),
                 }
             }
         }
@@ -250,7 +250,7 @@ impl<'a> BarSnapshot<'a> {
 
 /// Returns an estimated time as text, rounded down to whole seconds.
 fn whole_seconds(seconds: f64) -> String {
-    if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { duration(seconds.floor()) }
+    if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { format_duration(seconds.floor()) }
 }
 
 /// Task whose progress is shown as lines in a log.
@@ -281,7 +281,7 @@ impl Log {
     fn print_summary(&self) {
         // A task that failed before its first unit prints nothing.
         if self.done.load(Ordering::Relaxed) > 0 && !self.is_nested {
-            tell(&self.line(self.start.elapsed(), true));
+            show(&self.line(self.start.elapsed(), true));
         }
     }
 
@@ -297,8 +297,8 @@ impl Log {
         }
         let _ = write!(line, " {}, {}, ", self.unit, rate(per_second, &self.unit));
         let _ = match self.total.filter(|&total| total > done && !ended) {
-            Some(total) => write!(line, "{} left", duration((total - done) as f64 / per_second)),
-            None => write!(line, "{}", duration(elapsed.as_secs_f64())),
+            Some(total) => write!(line, "{} left", format_duration((total - done) as f64 / per_second)),
+            None => write!(line, "{}", format_duration(elapsed.as_secs_f64())),
         };
         line
     }
@@ -311,7 +311,7 @@ impl TaskSink for Log {
         let relaxed = Ordering::Relaxed;
         // Several threads can find that a line is due; the exchange lets one of them print it.
         if now >= due && self.next.compare_exchange(due, now + LOG_INTERVAL_SECONDS, relaxed, relaxed).is_ok() {
-            tell(&self.line(self.start.elapsed(), false));
+            show(&self.line(self.start.elapsed(), false));
         }
     }
 
@@ -332,7 +332,7 @@ impl Drop for Log {
 /// Returns a rate as text with two or three digits, or the time per unit if it is below 0.5 units per second.
 fn rate(per_second: f64, unit: &str) -> String {
     if per_second > 0.0 && per_second < 0.5 {
-        return format!("{} each", duration(1.0 / per_second));
+        return format!("{} each", format_duration(1.0 / per_second));
     }
     let (value, scale) = match per_second {
         more if more >= 999.5e6 => (more / 1e9, "G "),

@@ -87,7 +87,7 @@ impl RecipeFlags {
         }
         for setting in &self.settings {
             let RecipeSetting::Parameter { section, key, value } = setting else { continue };
-            recipe = recipe.with(section, key, value).map_err(|message| {
+            recipe = recipe.with_parameter(section, key, value).map_err(|message| {
                 Error::usage(format!(
                     "--set {key}={value}: {}\n  see `splatsieve recipe --preset paper`",
                     message.trim_end()
@@ -95,7 +95,7 @@ impl RecipeFlags {
             })?;
         }
         if self.has_no_refine {
-            recipe = recipe.unrefined();
+            recipe = recipe.without_refinement();
         }
         let passes = self.settings.iter().filter_map(|setting| match setting {
             RecipeSetting::Pass(pass) => Some(*pass),
@@ -244,7 +244,7 @@ mod tests {
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
         expected.score.weigh_motion_by_life = true;
-        expected.select.low_priority = splatsieve::recipe::LowPriority::Rescue;
+        expected.select.low_priority = splatsieve::recipe::LowScorePolicy::Rescue;
         assert_eq!(recipe, expected);
     }
 

@@ -7,7 +7,7 @@ use super::args::{
     Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene,
 };
 use super::help;
-use super::message::tell;
+use super::message::show;
 use super::options::{
     cache_request, compress_options, demo_options, evaluate_options, input_options, precision_options, render_options,
     requested_kind, result_page_options, storing, sweep_options, test_scene_options, video_options, view_options,
@@ -15,14 +15,14 @@ use super::options::{
 use super::output::{self, print, print_as};
 use super::progress::Display;
 use splatsieve::cache::{self, Completion};
-use splatsieve::commands::video::{places, video};
+use splatsieve::commands::video::{side_by_side_text, video};
 use splatsieve::commands::{container, convert, render, score};
 use splatsieve::diagnostics::{demo, precision, selfcheck, sweep, test_scene};
 use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation;
 use splatsieve::evaluation::EvaluateOptions;
-use splatsieve::pipeline::summary::Detail;
-use splatsieve::pipeline::{compress, divided_stages, foresee};
+use splatsieve::pipeline::summary::SummaryDetail;
+use splatsieve::pipeline::{self, compress, shardable_stages};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
@@ -65,14 +65,14 @@ pub(super) fn run(cli: Cli) -> Result<()> {
 /// Runs `compress`; with `--list-stages` or `--dry-run`, prints the stages or the plan instead.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
-    let detail = if args.verbose { Detail::All } else { Detail::Most };
+    let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Most };
     let page_output = args.view.clone();
     let request = compress_options(args, quiet, events)?;
     if list_stages {
-        return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
+        return print(&shardable_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
     }
     if dry_run {
-        let foreseen = foresee(&request)?;
+        let foreseen = pipeline::dry_run(&request)?;
         return print_as(json, || foreseen.json(), || foreseen.text());
     }
     let page = page_output.map(|output| result_page_options(&request, output)).transpose()?;
@@ -82,9 +82,9 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     if let Some(page) = page {
         let written = write_page(&page);
         if written.is_err() {
-            tell(&format!("{} is complete; writing its page failed:", request.output.shown()));
+            show(&format!("{} is complete; writing its page failed:", request.output.shown()));
         }
-        tell(&written?);
+        show(&written?);
     }
     printed
 }
@@ -109,7 +109,8 @@ fn run_render(mut args: Render, events: &Events) -> Result<()> {
         let filmed = video(&options)?;
         tell_notes(&filmed.notes);
         let (path, (width, height), fps) = (options.output.shown(), filmed.size, options.fps);
-        let places = options.beside.as_deref().map(|right| format!("  {}\n", places(&options.input.path, right)));
+        let places =
+            options.beside.as_deref().map(|right| format!("  {}\n", side_by_side_text(&options.input.path, right)));
         let places = places.unwrap_or_default();
         return print(&format!(
             "{path}: {} frames of {width}x{height}, {fps} frames per second\n{places}",
@@ -136,21 +137,21 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
 
 /// Runs `sweep`.
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
-    let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
+    let (as_json, page) = (args.json, args.output.join(trade_off::PAGE_FILE));
     let found = sweep::sweep(&sweep_options(args, events))?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs `precision`.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
-    let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
+    let (as_json, page) = (args.json, args.output.join(report::precision::PAGE_FILE));
     let found = precision::precision(&precision_options(args, events)?)?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
 /// Runs `report`.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
-    let page = args.output.join(report::PAGE);
+    let page = args.output.join(report::PAGE_FILE);
     let mut evaluate = evaluate_options(args.models, events);
     evaluate.original.work = cache_request(args.kept);
     let options = ReportOptions {
@@ -265,11 +266,11 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
 /// Runs `cache`: lists or removes the entries of a cache folder.
 fn run_cache(args: &CacheFolder) -> Result<()> {
     if args.clean {
-        let (files, bytes) = cache::clean(&args.folder)?;
+        let (files, bytes) = cache::remove_entries(&args.folder)?;
         return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
     }
-    let listed = cache::list(&args.folder)?;
-    print_as(args.json, || json_text(&listed), || cache::text(&listed))
+    let listed = cache::list_results(&args.folder)?;
+    print_as(args.json, || json_text(&listed), || cache::format_list(&listed))
 }
 
 /// Runs `demo`.
@@ -283,7 +284,7 @@ fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
     let options = test_scene_options(args, events)?;
     print(&test_scene::run(&options)?.text())?;
     if let Some(folder) = options.output {
-        tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.shown()));
+        show(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.shown()));
     }
     Ok(())
 }
@@ -292,7 +293,7 @@ fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
 fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     let found = selfcheck::run();
     let printed = print_as(args.json, || json_text(&found), || found.text());
-    found.verdict()?;
+    found.check_passed()?;
     printed
 }
 
@@ -320,7 +321,7 @@ fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
 /// Writes notes to standard error, one per line.
 fn tell_notes(notes: &[String]) {
     for note in notes {
-        tell(&format!("note: {note}"));
+        show(&format!("note: {note}"));
     }
 }
 

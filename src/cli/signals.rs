@@ -2,12 +2,12 @@
 
 use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps};
 use splatsieve::error::ErrorKind;
-use splatsieve::files::atomic::withdraw_all;
+use splatsieve::files::atomic::remove_unfinished;
 
 /// Installs the handlers. A signal that ends the process then removes unfinished outputs first. A mapped input file
 /// that is truncated ends the process with a message that names the file.
 pub(super) fn install() {
-    end_on_signals(withdraw_all, |signal| ErrorKind::Interrupted { signal }.exit_code());
+    end_on_signals(remove_unfinished, |signal| ErrorKind::Interrupted { signal }.exit_code());
     report_cut_short_maps(TruncatedMapMessage {
         before: "splatsieve: ",
         unknown_path: "an input file",

@@ -6,9 +6,9 @@ use std::path::Path;
 
 use crate::TOOL;
 use crate::archive::MAGIC;
-use crate::commands::converted::Converted;
+use crate::commands::converted::ConvertReport;
 use crate::error::{Error, Result};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::files::open::open_file;
 use crate::limits::ReadLimit;
@@ -35,11 +35,11 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
-pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Converted> {
+pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<ConvertReport> {
     let (content, parts) = read_archive(path, memory)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
     let attributes = content.cloud.len() * Attributes::all().width(content.cloud.sh_degree());
-    let converted = |kind| Converted {
+    let converted = |kind| ConvertReport {
         path: output.to_owned(),
         kind,
         gaussians: content.cloud.len(),
@@ -53,17 +53,17 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
         )],
     };
     if !is_folder(&content) {
-        check_target(output, Kind::File, &[path], overwrite)?;
+        check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;
         staged.commit()?;
         return Ok(converted(OutputKind::Ply));
     }
     check_folder_name(output, "convert")?;
-    check_target(output, Kind::Folder, &[path], overwrite)?;
+    check_target(output, TargetKind::Folder, &[path], overwrite)?;
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
-    let marker = staged.path().join(MARKER);
+    let marker = staged.path().join(SUMMARY_FILE);
     let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;

@@ -11,19 +11,19 @@ use serde::Serialize;
 
 use crate::cache::{Completion, SpillWriter};
 use crate::commands::archive::is_archive;
-use crate::commands::converted::Converted;
+use crate::commands::converted::ConvertReport;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::files::open::open_file;
 use crate::limits::Limits;
-use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::models;
 use crate::models::stream::pack_stream;
-use crate::models::{ColumnInfo, InputModel, Size, Timing};
-use crate::outputs::bounds::{Bounds, MaxError};
+use crate::models::{ColumnInfo, InputModel, ModelSize, TimeOrigin};
+use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{
     BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
 };
@@ -33,7 +33,8 @@ use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
-    InputOptions, OpenedInput, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
+    InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, link_stream, open_cache, open_input,
+    open_stream,
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -42,20 +43,22 @@ const PACK_STAGE: &str = "pack";
 
 /// Precision with which `pack` stores values.
 #[derive(Debug, Clone)]
-pub enum Storing {
+pub enum StoragePrecision {
     /// All values exact to the bit, with the given compression.
     Exact(Compression),
     /// Errors of the named attributes within bounds, others exact; compressed by zstd at the given level.
     Within(Vec<MaxError>, i32),
 }
 
-impl Storing {
+impl StoragePrecision {
     /// Returns how the values of a scene are stored in a container. Calls `extent` (length of the scene, scene units)
     /// only if an error bound is relative to it.
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
-            Storing::Exact(compression) => Ok((*compression).into()),
-            Storing::Within(errors, level) => Ok(Packing::within(Bounds::from_errors(errors, extent)?, *level)),
+            StoragePrecision::Exact(compression) => Ok((*compression).into()),
+            StoragePrecision::Within(errors, level) => {
+                Ok(Packing::with_bounds(ErrorBounds::from_errors(errors, extent)?, *level))
+            }
         }
     }
 }
@@ -69,38 +72,45 @@ impl Storing {
 pub fn pack(
     input: &InputOptions,
     output: &Path,
-    storing: &Storing,
+    storing: &StoragePrecision,
     overwrite: Replace,
-) -> Result<Completion<Converted>> {
+) -> Result<Completion<ConvertReport>> {
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
 /// Runs [`pack`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
 /// error [`Error::ShardDone`].
-fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Converted> {
+fn pack_whole(
+    input: &InputOptions,
+    output: &Path,
+    storing: &StoragePrecision,
+    overwrite: Replace,
+) -> Result<ConvertReport> {
     check_container_name(output, "convert")?;
-    check_target(output, Kind::File, &[&input.path], overwrite)?;
+    check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
         Some(stream) if is_linked(stream.header(), input) => link_stream(stream, input, None)?,
         Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
         None => open_input(input)?,
     };
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, &input.events, |work, _| pack_estimates(work, storing))?
-        .tell_time(input.memory.tell, &input.events);
-    let (work, digest) = kept_work(input, &*opened.input)?;
-    let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
-    let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
+    MemoryPlan::fit_budget(workload(&*opened.input), input.memory, &input.events, |work, _| {
+        pack_estimates(work, storing)
+    })?
+    .send_times(input.memory.tell, &input.events);
+    let (work, digest) = open_cache(input, &*opened.input)?;
+    let extent = || Ok(first_frame_box(source)?.map_or(1.0, |bounds| bounds.extent()));
+    let packing = storing.packing(|| work.get_or_compute("extent", work.key(&()), extent))?;
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
     let progress = |frames: usize| input.events.task(PACK_STAGE, "states", (source.info().count * frames) as u64);
-    let staged = if work.keeps() {
+    let staged = if work.is_enabled() {
         let encode = |blocks: Range<usize>, to: &mut SpillWriter| {
-            let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
+            let progress = progress(blocks.clone().map(|block| packing.frames_of_block(source, block).len()).sum());
             spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
         };
-        let spills = work.sharded_spill(
+        let spills = work.spill_in_shards(
             PACK_STAGE,
-            packing.key(),
+            packing.cache_key(),
             packing.frame_blocks(source),
             &input.scratch_folder(),
             encode,
@@ -118,7 +128,7 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let info = opened.input.source().info();
-    let larger = Size::from_frames(bytes).why_larger_than(&opened.input.size()?);
+    let larger = ModelSize::from_frames(bytes).why_larger_than(&opened.input.size()?);
     let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
     Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
@@ -128,21 +138,21 @@ fn pack_arriving(
     stream: FrameStream<Stdin>,
     input: &InputOptions,
     output: &Path,
-    storing: &Storing,
+    storing: &StoragePrecision,
     overwrite: Replace,
-) -> Result<Converted> {
+) -> Result<ConvertReport> {
     let packing = storing.packing(|| {
         let message = "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
         Err(Error::usage(message))
     })?;
     let staged = StagedFile::new(output, overwrite)?;
-    let mut quota = room_to_pack(input, stream.header())?;
+    let mut quota = frame_quota(input, stream.header())?;
     let received = pack_stream(stream, staged.path(), packing, &input.events, |held| quota.admit(held.len()))?;
     let container = Container::open(staged.path())?;
     let (gaussians, frames) = (container.info().count, container.info().times.len());
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
-    let larger = Size::from_frames(bytes).why_larger_than(&Size::from_frames(received));
+    let larger = ModelSize::from_frames(bytes).why_larger_than(&ModelSize::from_frames(received));
     Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
@@ -154,8 +164,16 @@ fn packed(
     bytes: u64,
     larger: Option<String>,
     notes: Vec<String>,
-) -> Converted {
-    Converted { path: output.to_owned(), kind: OutputKind::Gseq, gaussians, frames: Some(frames), bytes, larger, notes }
+) -> ConvertReport {
+    ConvertReport {
+        path: output.to_owned(),
+        kind: OutputKind::Gseq,
+        gaussians,
+        frames: Some(frames),
+        bytes,
+        larger,
+        notes,
+    }
 }
 
 /// Writes any input to `to` as a frame stream and returns the opened input.
@@ -167,12 +185,12 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     let info = source.info();
     let header =
         StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
-    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpack_estimates)?;
-    plan.tell_time(input.memory.tell, &input.events);
-    let max_held = plan.limits.frames_held;
-    let read_plan = ReadPlan::every().holding(max_held);
+    let plan = MemoryPlan::fit_budget(workload(&*opened.input), input.memory, &input.events, unpack_estimates)?;
+    plan.send_times(input.memory.tell, &input.events);
+    let max_held = plan.limits.max_kept_frames;
+    let read_plan = ReadPlan::all_frames().keeping_at_most(max_held);
     let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Attributes::all(), &read_plan)?;
-    let mut state = frames.state();
+    let mut state = frames.state_buffer();
     if !info.times.is_empty() {
         frames.read(0, Attributes::all(), &mut state)?;
     }
@@ -180,7 +198,7 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
     for (frame, &time) in info.times.iter().enumerate() {
         frames.read(frame, info.varying, &mut state)?;
-        stream.frame(time, &state)?;
+        stream.write_frame(time, &state)?;
         progress.advance(1);
     }
     stream.finish()?;
@@ -212,7 +230,7 @@ pub fn verify(path: &Path) -> Result<VerifyReport> {
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_container_name(output, "info --repair")?;
     check_is_container(input)?;
-    check_target(output, Kind::File, &[input], overwrite)?;
+    check_target(output, TargetKind::File, &[input], overwrite)?;
     let staged = StagedFile::new(output, overwrite)?;
     let report = gseq::recover_within(input, staged.path(), Budget::default().read_limit().bytes())?;
     if report.frames == 0 {
@@ -244,12 +262,12 @@ pub struct InputInfo {
 pub fn info(options: &InputOptions) -> Result<InputInfo> {
     let input: Box<dyn InputModel> = match options.is_stream() {
         true => open_input(options)?.input,
-        false => models::open(&options.path, &options.opening())?,
+        false => models::open(&options.path, &options.open_options())?,
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
     let mut summary = InputSummary::new(&*input, &options.path, input.digest()?)?;
-    if input.timing() == Timing::Continuous {
+    if input.timing() == TimeOrigin::Continuous {
         summary.frames = None;
     }
     Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: input.notes() })
@@ -257,33 +275,34 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
 
 /// Returns the workload of reading `input` without rendering it.
 fn workload(input: &dyn InputModel) -> Workload {
-    Workload::new(input.source().info(), input.residence())
+    Workload::new(input.source().info(), input.memory_profile())
 }
 
 /// Returns the resource estimate of packing all frames into a container.
-fn pack_estimates(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
-    let seconds =
-        work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;
+fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEstimate> {
+    let seconds = work.reading_seconds(work.gaussian_count(), work.frames as f64)
+        + work.gaussian_count() * work.frames as f64 * SECONDS_TO_ENCODE;
     let level = match storing {
-        Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
-        Storing::Exact(_) => 0,
+        StoragePrecision::Exact(Compression::Zstd(level)) | StoragePrecision::Within(_, level) => *level,
+        StoragePrecision::Exact(_) => 0,
     };
     // Bounds may need the extent of the scene, for which the positions of the first frame are read.
     let (together, positions) = match storing {
-        Storing::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
-        Storing::Exact(_) => (FRAME_BLOCK, 0),
+        StoragePrecision::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
+        StoragePrecision::Exact(_) => (FRAME_BLOCK, 0),
     };
     let per_gaussian = vec![("positions", positions)];
-    let fixed = [work.writing_together(together), vec![work.compressing(level, together)]].concat();
+    let fixed = [work.tile_write_buffers(together), vec![work.compressor_memory(level, together)]].concat();
     vec![ResourceEstimate { stage: PACK_STAGE, reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
 /// Returns the resource estimate of writing all frames as a stream.
 fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
-    let states = ("states", work.state(Attributes::all()));
-    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
-    let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
-    vec![ResourceEstimate { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
+    let states = ("states", work.state_bytes(Attributes::all()));
+    let per_gaussian =
+        vec![states, ("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
+    let seconds = 2.0 * work.reading_seconds(work.gaussian_count(), work.frames as f64);
+    vec![ResourceEstimate { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.filling_blocks()] }]
 }
 
 impl InputInfo {
@@ -305,7 +324,7 @@ impl InputInfo {
             },
             if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
             input.bytes,
-            input.size.parts(),
+            input.size.parts_text(),
             input.digest,
         );
         for column in &self.columns {

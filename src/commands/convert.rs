@@ -8,16 +8,16 @@ use std::path::Path;
 
 use crate::TOOL;
 use crate::commands::archive::{is_archive, unpack_archive};
-use crate::commands::converted::Converted;
+use crate::commands::converted::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::limits::Limits;
-use crate::memory_plan::{Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::Attributes;
 use crate::outputs::kind::{OutputKind, check_folder_name};
-use crate::outputs::windows::{MAX_SINGLE_FRAMES, is_windowed};
-use crate::passes::TRACK_BLOCK;
+use crate::outputs::time_windows::{MAX_SINGLE_FRAME_GAUSSIANS, is_windowed};
+use crate::passes::TRACKS_PER_BLOCK;
 use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
@@ -44,7 +44,7 @@ pub fn convert(
     output: &Path,
     requested: Option<OutputKind>,
     overwrite: Replace,
-) -> Result<Converted> {
+) -> Result<ConvertReport> {
     if requested.is_none() {
         OutputKind::check_name(output)?;
     }
@@ -66,19 +66,20 @@ pub fn convert(
     if kind.is_folder() {
         check_folder_name(output, "convert")?;
     }
-    let target = if kind.is_folder() { Kind::Folder } else { Kind::File };
+    let target = if kind.is_folder() { TargetKind::Folder } else { TargetKind::File };
     check_target(output, target, &[&input.path], overwrite)?;
     let (gaussians, frames) = (source.info().count, source.info().times.len());
     kind.check_frames(frames, output)?;
     model.check_output(kind, output)?;
-    let work = Workload::new(source.info(), model.residence());
-    let plan = Plan::fit(work, input.memory, &input.events, |work, limits| vec![estimate(kind, work, limits)])?;
-    plan.tell_time(input.memory.tell, &input.events);
+    let work = Workload::new(source.info(), model.memory_profile());
+    let plan =
+        MemoryPlan::fit_budget(work, input.memory, &input.events, |work, limits| vec![estimate(kind, work, limits)])?;
+    plan.send_times(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     let mut write = |path: &Path| -> Result<u64> {
         notes.extend(model.write(&all, kind, path, &plan.limits, &input.events)?);
-        Ok(model.size_written(kind, path)?.whole())
+        Ok(model.size_written(kind, path)?.total())
     };
     let bytes = if kind.is_folder() {
         let staged = StagedFolder::new(output, overwrite)?;
@@ -87,7 +88,7 @@ pub fn convert(
             "tool": TOOL,
             "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folders(),
         });
-        let path = staged.path().join(MARKER);
+        let path = staged.path().join(SUMMARY_FILE);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
         staged.commit()?;
         bytes
@@ -97,27 +98,28 @@ pub fn convert(
         staged.commit()?;
         bytes
     };
-    Ok(Converted { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
+    Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 
 /// Returns the resource estimate of writing all frames once as `kind`, with curve fitting where the format needs it.
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
-    let state_bytes = work.state(Attributes::all());
+    let state_bytes = work.state_bytes(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs) || is_windowed(kind);
-    let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * state_bytes;
-    let mut fixed = work.writing();
+    let tracked = work.threads * TRACKS_PER_BLOCK as u64 * work.frames * state_bytes;
+    let mut fixed = work.write_buffers();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));
-    let single = (work.gaussians * work.frames).min(MAX_SINGLE_FRAMES as u64) * (state_bytes + FRAME_IMAGE_BYTES);
+    let single =
+        (work.gaussians * work.frames).min(MAX_SINGLE_FRAME_GAUSSIANS as u64) * (state_bytes + FRAME_IMAGE_BYTES);
     fixed.push(("single frames", if kind == OutputKind::Tsog { single } else { 0 }));
     let per_gaussian = vec![
         ("kept", 16),
         ("result", work.input.reduced + work.input.file + state_bytes),
         ("readers", work.input.reader),
-        ("held", if fits { 0 } else { work.held(limits, Attributes::all()) }),
+        ("held", if fits { 0 } else { work.kept_frames_bytes(limits, Attributes::all()) }),
         ("fitted", if fits { FITTED_BYTES } else { 0 }),
         ("encoded", kind.encoding_bytes(state_bytes)),
     ];
-    let seconds =
-        work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;
+    let seconds = work.reading_seconds(work.gaussian_count(), work.frames as f64)
+        + work.gaussian_count() * work.frames as f64 * SECONDS_TO_ENCODE;
     ResourceEstimate { stage: "convert", reads: 1.0, seconds, per_gaussian, fixed }
 }

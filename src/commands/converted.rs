@@ -9,7 +9,7 @@ use crate::outputs::kind::OutputKind;
 
 /// Result of `convert`.
 #[derive(Debug, Serialize)]
-pub struct Converted {
+pub struct ConvertReport {
     /// Path of the output.
     pub path: PathBuf,
     /// Format of the output.
@@ -27,7 +27,7 @@ pub struct Converted {
     pub notes: Vec<String>,
 }
 
-impl Converted {
+impl ConvertReport {
     /// Returns one line for the terminal, and a second one if the output is larger than the input.
     pub fn text(&self) -> String {
         let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));

@@ -9,17 +9,17 @@ use rayon::prelude::*;
 use crate::TOOL;
 use crate::cache::{Completion, Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Camera, FrameView};
 use crate::outputs::kind::check_folder_name;
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::summary::{CameraSummary, InputSummary};
 use crate::progress::Events;
 use crate::render::Image;
-use crate::scene::pictures::{self, ViewSet, background, picture, pictures};
+use crate::scene::pictures::{self, ViewSet, render_background, select_view, select_views};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 
@@ -49,7 +49,7 @@ pub struct RenderOptions {
     pub selection: RenderSelection,
     /// Set of views from which `selection` selects.
     pub views: ViewSet,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
     /// Output file or folder.
     pub output: PathBuf,
@@ -59,7 +59,7 @@ pub struct RenderOptions {
 
 /// Result of `render`.
 #[derive(Debug)]
-pub struct Rendered {
+pub struct RenderReport {
     /// Number of rendered views.
     pub views: usize,
     /// Notes for the user.
@@ -68,40 +68,40 @@ pub struct Rendered {
 
 /// Renders views of an input to image files.
 ///
-/// Memory: one frame state, and per thread one render with its footprints ([`crate::scene::pictures::need`]).
+/// Memory: one frame state, and per thread one render with its footprints ([`crate::scene::pictures::render_estimate`]).
 ///
 /// # Errors
 /// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or
 /// cannot be written. Leaves no partial output.
-pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
+pub fn render(options: &RenderOptions) -> Result<Completion<RenderReport>> {
     Completion::from_result(render_whole(options))
 }
 
 /// Runs [`render`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
 /// error [`Error::ShardDone`].
-fn render_whole(options: &RenderOptions) -> Result<Rendered> {
+fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
     let output = options.output.as_path();
     let (kind, format) = match options.selection {
         RenderSelection::All(format) => {
             check_folder_name(output, "--all")?;
-            (Kind::Folder, format)
+            (TargetKind::Folder, format)
         }
-        RenderSelection::One { .. } => (Kind::File, format_of(output)?),
+        RenderSelection::One { .. } => (TargetKind::File, format_of(output)?),
     };
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_target(output, kind, &inputs, options.overwrite)?;
-    if options.input.work.is_some() && kind == Kind::File {
+    if options.input.work.is_some() && kind == TargetKind::File {
         return Err(Error::usage("--cache: expected --all, found a single view, which cannot be divided into shards"));
     }
     let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
-    scene.keep_to(options.input.memory, |work, limits| estimates(work, limits, options.input.work.is_some()))?;
+    scene.plan_memory(options.input.memory, |work, limits| estimates(work, limits, options.input.work.is_some()))?;
     let source = scene.source();
     let times = &source.info().times;
-    let background = background(options.background, &scene)?;
+    let background = render_background(options.background, &scene)?;
     let chosen = match options.selection {
-        RenderSelection::One { frame, view } => vec![picture(&scene.rig, times, options.views, frame, view)?],
-        RenderSelection::All(_) => pictures(&scene.rig, times, options.views)?,
+        RenderSelection::One { frame, view } => vec![select_view(&scene.rig, times, options.views, frame, view)?],
+        RenderSelection::All(_) => select_views(&scene.rig, times, options.views)?,
     };
     let job = RenderJob {
         source,
@@ -111,16 +111,16 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
         format,
         events: &scene.events,
     };
-    if kind == Kind::File {
+    if kind == TargetKind::File {
         let staged = StagedFile::new(output, options.overwrite)?;
         job.write(&chosen, |_| staged.path().to_owned())?;
         staged.commit()?;
     } else {
         let name = |picture: &FrameView| format!("{}.{}", picture.name(), format.extension());
-        let staged = if scene.work.keeps() {
+        let staged = if scene.work.is_enabled() {
             let key = scene.work.key(&(&chosen, background, format.extension()));
             let make = |some: Range<usize>, to: &mut SpillWriter| job.spill(&chosen[some], to);
-            let spills = scene.work.sharded_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
+            let spills = scene.work.spill_in_shards(NAME, key, chosen.len(), &scene.scratch, make)?;
             scene.work.end_shard_before("writing")?;
             let staged = StagedFolder::new(output, options.overwrite)?;
             for (some, spill) in spills {
@@ -142,18 +142,18 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
             },
             "background": background,
         });
-        let path = staged.path().join(MARKER);
+        let path = staged.path().join(SUMMARY_FILE);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
         staged.commit()?;
     }
     let notes = scene.notes.into_iter().chain(scene.work.take_notes()).collect();
-    Ok(Rendered { views: chosen.len(), notes })
+    Ok(RenderReport { views: chosen.len(), notes })
 }
 
 /// Returns the resource estimate of rendering. `keeps_files`: the encoded files of a batch stay in memory until they
 /// are written.
 fn estimates(work: &Workload, limits: &Limits, keeps_files: bool) -> Vec<ResourceEstimate> {
-    vec![pictures::need(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
+    vec![pictures::render_estimate(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
 }
 
 /// Returns the image format that the extension of `output` gives.
@@ -199,15 +199,21 @@ impl RenderJob<'_> {
         mut take: impl FnMut(T) -> Result<()>,
     ) -> Result<()> {
         let progress = self.events.task(NAME, "views", pictures.len() as u64);
-        show([RenderedSource::all(self.source)], self.cameras, pictures, Batch::one_frame(&self.limits), |views| {
-            // Renders are parallel inside too, because a frame can have fewer views than there are threads.
-            let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
-                let made = render_one(view.picture, &view.render(0, self.background))?;
-                progress.advance(1);
-                Ok(made)
-            });
-            made.collect::<Result<Vec<T>>>()?.into_iter().try_for_each(&mut take)
-        })
+        for_each_view_batch(
+            [RenderedSource::all(self.source)],
+            self.cameras,
+            pictures,
+            BatchLimits::one_frame(&self.limits),
+            |views| {
+                // Renders are parallel inside too, because a frame can have fewer views than there are threads.
+                let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
+                    let made = render_one(view.picture, &view.render(0, self.background))?;
+                    progress.advance(1);
+                    Ok(made)
+                });
+                made.collect::<Result<Vec<T>>>()?.into_iter().try_for_each(&mut take)
+            },
+        )
     }
 }
 

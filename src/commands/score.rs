@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::Journal;
 use crate::memory_plan::Workload;
 use crate::outputs::rows::RowTable;
 use crate::pipeline::planning::InputMeta;
-use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::{RunPlan, open_to_measure};
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
@@ -25,10 +25,10 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     if !matches!(extension.as_str(), "npz" | "csv") {
         return Err(Error::usage(format!("{}: expected a name that ends in .npz or .csv", output.shown())));
     }
-    check_target(output, Kind::File, &[&input.path], overwrite)?;
+    check_target(output, TargetKind::File, &[&input.path], overwrite)?;
     let journal = &mut Journal::default();
     let plan = |meta: InputMeta, _: &Workload| {
-        Ok(RunPlan::to_measure(Measure::new(recipe, meta.has_cameras, UserOverrides::default()), meta))
+        Ok(RunPlan::measure_only(MeasureStages::new(recipe, meta.has_cameras, UserOverrides::default()), meta))
     };
     let (scene, plan, arrived) = open_to_measure(input, plan, journal)?;
     let scored = plan.measure.measure(&scene, arrived, journal)?;
@@ -49,7 +49,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     staged.commit()?;
     Ok(ScoreReport {
         output: output.to_owned(),
-        gaussians: scored.count(),
+        gaussians: scored.gaussian_count(),
         kept: scored.selection.counts.kept,
         notes: scene.notes,
     })

@@ -8,17 +8,17 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::ResourceEstimate;
 use crate::model::{Camera, FrameView, Rig, Shot};
 use crate::outputs::film::{FilmFormat, FilmOutput};
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::progress::Events;
 use crate::render::Image;
+use crate::scene::camera_path::cameras_along;
 use crate::scene::open_compressed;
-use crate::scene::path::along;
-use crate::scene::pictures::{self, ViewSet, background};
+use crate::scene::pictures::{self, ViewSet, render_background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
 /// Name of the rendering stage, for progress.
@@ -28,7 +28,7 @@ const VIEWS_BETWEEN_STOPS: usize = 24;
 
 /// Camera of a video.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum FilmPath {
+pub enum VideoCamera {
     /// Camera of one view, which may move over time; `None`: the view with the lowest number.
     View(Option<u32>),
     /// Path through the cameras of these views, in order; empty: through all views by number.
@@ -44,12 +44,12 @@ pub struct VideoOptions {
     /// Other model with the same frames, shown to the right.
     pub beside: Option<PathBuf>,
     /// Camera of the video.
-    pub path: FilmPath,
+    pub path: VideoCamera,
     /// Set of views from which `path` selects.
     pub views: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
     /// Output file; its extension gives the format.
     pub output: PathBuf,
@@ -59,7 +59,7 @@ pub struct VideoOptions {
 
 /// Result of rendering a video.
 #[derive(Debug)]
-pub struct Filmed {
+pub struct VideoReport {
     /// Number of video frames.
     pub frames: usize,
     /// Width and height, pixels.
@@ -75,7 +75,7 @@ pub struct Filmed {
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
 /// if the views have different sizes, if the output cannot be written, or if the encoder is missing or fails. Leaves no
 /// partial output.
-pub fn video(options: &VideoOptions) -> Result<Filmed> {
+pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     let output = options.output.as_path();
     let format = FilmFormat::from_path(output)?;
     if options.input.work.is_some() {
@@ -86,21 +86,21 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     inputs.extend(options.beside.as_deref());
-    check_target(output, Kind::File, &inputs, options.overwrite)?;
+    check_target(output, TargetKind::File, &inputs, options.overwrite)?;
 
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = shots_with_times(&mut opened, options.input.frames.is_some());
     let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
-    scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
+    scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
         // palette (5).
-        let mut estimate = pictures::need(work, limits, NAME, models, models * 12);
+        let mut estimate = pictures::render_estimate(work, limits, NAME, models, models * 12);
         estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![estimate]
     })?;
-    let background = background(options.background, &scene)?;
+    let background = render_background(options.background, &scene)?;
     let shots = shots(own.as_deref().unwrap_or(&scene.rig.shots), &scene.rig, options.views)?;
     let (cameras, views) = plan_views(&options.path, &shots, &scene.rig, &scene.source().info().times)?;
     let size = common_size(&cameras)?;
@@ -116,7 +116,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     }
     film.finish()?;
     staged.commit()?;
-    Ok(Filmed { frames: views.len(), size, notes: scene.notes })
+    Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
 /// Returns a copy of the shots (views of the scene) of `opened` with their times, and removes the times in `opened`, so
@@ -146,9 +146,9 @@ fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
 }
 
 /// Returns the cameras of the video and the view of each video frame, in order.
-fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
+fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match path {
-        FilmPath::View(view) => {
+        VideoCamera::View(view) => {
             let view = view.unwrap_or_else(|| shots.first().map_or(0, |shot| shot.view));
             let own = shots_of_view(shots, view, "--view", rig)?;
             let time_distance = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
@@ -158,7 +158,7 @@ fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Resu
             let film_view = |(frame, time)| FrameView { frame, view, camera: camera(time) };
             Ok((rig.cameras.clone(), times.iter().enumerate().map(film_view).collect()))
         }
-        FilmPath::Path(views) => {
+        VideoCamera::Path(views) => {
             let all = || shots.chunk_by(|a, b| a.view == b.view).map(|shots| shots[0].view).collect();
             let views: Vec<u32> = if views.is_empty() { all() } else { views.clone() };
             if views.len() < 2 {
@@ -175,7 +175,7 @@ fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Resu
             common_size(&stops)?;
             let count = if times.len() > 1 { times.len() } else { VIEWS_BETWEEN_STOPS * (stops.len() - 1) + 1 };
             let film_view = |k: usize| FrameView { frame: k.min(times.len() - 1), view: 0, camera: k as u32 };
-            Ok((along(&stops, count), (0..count).map(film_view).collect()))
+            Ok((cameras_along(&stops, count), (0..count).map(film_view).collect()))
         }
     }
 }
@@ -218,7 +218,7 @@ impl FilmSource<'_> {
     /// Renders all views of the `subjects` side by side and adds them to `film`.
     fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = self.events.task(NAME, "frames", self.views.len() as u64);
-        show(subjects, self.cameras, self.views, Batch::one_frame(self.limits), |views| {
+        for_each_view_batch(subjects, self.cameras, self.views, BatchLimits::one_frame(self.limits), |views| {
             let images: Vec<Image> = views
                 .par_iter()
                 .map(|view: &ViewStates<'_, S>| {
@@ -228,7 +228,7 @@ impl FilmSource<'_> {
                 .collect();
             images.iter().try_for_each(|image| {
                 progress.advance(1);
-                film.add(image)
+                film.add_frame(image)
             })
         })
     }
@@ -249,6 +249,6 @@ fn side_by_side(mut images: Vec<Image>) -> Image {
 }
 
 /// Returns a line that says which model is left and which is right.
-pub fn places(left: &Path, right: &Path) -> String {
+pub fn side_by_side_text(left: &Path, right: &Path) -> String {
     format!("left: {}; right: {}", left.shown(), right.shown())
 }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::diagnostics::demo_scene::Playground;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::EvaluateOptions;
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
 use crate::files::container::Container;
 use crate::limits::Limits;
 use crate::memory_plan::Budget;
@@ -18,7 +18,7 @@ use crate::model::{Camera, FrameView, Rig, Split};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::outputs::kind::{OutputKind, check_folder_name};
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
 use crate::player::view::{ViewOptions, view};
 use crate::progress::Events;
@@ -29,21 +29,21 @@ use crate::scene::pictures::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
 /// File name of the generated scene.
-pub const SCENE: &str = "scene.gseq";
+pub const SCENE_FILE: &str = "scene.gseq";
 /// File name of the cameras of the generated scene.
-pub const CAMERAS: &str = "cameras.json";
+pub const CAMERAS_FILE: &str = "cameras.json";
 /// File name of the scene compressed to a tenth of its Gaussians and refined.
-pub const TENTH: &str = "compressed_10x.gseq";
+pub const COMPRESSED_10X_FILE: &str = "compressed_10x.gseq";
 /// File name of the scene compressed to a twentieth of its Gaussians and refined.
-pub const TWENTIETH: &str = "compressed_20x.gseq";
+pub const COMPRESSED_20X_FILE: &str = "compressed_20x.gseq";
 /// File name of the scene compressed to a tenth of its Gaussians without refinement.
-pub const PRUNED: &str = "pruned_10x.gseq";
-/// File name of the page that plays the scene beside [`TENTH`].
-pub const PLAYER: &str = "player.html";
+pub const PRUNED_10X_FILE: &str = "pruned_10x.gseq";
+/// File name of the page that plays the scene beside [`COMPRESSED_10X_FILE`].
+pub const PLAYER_FILE: &str = "player.html";
 /// Name of the folder with the report.
-pub const REPORT: &str = "report";
-/// File name of the film: the scene, [`PRUNED`] and [`TENTH`] side by side.
-pub const FILM: &str = "comparison.gif";
+pub const REPORT_FOLDER: &str = "report";
+/// File name of the film: the scene, [`PRUNED_10X_FILE`] and [`COMPRESSED_10X_FILE`] side by side.
+pub const FILM_FILE: &str = "comparison.gif";
 
 /// Size of one render in the film, pixels: three of them, side by side, fit a page of text.
 const FILM_RENDER: (u32, u32) = (280, 210);
@@ -108,7 +108,7 @@ pub struct DemoReport {
 pub fn run(options: &DemoOptions) -> Result<DemoReport> {
     let output = &options.output;
     check_folder_name(output, "demo")?;
-    check_target(output, Kind::Folder, &[], options.overwrite)?;
+    check_target(output, TargetKind::Folder, &[], options.overwrite)?;
     let staged = StagedFolder::new(output, options.overwrite)?;
     let report = run_in(staged.path(), options)?;
     staged.commit()?;
@@ -117,20 +117,24 @@ pub fn run(options: &DemoOptions) -> Result<DemoReport> {
 
 fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     let made = Playground::new(options.gaussians, options.frames);
-    write_sequence(&made, OutputKind::Gseq, &folder.join(SCENE), 1, &options.events)?;
-    let cameras = folder.join(CAMERAS);
+    write_sequence(&made, OutputKind::Gseq, &folder.join(SCENE_FILE), 1, &options.events)?;
+    let cameras = folder.join(CAMERAS_FILE);
     fs::write(&cameras, cameras_json(&made.rig())).map_err(Error::io("write", &cameras))?;
 
     let fast = Recipe::preset("default")?.with_effort(Effort::Fast);
-    let refined = options.steps.map_or(fast.clone(), |steps| fast.refining_by(steps));
-    let models = [(TENTH, 0.1, refined.clone()), (TWENTIETH, 0.05, refined), (PRUNED, 0.1, fast.unrefined())];
+    let refined = options.steps.map_or(fast.clone(), |steps| fast.with_refinement_steps(steps));
+    let models = [
+        (COMPRESSED_10X_FILE, 0.1, refined.clone()),
+        (COMPRESSED_20X_FILE, 0.05, refined),
+        (PRUNED_10X_FILE, 0.1, fast.without_refinement()),
+    ];
     let mut limits = Limits::NONE;
     for (name, ratio, recipe) in models {
         limits = compress(folder, name, Target::Ratio(ratio), &recipe, options)?;
     }
     film(folder, &made.rig(), &limits, &options.events)?;
     let original = InputOptions {
-        path: folder.join(SCENE),
+        path: folder.join(SCENE_FILE),
         cameras: Some(cameras),
         memory: options.memory,
         events: options.events.clone(),
@@ -138,19 +142,19 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     };
     view(&ViewOptions {
         original: original.clone(),
-        compressed: Some(folder.join(TENTH)),
+        compressed: Some(folder.join(COMPRESSED_10X_FILE)),
         max_frames: options.frames,
         original_frames: None,
         original_degree: None,
         background: None,
         page_limit: u64::MAX,
-        output: folder.join(PLAYER),
+        output: folder.join(PLAYER_FILE),
         overwrite: Replace::Never,
     })?;
     let found = report::report_whole(&ReportOptions {
         evaluate: EvaluateOptions {
             original,
-            compressed: folder.join(TENTH),
+            compressed: folder.join(COMPRESSED_10X_FILE),
             ground_truth: None,
             views: ViewSet::HeldOut,
             max_frames: None,
@@ -160,14 +164,14 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
             csv: None,
             overwrite: Replace::Never,
         },
-        more: vec![folder.join(TWENTIETH), folder.join(PRUNED)],
+        more: vec![folder.join(COMPRESSED_20X_FILE), folder.join(PRUNED_10X_FILE)],
         sweep: None,
         precision: None,
         render_time: false,
-        output: folder.join(REPORT),
+        output: folder.join(REPORT_FOLDER),
         overwrite: Replace::Never,
     })?;
-    let marker = folder.join(MARKER);
+    let marker = folder.join(SUMMARY_FILE);
     let summary = serde_json::json!({ "tool": crate::TOOL, "verdict": found.result.verdict });
     fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
     Ok(DemoReport::new(&found))
@@ -176,9 +180,9 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
 /// Compresses the scene in `folder` into the file `name` there. Returns the limits (such as the block sizes) with which
 /// the run fits into the memory limit.
 fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options: &DemoOptions) -> Result<Limits> {
-    let input = Box::new(Container::open(&folder.join(SCENE))?);
+    let input = Box::new(Container::open(&folder.join(SCENE_FILE))?);
     let rig = Playground::new(options.gaussians, options.frames).rig();
-    let mut scene = Scene::new(PathBuf::from(SCENE), input, rig, Some(Split::Train))?;
+    let mut scene = Scene::new(PathBuf::from(SCENE_FILE), input, rig, Some(Split::Train))?;
     scene.events = options.events.clone();
     let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
     let request = Request { target: Some(target), ..Request::new(plain, folder.join(name), recipe.clone()) };
@@ -216,7 +220,7 @@ fn cameras_json(rig: &Rig) -> String {
 
 /// Writes the film, an animated image: the scene, the pruned and the refined model side by side.
 fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()> {
-    let models = [SCENE, PRUNED, TENTH].map(|name| Container::open(&folder.join(name)));
+    let models = [SCENE_FILE, PRUNED_10X_FILE, COMPRESSED_10X_FILE].map(|name| Container::open(&folder.join(name)));
     let [scene, pruned, refined] = models;
     let (scene, pruned, refined) = (scene?, pruned?, refined?);
     let camera = smaller(&rig.cameras[FILM_VIEW as usize]);
@@ -224,12 +228,12 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     let step = frames.div_ceil(FILM_FRAMES).max(1);
     let picture = |frame| FrameView { frame, view: FILM_VIEW, camera: 0 };
     let pictures: Vec<FrameView> = (0..frames).step_by(step).map(picture).collect();
-    let path = folder.join(FILM);
+    let path = folder.join(FILM_FILE);
     let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
     let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
     let progress = events.task("film", "frames", pictures.len() as u64);
     let subjects = [RenderedSource::all(&scene), RenderedSource::all(&pruned), RenderedSource::all(&refined)];
-    show(subjects, &[camera], &pictures, Batch::one_frame(limits), |views| {
+    for_each_view_batch(subjects, &[camera], &pictures, BatchLimits::one_frame(limits), |views| {
         let render = |view: &ViewStates<'_, 3>| {
             let black = rig.background.unwrap_or_default();
             beside([0, 1, 2].map(|subject| view.render(subject, black)))
@@ -237,7 +241,7 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
         let images: Vec<Image> = views.par_iter().map(render).collect();
         images.iter().try_for_each(|image| {
             progress.advance(1);
-            film.add(image)
+            film.add_frame(image)
         })
     })?;
     film.finish()
@@ -279,32 +283,34 @@ impl DemoReport {
     fn new(found: &report::ReportData) -> DemoReport {
         let first = &found.result.evaluation;
         let mut models = vec![DemoModel {
-            name: SCENE,
+            name: SCENE_FILE,
             gaussians: first.count.original,
             bytes: first.bytes.original,
             psnr: None,
             ssim: None,
         }];
         let evaluations = std::iter::once(first).chain(found.others.iter().map(|other| &other.evaluation));
-        models.extend([TENTH, TWENTIETH, PRUNED].into_iter().zip(evaluations).map(|(name, of)| DemoModel {
-            name,
-            gaussians: of.count.compressed,
-            bytes: of.bytes.compressed,
-            psnr: Some(of.loss.overall.psnr),
-            ssim: Some(of.loss.overall.ssim),
-        }));
+        models.extend([COMPRESSED_10X_FILE, COMPRESSED_20X_FILE, PRUNED_10X_FILE].into_iter().zip(evaluations).map(
+            |(name, of)| DemoModel {
+                name,
+                gaussians: of.count.compressed,
+                bytes: of.bytes.compressed,
+                psnr: Some(of.loss.overall.psnr),
+                ssim: Some(of.loss.overall.ssim),
+            },
+        ));
         DemoReport {
             models,
             renders: first.cameras.pairs,
             written: vec![
-                (PLAYER, "the scene and a tenth of it, moving, in a browser"),
+                (PLAYER_FILE, "the scene and a tenth of it, moving, in a browser"),
                 ("report/report.html", "the three results beside the scene"),
-                (FILM, "left the scene, middle a tenth without refinement, right a tenth refined"),
-                (SCENE, "the scene"),
-                (CAMERAS, "its cameras"),
-                (TENTH, "a tenth of the Gaussians, refined"),
-                (TWENTIETH, "a twentieth of the Gaussians, refined"),
-                (PRUNED, "a tenth of the Gaussians, without refinement"),
+                (FILM_FILE, "left the scene, middle a tenth without refinement, right a tenth refined"),
+                (SCENE_FILE, "the scene"),
+                (CAMERAS_FILE, "its cameras"),
+                (COMPRESSED_10X_FILE, "a tenth of the Gaussians, refined"),
+                (COMPRESSED_20X_FILE, "a twentieth of the Gaussians, refined"),
+                (PRUNED_10X_FILE, "a tenth of the Gaussians, without refinement"),
             ],
         }
     }
@@ -332,7 +338,7 @@ impl DemoReport {
         for (name, about) in &self.written {
             let _ = writeln!(out, "  {name:<24} {about}");
         }
-        let page = folder.join(PLAYER);
+        let page = folder.join(PLAYER_FILE);
         let _ = writeln!(out, "\nSee it:   {} {}", opener(), page.shown());
         out
     }

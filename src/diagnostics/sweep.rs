@@ -12,14 +12,14 @@ use std::path::PathBuf;
 use super::whole_run::{WholeRun, result_name, with_training_views};
 use crate::TOOL;
 use crate::error::{Error, Result};
-use crate::evaluation::cost::Repeats;
+use crate::evaluation::cost::RepeatLimits;
 use crate::evaluation::method::{Method, MethodKind, STEPS, refining_by};
-use crate::evaluation::trade_off::{EffortCurve, Setting, TradeOff, TradeOffPoint};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::evaluation::trade_off::{EffortCurve, EffortSetting, TradeOff, TradeOffPoint};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::Target;
-use crate::report::trade_off::{PAGE, page};
+use crate::report::trade_off::{PAGE_FILE, page};
 use crate::scene::{InputOptions, open_scene};
 
 /// Options of a sweep, which measures trade-off curves of size against quality.
@@ -66,7 +66,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_folder_name(&options.output, "sweep")?;
-    check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
+    check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut fractions = options.fractions.clone();
     fractions.sort_unstable_by(|a, b| b.total_cmp(a));
@@ -80,7 +80,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         input: &options.input,
         scratch: &staged.path().join("point"),
         name,
-        repeats: Repeats::always(options.runs),
+        repeats: RepeatLimits::exactly(options.runs),
         max_frames: options.max_frames,
         background: options.background,
     };
@@ -95,7 +95,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let progress = options.input.events.task("sweep", "points", (points.len() + steps.len()) as u64);
     for (method, fraction) in points {
         if !exceeds_merging(method, fraction, &found) {
-            let point = measure(&run, method, fraction, &method.means()?, &mut found)?;
+            let point = measure(&run, method, fraction, &method.kind()?, &mut found)?;
             found.points.push(point);
         }
         progress.advance(1);
@@ -104,7 +104,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     for value in steps {
         let (method, fraction) = (Method::Default, Some(options.steps_at));
         let point = measure(&run, method, fraction, &refining_by(value)?, &mut found)?;
-        settings.push(Setting { value, point });
+        settings.push(EffortSetting { value, point });
         progress.advance(1);
     }
     if !settings.is_empty() {
@@ -123,9 +123,9 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         write("knobs.csv", found.knobs_csv())?;
     }
     write("sweep.json", found.json())?;
-    write(PAGE, page(&found))?;
+    write(PAGE_FILE, page(&found))?;
     // The marker file lets a later run recognize the folder as one that it may replace.
-    write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
+    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
     staged.commit()?;
     Ok(found)
 }

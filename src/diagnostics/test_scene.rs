@@ -8,15 +8,15 @@ use std::path::{Path, PathBuf};
 
 use crate::diagnostics::demo_scene::{self, DemoBody, cameras_json};
 use crate::error::{Error, Result};
-use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, ScratchFolder, StagedFolder, TargetKind, check_target};
 use crate::files::container::Container;
 use crate::memory_plan::Budget;
 use crate::model::Split;
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::outputs::kind::check_folder_name;
-use crate::pipeline::summary::Detail;
 use crate::pipeline::summary::Summary;
+use crate::pipeline::summary::SummaryDetail;
 use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
 use crate::progress::Events;
 use crate::recipe::Recipe;
@@ -58,12 +58,12 @@ pub struct TestSceneReport {
 /// # Errors
 /// Fails if the requested number of Gaussians is impossible, if the compression fails, or if a file cannot be written.
 pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
-    options.kept.count(options.gaussians)?;
+    options.kept.resolve_count(options.gaussians)?;
     let Some(output) = &options.output else {
         return run_in(ScratchFolder::new(&std::env::temp_dir())?.path(), options);
     };
     check_folder_name(output, "test-scene")?;
-    check_target(output, Kind::Folder, &[], options.overwrite)?;
+    check_target(output, TargetKind::Folder, &[], options.overwrite)?;
     let staged = StagedFolder::new(output, options.overwrite)?;
     let report = run_in(staged.path(), options)?;
     staged.commit()?;
@@ -71,7 +71,7 @@ pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
 }
 
 fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> {
-    let made = demo_scene::Scene::new(options.gaussians, options.frames);
+    let made = demo_scene::DemoScene::new(options.gaussians, options.frames);
     let packed = folder.join("scene.gseq");
     write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
     let rig = made.rig();
@@ -90,14 +90,14 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
     let (mut summary, map) = compress_scene(&scene, &request)?;
     // The folder is still under its temporary name.
     summary.output.clear();
-    let marker = folder.join(MARKER);
+    let marker = folder.join(SUMMARY_FILE);
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
 
     let mut leaders = vec![false; summary.gaussians];
     let bodies = DemoBody::ALL
         .iter()
         .map(|&body| {
-            let members = made.members(body);
+            let members = made.body_ids(body);
             // The first Gaussian with a place of the output counts as kept, others with the same place as merged.
             let kept = members
                 .clone()
@@ -113,7 +113,7 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
 impl TestSceneReport {
     /// Returns the summary and a table of the bodies, for a person.
     pub fn text(&self) -> String {
-        let mut out = self.summary.text(Detail::Most);
+        let mut out = self.summary.text(SummaryDetail::Most);
         // Writing to a String cannot fail.
         let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "body", "Gaussians", "kept", "merged", "pruned");
         for &(body, all, kept, merged) in &self.bodies {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::error::{Error, Result};
 use crate::evaluation::baseline::prune_by;
-use crate::evaluation::cost::{Cost, Repeats};
+use crate::evaluation::cost::{Cost, RepeatLimits};
 use crate::evaluation::found::Evaluation;
 use crate::evaluation::method::MethodKind;
 use crate::evaluation::{self, EvaluateOptions, ModelPair};
@@ -25,7 +25,7 @@ pub(crate) struct WholeRun<'a> {
     /// File name of the result, which determines the kind of output.
     pub(crate) name: &'a str,
     /// Limits on the repetition of each run for measuring its time.
-    pub(crate) repeats: Repeats,
+    pub(crate) repeats: RepeatLimits,
     /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,
     /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
@@ -56,7 +56,7 @@ impl WholeRun<'_> {
             MethodKind::Baseline(baseline) => prune_by(*baseline, &input, target, &output).map(|_| ()),
         };
         create()?;
-        let ((), cost) = self.repeats.measure(once, || clear().and_then(|()| create()))?;
+        let ((), cost) = self.repeats.measure_cost(once, || clear().and_then(|()| create()))?;
         let seen = look(&output)?;
         clear()?;
         Ok((seen, cost))
@@ -80,7 +80,7 @@ impl WholeRun<'_> {
             overwrite: Replace::Never,
         };
         let mut pair = ModelPair::open(&options)?;
-        pair.keep_to(options.original.memory, evaluation::needs)?;
+        pair.plan_memory(options.original.memory, evaluation::resource_estimates)?;
         pair.evaluate()
     }
 }

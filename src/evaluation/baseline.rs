@@ -11,7 +11,7 @@ use crate::model::{Attributes, Gaussians};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather;
 use crate::pipeline::Target;
-use crate::pipeline::stages::write::write_alone;
+use crate::pipeline::stages::write::write_without_companions;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
 
@@ -36,7 +36,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let scene = open_scene(options)?;
     let source = scene.source();
     let count = source.info().count;
-    let target_count = target.map_or(Ok(count), |target| target.count(count))?;
+    let target_count = target.map_or(Ok(count), |target| target.resolve_count(count))?;
     let ids: Vec<u32> = (0..count as u32).collect();
     let state = match scene.input.canonical() {
         Some(canonical) => canonical.clone(),
@@ -47,7 +47,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let kind = OutputKind::from_path(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
     let compressed = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
-    write_alone(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
+    write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
 /// Returns the `target_count` ids with the largest property, in increasing order.

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::journal::Clock;
+use crate::journal::Stopwatch;
 use crate::machine::{peak_memory_bytes, reset_peak_memory};
 
 /// Time and memory of repeated runs of the same work.
@@ -12,9 +12,9 @@ pub struct Cost {
     /// Number of runs.
     pub runs: usize,
     /// Wall-clock seconds of a run.
-    pub seconds: Spread,
+    pub seconds: MedianAndRange,
     /// CPU seconds of a run, over all threads; `None` if the system does not report them.
-    pub processor_seconds: Option<Spread>,
+    pub processor_seconds: Option<MedianAndRange>,
     /// Maximum resident memory of the process over all runs, including memory that the work does not use; `None` if the
     /// system does not report it.
     pub peak_memory_bytes: Option<u64>,
@@ -22,7 +22,7 @@ pub struct Cost {
 
 /// Median and range of the values of repeated runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct MedianAndRange {
     /// Median; the mean of both middle values if their number is even.
     pub median: f64,
     /// Smallest value.
@@ -31,31 +31,35 @@ pub struct Spread {
     pub most: f64,
 }
 
-impl Spread {
+impl MedianAndRange {
     /// Computes the spread of `values`.
     ///
     /// # Panics
     /// Panics if `values` is empty.
-    pub fn from_values(mut values: Vec<f64>) -> Spread {
+    pub fn from_values(mut values: Vec<f64>) -> MedianAndRange {
         values.sort_unstable_by(f64::total_cmp);
         let last = values.len() - 1;
-        Spread { median: 0.5 * (values[last / 2] + values[values.len() / 2]), least: values[0], most: values[last] }
+        MedianAndRange {
+            median: 0.5 * (values[last / 2] + values[values.len() / 2]),
+            least: values[0],
+            most: values[last],
+        }
     }
 }
 
 /// Limits on the repetition of work.
 #[derive(Debug, Clone, Copy)]
-pub struct Repeats {
+pub struct RepeatLimits {
     /// Maximum number of runs; the work always runs at least once.
     pub most: usize,
     /// Total seconds after which no further run starts.
     pub enough: f64,
 }
 
-impl Repeats {
+impl RepeatLimits {
     /// Returns `most` runs without a time limit.
-    pub fn always(most: usize) -> Repeats {
-        Repeats { most, enough: f64::INFINITY }
+    pub fn exactly(most: usize) -> RepeatLimits {
+        RepeatLimits { most, enough: f64::INFINITY }
     }
 
     /// Runs `work` repeatedly and returns the value of the last run with the cost of all runs. Calls `clear` between
@@ -63,7 +67,7 @@ impl Repeats {
     ///
     /// # Errors
     /// Fails if `work` or `clear` fails.
-    pub fn measure<T>(
+    pub fn measure_cost<T>(
         self,
         mut work: impl FnMut() -> Result<T>,
         mut clear: impl FnMut() -> Result<()>,
@@ -71,7 +75,7 @@ impl Repeats {
         let (mut seconds, mut processors, mut peak) = (Vec::new(), Vec::new(), None);
         loop {
             let is_peak_reset = reset_peak_memory();
-            let clock = Clock::start();
+            let clock = Stopwatch::start();
             let value = work()?;
             seconds.push(clock.seconds());
             processors.extend(clock.processor_seconds());
@@ -79,8 +83,8 @@ impl Repeats {
             peak = peak.max(if is_peak_reset { peak_memory_bytes() } else { None });
             if seconds.len() >= self.most || seconds.iter().sum::<f64>() >= self.enough {
                 let runs = seconds.len();
-                let processor_seconds = (processors.len() == runs).then(|| Spread::from_values(processors));
-                let seconds = Spread::from_values(seconds);
+                let processor_seconds = (processors.len() == runs).then(|| MedianAndRange::from_values(processors));
+                let seconds = MedianAndRange::from_values(seconds);
                 return Ok((value, Cost { runs, seconds, processor_seconds, peak_memory_bytes: peak }));
             }
             clear()?;
@@ -97,7 +101,7 @@ mod tests {
         for (values, expected) in
             [(vec![7.0], [7.0; 3]), (vec![9.0, 1.0], [5.0, 1.0, 9.0]), (vec![9.0, 1.0, 2.0], [2.0, 1.0, 9.0])]
         {
-            let Spread { median, least, most } = Spread::from_values(values);
+            let MedianAndRange { median, least, most } = MedianAndRange::from_values(values);
             assert_eq!([median, least, most], expected);
         }
     }
@@ -105,17 +109,17 @@ mod tests {
     #[test]
     fn work_repeats_until_run_or_time_limit() {
         for (repeats, expected) in [
-            (Repeats::always(3), 3),
-            (Repeats { most: 3, enough: 0.0 }, 1),
-            (Repeats { most: 1, enough: 1e9 }, 1),
-            (Repeats::always(0), 1),
+            (RepeatLimits::exactly(3), 3),
+            (RepeatLimits { most: 3, enough: 0.0 }, 1),
+            (RepeatLimits { most: 1, enough: 1e9 }, 1),
+            (RepeatLimits::exactly(0), 1),
         ] {
             let (mut runs, mut clears) = (0, 0);
             let count = |n: &mut usize| {
                 *n += 1;
                 Ok(*n)
             };
-            let (last, cost) = repeats.measure(|| count(&mut runs), || count(&mut clears).map(|_| ())).unwrap();
+            let (last, cost) = repeats.measure_cost(|| count(&mut runs), || count(&mut clears).map(|_| ())).unwrap();
             assert_eq!((last, cost.runs, runs, clears), (expected, expected, expected, expected - 1));
             assert!(cost.seconds.least <= cost.seconds.median && cost.seconds.median <= cost.seconds.most);
         }

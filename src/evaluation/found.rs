@@ -13,13 +13,13 @@ use crate::error::ShowPath;
 use crate::files::csv::{known, table};
 use crate::files::names::name_of;
 use crate::journal::records::RenderTime;
-use crate::models::Size;
-use crate::models::size::compared;
+use crate::models::ModelSize;
+use crate::models::size::format_ratio;
 use crate::pipeline::summary::CameraSummary;
 
 /// Pair of values, for the original and the compressed model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Both<T> {
+pub struct ByModel<T> {
     /// Value of the original model.
     pub original: T,
     /// Value of the compressed model.
@@ -41,7 +41,7 @@ pub struct ImageScore {
 
 /// Scores of one (frame, view).
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct PictureScores {
+pub struct ViewScores {
     /// Frame of the sequence.
     pub frame: usize,
     /// Time stamp of the frame.
@@ -52,7 +52,7 @@ pub struct PictureScores {
     pub loss: ImageScore,
     /// Scores of both models against the photograph; `None` without a photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub truth: Option<Both<ImageScore>>,
+    pub truth: Option<ByModel<ImageScore>>,
 }
 
 /// Mean scores over a set of views.
@@ -125,13 +125,13 @@ pub struct Evaluation {
     /// Name and version of the program.
     pub tool: String,
     /// Paths of the models, as given.
-    pub path: Both<String>,
+    pub path: ByModel<String>,
     /// Numbers of Gaussians.
-    pub count: Both<usize>,
-    /// Bytes of each model, divided by purpose ([`Size`]).
-    pub bytes: Both<u64>,
+    pub count: ByModel<usize>,
+    /// Bytes of each model, divided by purpose ([`ModelSize`]).
+    pub bytes: ByModel<u64>,
     /// Bytes of the models by part.
-    pub size: Both<Size>,
+    pub size: ByModel<ModelSize>,
     /// Cameras of the evaluation.
     pub cameras: CameraSummary,
     /// Background color: red, green, blue in [0, 1].
@@ -152,7 +152,7 @@ pub struct Evaluation {
     pub work_notes: Vec<String>,
     /// Scores of every view, for the CSV.
     #[serde(skip)]
-    pub pictures: Vec<PictureScores>,
+    pub views: Vec<ViewScores>,
 }
 
 impl QualityMeans {
@@ -179,11 +179,11 @@ impl Comparison {
     /// it.
     ///
     /// `pictures` is sorted by frame.
-    pub fn from_pictures(
-        pictures: &[PictureScores],
-        score: impl Fn(&PictureScores) -> Option<ImageScore>,
+    pub fn from_views(
+        pictures: &[ViewScores],
+        score: impl Fn(&ViewScores) -> Option<ImageScore>,
     ) -> Option<Comparison> {
-        let (pictures, scores): (Vec<&PictureScores>, Vec<ImageScore>) =
+        let (pictures, scores): (Vec<&ViewScores>, Vec<ImageScore>) =
             pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
         if scores.is_empty() {
             return None;
@@ -227,7 +227,7 @@ impl Evaluation {
     /// Returns a text for the terminal: models, table of mean scores, worst view and worst frame, notes.
     pub fn text(&self) -> String {
         let mut out = String::new();
-        let Both { original, compressed } = self.count;
+        let ByModel { original, compressed } = self.count;
         let percent = 100.0 * compressed as f64 / original.max(1) as f64;
         // Writing to a String cannot fail.
         let (before, after) = (self.size.original, self.size.compressed);
@@ -235,14 +235,14 @@ impl Evaluation {
             out,
             "{}: {original} Gaussians; {} bytes: {}",
             Path::new(&self.path.original).shown(),
-            before.whole(),
-            before.parts()
+            before.total(),
+            before.parts_text()
         );
         let _ = writeln!(
             out,
             "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
             Path::new(&self.path.compressed).shown(),
-            compared(after.whole(), before.whole()),
+            format_ratio(after.total(), before.total()),
             after.format_relative_to(&before)
         );
         let frames = self.loss.per_frame.len();
@@ -295,7 +295,7 @@ impl Evaluation {
             names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{suffix}")));
             names.extend(with_flip.then(|| format!("flip{suffix}")));
         }
-        let row = |picture: &PictureScores| {
+        let row = |picture: &ViewScores| {
             let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
             let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
@@ -305,7 +305,7 @@ impl Evaluation {
             row.resize(names.len(), String::new());
             row
         };
-        table(&names, self.pictures.iter().map(row))
+        table(&names, self.views.iter().map(row))
     }
 }
 
@@ -313,9 +313,9 @@ impl Evaluation {
 mod tests {
     use super::*;
 
-    fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> PictureScores {
+    fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> ViewScores {
         let loss = ImageScore { psnr, ssim: psnr / 100.0, temporal, flip: None };
-        PictureScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
+        ViewScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
 
     #[test]
@@ -327,26 +327,26 @@ mod tests {
             picture(2, 7, 20.0, None),
             picture(3, 1, 10.0, Some(0.75)),
         ];
-        let found = Comparison::from_pictures(&pictures, |picture| Some(picture.loss)).unwrap();
+        let found = Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap();
         assert_eq!(found.overall, QualityMeans { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
         let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
         assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
         assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
-        assert!(Comparison::from_pictures(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+        assert!(Comparison::from_views(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
     }
 
-    fn evaluation(pictures: Vec<PictureScores>) -> Evaluation {
-        let truth = Comparison::from_pictures(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
+    fn evaluation(pictures: Vec<ViewScores>) -> Evaluation {
+        let truth = Comparison::from_views(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
         Evaluation {
             tool: String::new(),
-            path: Both { original: String::new(), compressed: String::new() },
-            count: Both { original: 0, compressed: 0 },
-            bytes: Both { original: 0, compressed: 0 },
-            size: Both { original: Size::default(), compressed: Size::default() },
+            path: ByModel { original: String::new(), compressed: String::new() },
+            count: ByModel { original: 0, compressed: 0 },
+            bytes: ByModel { original: 0, compressed: 0 },
+            size: ByModel { original: ModelSize::default(), compressed: ModelSize::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
-            loss: Comparison::from_pictures(&pictures, |picture| Some(picture.loss)).unwrap(),
+            loss: Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap(),
             ground_truth: truth.map(|comparison| TruthComparison {
                 folder: String::new(),
                 of: 2,
@@ -356,7 +356,7 @@ mod tests {
             render_ms: None,
             notes: Vec::new(),
             work_notes: Vec::new(),
-            pictures,
+            views: pictures,
         }
     }
 
@@ -370,7 +370,7 @@ mod tests {
         for picture in &mut pictures {
             picture.loss.flip = Some(0.5);
             picture.truth =
-                Some(Both { original: ImageScore { flip: None, ..picture.loss }, compressed: picture.loss });
+                Some(ByModel { original: ImageScore { flip: None, ..picture.loss }, compressed: picture.loss });
         }
         assert_eq!(
             evaluation(pictures).csv(),

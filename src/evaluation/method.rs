@@ -2,8 +2,8 @@
 
 use super::baseline::Baseline;
 use crate::error::{Error, Result};
-use crate::pipeline::Only;
-use crate::recipe::{Coverage, Precision, Recipe, ShDegreeRule, StaticTerm};
+use crate::pipeline::PruneOrMerge;
+use crate::recipe::{Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticScoreTerm};
 
 /// Compression method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -62,7 +62,7 @@ impl Method {
     }
 
     /// Returns the same method with refinement; `None` unless this method is [`Method::NoRefine`].
-    pub fn refined(self) -> Option<Method> {
+    pub fn with_refinement(self) -> Option<Method> {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
@@ -70,29 +70,29 @@ impl Method {
     ///
     /// # Errors
     /// Fails only if a built-in preset does not parse.
-    pub(crate) fn means(self) -> Result<MethodKind> {
-        let unrefined = || Ok::<_, Error>(Recipe::preset("default")?.unrefined());
+    pub(crate) fn kind(self) -> Result<MethodKind> {
+        let unrefined = || Ok::<_, Error>(Recipe::preset("default")?.without_refinement());
         let pruning = |coverage| {
             let mut recipe = unrefined()?;
             // Leave out every stage except pruning.
-            recipe.field.field = Precision::Exact;
+            recipe.field.field = FieldPrecision::Exact;
             recipe.bands.bands = ShDegreeRule::All;
             recipe.scan.coverage = coverage;
-            recipe.score.static_term = StaticTerm::Mean;
+            recipe.score.static_term = StaticScoreTerm::Mean;
             // S = C without clipping, so that Gaussians with different C never tie.
             recipe.score.w_dynamic = 0.0;
             recipe.score.clip_norm = false;
             recipe.select.round_fraction = 1.0;
             recipe.select.choose_by_views = false;
-            Ok::<_, Error>(MethodKind::Recipe(Box::new(recipe), Only::Prune))
+            Ok::<_, Error>(MethodKind::Recipe(Box::new(recipe), PruneOrMerge::Prune))
         };
         let paper = |only| Ok(MethodKind::Recipe(Box::new(Recipe::preset("paper")?), only));
         match self {
-            Method::Default => Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
-            Method::NoRefine => Ok(MethodKind::Recipe(Box::new(unrefined()?), Only::Both)),
-            Method::Paper => paper(Only::Both),
-            Method::PaperPrune => paper(Only::Prune),
-            Method::PaperMerge => paper(Only::Merge),
+            Method::Default => Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?), PruneOrMerge::Both)),
+            Method::NoRefine => Ok(MethodKind::Recipe(Box::new(unrefined()?), PruneOrMerge::Both)),
+            Method::Paper => paper(PruneOrMerge::Both),
+            Method::PaperPrune => paper(PruneOrMerge::Prune),
+            Method::PaperMerge => paper(PruneOrMerge::Merge),
             Method::Visible => pruning(Coverage::Visible),
             Method::Projected => pruning(Coverage::Projected),
             Method::Opacity => Ok(MethodKind::Baseline(Baseline::Opacity)),
@@ -109,7 +109,7 @@ impl Method {
 
 /// Recipe or baseline by which a method compresses.
 pub(crate) enum MethodKind {
-    Recipe(Box<Recipe>, Only),
+    Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),
 }
 
@@ -118,7 +118,7 @@ pub(crate) const STEPS: &str = "refine_steps";
 
 /// Returns [`Method::Default`] with `steps` refinement steps; the steps before prune steps change in proportion.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
-    Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.refining_by(steps)), Only::Both))
+    Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.with_refinement_steps(steps)), PruneOrMerge::Both))
 }
 
 #[cfg(test)]
@@ -129,13 +129,13 @@ mod tests {
     fn setting_the_presets_own_steps_keeps_the_preset() {
         let preset = Recipe::preset("default").unwrap();
         let recipe = |steps| match refining_by(steps).unwrap() {
-            MethodKind::Recipe(recipe, Only::Both) => *recipe,
+            MethodKind::Recipe(recipe, PruneOrMerge::Both) => *recipe,
             _ => panic!("not method default"),
         };
         assert_eq!(recipe(preset.refine.refine_steps), preset);
         let half = recipe(preset.refine.refine_steps / 2).refine;
         assert_eq!(half.refine_cut_steps, preset.refine.refine_cut_steps / 2);
         assert_eq!(recipe(0).refine.refine_cut_steps, 0);
-        assert!(preset.with("refine", STEPS, "1").is_ok(), "{STEPS} is no parameter");
+        assert!(preset.with_parameter("refine", STEPS, "1").is_ok(), "{STEPS} is no parameter");
     }
 }

@@ -23,20 +23,20 @@ use serde::de::DeserializeOwned;
 use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
-use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
-use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, TruthComparison, ViewScores};
+use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::records::RenderTime;
 use crate::limits::Limits;
-use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, FrameView, Gaussians};
 use crate::models::InputModel;
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{self, ViewSet, background, pictures, spread_views, thin};
+use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
 /// Name of the stage, for progress and cache entries.
@@ -57,7 +57,7 @@ pub struct EvaluateOptions {
     pub max_frames: Option<usize>,
     /// Maximum number of views, spread over frames and cameras; `None`: all.
     pub max_views: Option<usize>,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
     /// Whether to compute FLIP, which takes longer than all other scores.
     pub flip: bool,
@@ -80,10 +80,10 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
 /// error [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
-        check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
+        check_target(csv, TargetKind::File, &options.input_paths(), options.overwrite)?;
     }
     let mut pair = ModelPair::open(options)?;
-    pair.keep_to(options.original.memory, needs)?;
+    pair.plan_memory(options.original.memory, resource_estimates)?;
     let mut evaluation = pair.evaluate()?;
     evaluation.render_ms = pair.render_time()?;
     if let Some(csv) = &options.csv {
@@ -95,18 +95,18 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
 }
 
 /// Returns the resource estimate of rendering and comparing two models. `work` holds the larger number of Gaussians.
-pub fn needs(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
+pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
-    let mut need = pictures::need(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    let mut need = pictures::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
-    need.fixed.push(("scores", size_of::<PictureScores>() as u64 * work.pictures));
+    need.fixed.push(("scores", size_of::<ViewScores>() as u64 * work.pictures));
     need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }
 
 impl EvaluateOptions {
     /// Returns all paths that are read, so that none of them is overwritten.
-    pub fn inputs(&self) -> Vec<&Path> {
+    pub fn input_paths(&self) -> Vec<&Path> {
         let mut inputs = vec![self.original.path.as_path(), &self.compressed];
         inputs.extend(self.original.cameras.as_deref());
         inputs.extend(self.ground_truth.as_deref());
@@ -136,11 +136,11 @@ impl ModelPair {
     pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
         let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
-        let background = background(options.background, &scene)?;
+        let background = render_background(options.background, &scene)?;
         let times = &scene.source().info().times;
-        let mut chosen = pictures(&scene.rig, times, options.views)?;
+        let mut chosen = select_views(&scene.rig, times, options.views)?;
         if let Some(frames) = options.max_frames {
-            chosen = thin(chosen, frames);
+            chosen = select_frames(chosen, frames);
         }
         if let Some(views) = options.max_views {
             chosen = spread_views(chosen, views);
@@ -169,7 +169,7 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails if the stages cannot run within `budget`.
-    pub fn keep_to(
+    pub fn plan_memory(
         &mut self,
         budget: Budget,
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
@@ -177,8 +177,13 @@ impl ModelPair {
         let scene_work = self.scene.workload();
         let gaussians = scene_work.gaussians.max(self.compressed_count() as u64);
         let views = scene_work.pictures.max(self.views.len() as u64);
-        let plan = Plan::fit(Workload { gaussians, pictures: views, ..scene_work }, budget, &self.scene.events, needs)?;
-        plan.tell_time(budget.tell, &self.scene.events);
+        let plan = MemoryPlan::fit_budget(
+            Workload { gaussians, pictures: views, ..scene_work },
+            budget,
+            &self.scene.events,
+            needs,
+        )?;
+        plan.send_times(budget.tell, &self.scene.events);
         self.scene.limits = plan.limits;
         Ok(())
     }
@@ -188,7 +193,7 @@ impl ModelPair {
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
     pub fn evaluate(&self) -> Result<Evaluation> {
-        let evaluation = self.compare()?;
+        let evaluation = self.evaluate_as_first_stage()?;
         self.scene.work.end_shard_before("averaging")?;
         Ok(evaluation)
     }
@@ -198,13 +203,13 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
-    pub fn compare(&self) -> Result<Evaluation> {
+    pub fn evaluate_as_first_stage(&self) -> Result<Evaluation> {
         let compute = |range| Ok(self.scores(range, |_, _, _| ())?.0);
         self.evaluation(self.compute_sharded(NAME, compute)?)
     }
 
     /// Compares all views in one process and calls `observe` with the images of every view and the frame state of the
-    /// original, from any thread. Returns the values of `observe` in the order of [`Evaluation::pictures`].
+    /// original, from any thread. Returns the values of `observe` in the order of [`Evaluation::views`].
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -221,7 +226,7 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
-    pub fn observe_in_parts<O: Send + Serialize + DeserializeOwned>(
+    pub fn observe_sharded<O: Send + Serialize + DeserializeOwned>(
         &self,
         name: &'static str,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
@@ -251,7 +256,7 @@ impl ModelPair {
     ) -> Result<Vec<T>> {
         let work = &self.scene.work;
         let key = self.key()?;
-        work.divided(name, key, self.views.len(), compute, |parts| {
+        work.compute_in_shards(name, key, self.views.len(), compute, |parts| {
             let mut all = Vec::with_capacity(self.views.len());
             for part in parts {
                 all.extend(part?);
@@ -263,34 +268,34 @@ impl ModelPair {
     /// Builds the evaluation from the scores of all views.
     fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
-        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| PictureScores {
+        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| ViewScores {
             frame,
             time: times[frame],
             view,
             loss,
             truth,
         };
-        let scores: Vec<PictureScores> = self.views.iter().zip(scores).map(view_scores).collect();
+        let scores: Vec<ViewScores> = self.views.iter().zip(scores).map(view_scores).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
                 of: self.views.len(),
-                compressed: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.compressed))?,
-                original: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.original))?,
+                compressed: Comparison::from_views(&scores, |picture| Some(picture.truth?.compressed))?,
+                original: Comparison::from_views(&scores, |picture| Some(picture.truth?.original))?,
             })
         });
         let scene = &self.scene;
         let count = |input: &dyn InputModel| input.source().info().count;
-        let path = Both {
+        let path = ByModel {
             original: scene.path.to_string_lossy().into_owned(),
             compressed: self.compressed_as.path.to_string_lossy().into_owned(),
         };
-        let size = Both { original: scene.input.size()?, compressed: self.compressed.size()? };
+        let size = ByModel { original: scene.input.size()?, compressed: self.compressed.size()? };
         Ok(Evaluation {
             tool: TOOL.to_owned(),
             path,
-            count: Both { original: count(&*scene.input), compressed: count(&*self.compressed) },
-            bytes: Both { original: size.original.whole(), compressed: size.compressed.whole() },
+            count: ByModel { original: count(&*scene.input), compressed: count(&*self.compressed) },
+            bytes: ByModel { original: size.original.total(), compressed: size.compressed.total() },
             size,
             cameras: CameraSummary {
                 origin: scene.rig.origin.clone(),
@@ -298,31 +303,31 @@ impl ModelPair {
                 pairs: self.views.len(),
             },
             background: self.background,
-            loss: Comparison::from_pictures(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
+            loss: Comparison::from_views(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
-            pictures: scores,
+            views: scores,
         })
     }
 
     /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.
     fn key(&self) -> Result<CacheKey> {
-        if !self.scene.work.keeps() {
+        if !self.scene.work.is_enabled() {
             return Ok(CacheKey::NONE);
         }
-        let compressed = self.scene.digest_of(&self.compressed_as, &*self.compressed)?;
-        let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.views)).transpose()?;
+        let compressed = self.scene.input_digest(&self.compressed_as, &*self.compressed)?;
+        let photographs = self.truth.as_ref().map(|truth| truth.file_stamps(&self.views)).transpose()?;
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders the views with the indices `places` in [`Evaluation::pictures`] again and passes them to `see`, each
+    /// Renders the views with the indices `places` in [`Evaluation::views`] again and passes them to `see`, each
     /// with the frame state of the original. Keeping all renders would take memory that grows with frames and views.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
-    pub fn again<O>(
+    pub fn render_again<O>(
         &self,
         places: &[usize],
         mut see: impl FnMut(usize, &Gaussians, &Camera, RenderedViews) -> O,
@@ -341,8 +346,8 @@ impl ModelPair {
         Ok(found)
     }
 
-    /// Returns the view at index `place` of [`Evaluation::pictures`].
-    pub fn picture(&self, place: usize) -> FrameView {
+    /// Returns the view at index `place` of [`Evaluation::views`].
+    pub fn view(&self, place: usize) -> FrameView {
         self.views[place]
     }
 
@@ -351,7 +356,7 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
-    pub fn both<O: Send>(
+    pub fn render_pairs<O: Send>(
         &self,
         pictures: &[FrameView],
         see: impl Fn([&Image; 2]) -> Result<O> + Sync,
@@ -384,7 +389,13 @@ impl ModelPair {
     /// Calls `visit` with batches of views, each with the frame states of the original and the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
-        show(subjects, &self.scene.rig.cameras, pictures, Batch::one_frame(&self.scene.limits), visit)
+        for_each_view_batch(
+            subjects,
+            &self.scene.rig.cameras,
+            pictures,
+            BatchLimits::one_frame(&self.scene.limits),
+            visit,
+        )
     }
 
     /// Computes the scores and the values of `observe` for the views in `range`. For the temporal error, first renders
@@ -465,7 +476,7 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
 }
 
 /// Scores of one view: of the compressed model against the original, and of both against the photograph, if any.
-type PairScores = (ImageScore, Option<Both<ImageScore>>);
+type PairScores = (ImageScore, Option<ByModel<ImageScore>>);
 
 /// Images of one (frame, view), all of the same size.
 pub struct RenderedViews {
@@ -488,7 +499,7 @@ impl RenderedViews {
             let against = |image: fn(&RenderedViews) -> &Image| {
                 score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
-            Both {
+            ByModel {
                 original: against(|rendered| &rendered.original),
                 compressed: against(|rendered| &rendered.compressed),
             }

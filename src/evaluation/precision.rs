@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::cost::{Cost, Spread};
+use crate::evaluation::cost::{Cost, MedianAndRange};
 use crate::files::csv::{known, table};
 
 /// Result of `precision`: measurements of all varied settings, and their common conditions.
@@ -22,7 +22,8 @@ pub struct PrecisionDiagram {
     /// Number of frames of the input.
     pub frames: usize,
     /// Maximum number of frames for scoring and ranking, spread evenly from first to last.
-    pub frames_looked_at: usize,
+    #[serde(rename = "frames_looked_at")]
+    pub frames_scored: usize,
     /// Number of views of the frames that are used for scoring and ranking.
     pub pictures: usize,
     /// Number of views on which rankings are judged: test views if there are any.
@@ -33,11 +34,12 @@ pub struct PrecisionDiagram {
     pub kept: usize,
     /// Number of threads, except where the number of threads is varied.
     pub threads: usize,
-    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in
+    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::max_setting_seconds`] seconds in
     /// all.
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
-    pub enough: f64,
+    #[serde(rename = "enough")]
+    pub max_setting_seconds: f64,
     /// Knobs (settings, or groups of settings) that were varied.
     pub knobs: Vec<PrecisionKnob>,
     /// Notes for the user.
@@ -47,7 +49,7 @@ pub struct PrecisionDiagram {
 /// Source of an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Source {
+pub enum ErrorSource {
     /// Sampling, or a finite step.
     Discretization,
     /// Finite number of digits.
@@ -56,13 +58,13 @@ pub enum Source {
     Model,
 }
 
-impl Source {
+impl ErrorSource {
     /// Returns the name in tables and CSV files.
     pub fn name(self) -> &'static str {
         match self {
-            Source::Discretization => "discretization",
-            Source::Rounding => "rounding",
-            Source::Model => "model",
+            ErrorSource::Discretization => "discretization",
+            ErrorSource::Rounding => "rounding",
+            ErrorSource::Model => "model",
         }
     }
 }
@@ -75,7 +77,7 @@ pub struct PrecisionKnob {
     /// Description of the setting and of its errors.
     pub about: String,
     /// Source of the error that the setting changes.
-    pub source: Source,
+    pub source: ErrorSource,
     /// One curve for each parameter of the knob.
     pub curves: Vec<PrecisionCurve>,
 }
@@ -86,16 +88,20 @@ pub struct PrecisionCurve {
     /// Name of the parameter; the name in the recipe if it is a recipe parameter.
     pub name: String,
     /// Description of the reference values from which the errors are measured.
-    pub against: String,
+    #[serde(rename = "against")]
+    pub reference: String,
     /// Measurements in the order in which they were made, mostly from coarse to fine.
-    pub marks: Vec<PrecisionSetting>,
+    #[serde(rename = "marks")]
+    pub settings: Vec<PrecisionSetting>,
     /// For each error, its observed order: the exponent with which it depends on the step size.
     pub orders: Vec<ObservedOrder>,
     /// Value of the parameter in the recipe; `None` if it was not measured.
-    pub own: Option<f64>,
+    #[serde(rename = "own")]
+    pub recipe_value: Option<f64>,
     /// Coarsest value of the parameter such that, at this and all finer values, the error added to renders stays below
     /// a tenth of the model's own error; `None` if there is none.
-    pub enough: Option<f64>,
+    #[serde(rename = "enough")]
+    pub sufficient_value: Option<f64>,
 }
 
 /// Measurements at one value of a parameter.
@@ -107,7 +113,7 @@ pub struct PrecisionSetting {
     pub step: f64,
     /// Time and memory of the runs.
     pub cost: Cost,
-    /// Errors by name; [`meaning`] describes them.
+    /// Errors by name; [`axis_label`] describes them.
     pub errors: BTreeMap<String, f64>,
     /// Mean PSNR on the views by which settings are judged, dB; `None` if the setting yields no model.
     pub psnr: Option<f64>,
@@ -117,7 +123,8 @@ pub struct PrecisionSetting {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObservedOrder {
     /// Name of the error.
-    pub of: String,
+    #[serde(rename = "of")]
+    pub error: String,
     /// Slope of log error against log step, by least squares.
     pub observed: f64,
     /// Order that theory predicts; `None` if it predicts none.
@@ -125,32 +132,32 @@ pub struct ObservedOrder {
 }
 
 /// Error name: root mean square error of renders with a setting against renders of the whole model, colors in [0, 1].
-pub const PICTURES: &str = "pictures";
-/// Error name: increase of the error [`PICTURES`] over that of the finest setting. The error of the finest setting
-/// counts as the error of the compressed model itself (see [`added`]).
-pub const ADDED: &str = "added";
+pub const RENDER_ERROR: &str = "pictures";
+/// Error name: increase of the error [`RENDER_ERROR`] over that of the finest setting. The error of the finest setting
+/// counts as the error of the compressed model itself (see [`added_error`]).
+pub const ADDED_ERROR: &str = "added";
 /// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
 /// keeps.
-pub const KEPT: &str = "kept";
+pub const SELECTION_DISTANCE: &str = "kept";
 /// Error name: relative error of the number of Gaussians that a setting keeps.
-pub const STAYING: &str = "staying";
+pub const COUNT_ERROR: &str = "staying";
 /// Error name: largest relative error of the percentiles P1 and P99.
-pub const PERCENTILES: &str = "percentiles";
+pub const PERCENTILE_ERROR: &str = "percentiles";
 /// Error name: 1 if the bytes of the result differ from those of the first run, else 0.
-pub const BYTES: &str = "bytes";
+pub const DIFFERENT_BYTES: &str = "bytes";
 
-/// Maximum of the error [`ADDED`] at the value [`PrecisionCurve::enough`] and all finer values.
+/// Maximum of the error [`ADDED_ERROR`] at the value [`PrecisionCurve::sufficient_value`] and all finer values.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of the error called `error`.
-pub fn meaning(error: &str) -> String {
+pub fn axis_label(error: &str) -> String {
     match error {
-        PICTURES => "root mean square error of renders".to_owned(),
-        ADDED => "error added / error of the model".to_owned(),
-        KEPT => "1 - Jaccard of the kept set".to_owned(),
-        STAYING => "relative error of how many stay".to_owned(),
-        PERCENTILES => "worst relative error of P1 and P99".to_owned(),
-        BYTES => "results of other bytes".to_owned(),
+        RENDER_ERROR => "root mean square error of renders".to_owned(),
+        ADDED_ERROR => "error added / error of the model".to_owned(),
+        SELECTION_DISTANCE => "1 - Jaccard of the kept set".to_owned(),
+        COUNT_ERROR => "relative error of how many stay".to_owned(),
+        PERCENTILE_ERROR => "worst relative error of P1 and P99".to_owned(),
+        DIFFERENT_BYTES => "results of other bytes".to_owned(),
         statistic => format!("relative L2 error of {statistic}"),
     }
 }
@@ -172,24 +179,25 @@ impl PrecisionCurve {
         names.sort_unstable();
         names.dedup();
         // The error of renders converges to the model's own error, not to 0, so it has no order.
-        names.retain(|name| name != PICTURES);
+        names.retain(|name| name != RENDER_ERROR);
         let order = |error: String| {
             let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&error)?)));
             let expected = expected.iter().find(|(name, _)| *name == error).map(|&(_, order)| order);
-            Some(ObservedOrder { observed: slope(points)?, expected, of: error })
+            Some(ObservedOrder { observed: slope(points)?, expected, error })
         };
         let orders = names.into_iter().filter_map(order).collect();
-        let is_small = |mark: &PrecisionSetting| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL_ADDED_ERROR);
+        let is_small =
+            |mark: &PrecisionSetting| mark.errors.get(ADDED_ERROR).is_some_and(|&added| added < SMALL_ADDED_ERROR);
         // The finest setting is measured against itself, so it does not count.
         let small = marks.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
         let own = own.filter(|own| marks.iter().any(|mark| mark.value == *own));
         PrecisionCurve {
             name: name.to_owned(),
-            against: against.to_owned(),
-            enough: small.map(|mark| mark.value),
-            marks,
+            reference: against.to_owned(),
+            sufficient_value: small.map(|mark| mark.value),
+            settings: marks,
             orders,
-            own,
+            recipe_value: own,
         }
     }
 }
@@ -216,7 +224,7 @@ pub(crate) fn relative_l2(a: impl IntoIterator<Item = f64>, b: impl IntoIterator
 }
 
 /// Returns the Jaccard distance 1 − |a ∩ b| / |a ∪ b| of two lists of increasing ids; 0 for two empty lists.
-pub(crate) fn apart(a: &[u32], b: &[u32]) -> f64 {
+pub(crate) fn jaccard_distance(a: &[u32], b: &[u32]) -> f64 {
     let both = a.iter().filter(|id| b.binary_search(id).is_ok()).count();
     let either = a.len() + b.len() - both;
     if either == 0 { 0.0 } else { 1.0 - both as f64 / either as f64 }
@@ -224,7 +232,7 @@ pub(crate) fn apart(a: &[u32], b: &[u32]) -> f64 {
 
 /// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`:
 /// √(error² − finest²) / finest, as independent errors add in squares. Returns 0 if `error` is below `finest`.
-pub(crate) fn added(error: f64, finest: f64) -> f64 {
+pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }
 
@@ -258,9 +266,9 @@ impl PrecisionDiagram {
         ];
         let mut rows = Vec::new();
         for (knob, curve) in self.curves() {
-            for mark in &curve.marks {
+            for mark in &curve.settings {
                 let Cost { runs, seconds, processor_seconds, peak_memory_bytes } = &mark.cost;
-                let spread_columns = |spread: Option<&Spread>| {
+                let spread_columns = |spread: Option<&MedianAndRange>| {
                     [spread.map(|s| s.median), spread.map(|s| s.least), spread.map(|s| s.most)].map(known)
                 };
                 rows.extend(mark.errors.iter().map(|(of, error)| {
@@ -290,7 +298,7 @@ impl PrecisionDiagram {
         let _ = writeln!(
             out,
             "{}: {} Gaussians x {} frames; scoring on {} views of {} frames, judged on {} views; {} kept",
-            self.path, self.gaussians, self.frames, self.pictures, self.frames_looked_at, self.judged, self.kept
+            self.path, self.gaussians, self.frames, self.pictures, self.frames_scored, self.judged, self.kept
         );
         for (knob, curve) in self.curves() {
             let _ = writeln!(
@@ -299,25 +307,25 @@ impl PrecisionDiagram {
                 knob.name,
                 knob.source.name(),
                 curve.name,
-                curve.against
+                curve.reference
             );
-            for mark in &curve.marks {
+            for mark in &curve.settings {
                 let errors: Vec<String> =
                     mark.errors.iter().map(|(name, error)| format!("{name} {error:.1e}")).collect();
                 let psnr = mark.psnr.map_or(String::new(), |psnr| format!("{psnr:>7.2} dB"));
-                let own = if curve.own == Some(mark.value) { "*" } else { " " };
+                let own = if curve.recipe_value == Some(mark.value) { "*" } else { " " };
                 let seconds = mark.cost.seconds.median;
                 let _ = writeln!(out, " {own}{:>12} {seconds:>9.3} s {psnr:>10}  {}", mark.value, errors.join(", "));
             }
             let orders = curve.orders.iter().map(|order| {
                 let expected = order.expected.map_or(String::new(), |expected| format!(" ({expected} expected)"));
-                format!("{} {:.2}{expected}", order.of, order.observed)
+                format!("{} {:.2}{expected}", order.error, order.observed)
             });
             let orders: Vec<String> = orders.collect();
             if !orders.is_empty() {
                 let _ = writeln!(out, "  order by the step: {}", orders.join(", "));
             }
-            if let Some(enough) = curve.enough {
+            if let Some(enough) = curve.sufficient_value {
                 let _ = writeln!(out, "  from {enough} on, adds less than a tenth of the model's own error to renders");
             }
         }
@@ -333,7 +341,7 @@ mod tests {
     use super::*;
 
     fn mark(value: f64, step: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
-        let seconds = Spread::from_values(vec![value]);
+        let seconds = MedianAndRange::from_values(vec![value]);
         PrecisionSetting {
             value,
             step,
@@ -355,31 +363,41 @@ mod tests {
     #[test]
     fn enough_is_the_coarsest_value_with_small_finer_errors() {
         let curve = |added: &[f64]| {
-            let marks = added.iter().zip(1..).map(|(&added, k)| mark(f64::from(k), 1.0, &[(ADDED, added)])).collect();
+            let marks =
+                added.iter().zip(1..).map(|(&added, k)| mark(f64::from(k), 1.0, &[(ADDED_ERROR, added)])).collect();
             PrecisionCurve::new("pictures", "all", marks, Some(2.0), &[])
         };
-        assert_eq!(curve(&[0.5, 0.05, 0.2, 0.09, 0.0]).enough, Some(4.0));
-        assert_eq!(curve(&[0.5, 0.5]).enough, None);
-        assert_eq!((curve(&[0.0; 5]).enough, curve(&[0.0; 5]).own, curve(&[0.0]).own), (Some(1.0), Some(2.0), None));
-        assert_eq!(curve(&[0.5, 0.5, 0.0]).enough, None, "the finest setting is not counted");
+        assert_eq!(curve(&[0.5, 0.05, 0.2, 0.09, 0.0]).sufficient_value, Some(4.0));
+        assert_eq!(curve(&[0.5, 0.5]).sufficient_value, None);
+        assert_eq!(
+            (curve(&[0.0; 5]).sufficient_value, curve(&[0.0; 5]).recipe_value, curve(&[0.0]).recipe_value),
+            (Some(1.0), Some(2.0), None)
+        );
+        assert_eq!(curve(&[0.5, 0.5, 0.0]).sufficient_value, None, "the finest setting is not counted");
     }
 
     #[test]
     fn distances_match_their_definitions() {
         assert_eq!(relative_l2([3.0, 0.0], [0.0, 4.0]), 1.25);
         assert_eq!(relative_l2([3.0, 4.0], [0.0, 0.0]), 5.0);
-        assert_eq!(apart(&[1, 2, 3], &[2, 3, 4, 5]), 1.0 - 2.0 / 5.0);
-        assert_eq!((apart(&[], &[]), apart(&[1], &[1])), (0.0, 0.0));
-        assert_eq!((added(0.5, 0.3), added(0.2, 0.3)), (0.4 / 0.3, 0.0));
+        assert_eq!(jaccard_distance(&[1, 2, 3], &[2, 3, 4, 5]), 1.0 - 2.0 / 5.0);
+        assert_eq!((jaccard_distance(&[], &[]), jaccard_distance(&[1], &[1])), (0.0, 0.0));
+        assert_eq!((added_error(0.5, 0.3), added_error(0.2, 0.3)), (0.4 / 0.3, 0.0));
     }
 
     #[test]
     fn csv_has_a_line_for_every_error_and_reads_back_from_json() {
-        let curve = PrecisionCurve::new("bits", "exact", vec![mark(2.0, 0.25, &[("C", 0.5), (KEPT, 0.0)])], None, &[]);
+        let curve = PrecisionCurve::new(
+            "bits",
+            "exact",
+            vec![mark(2.0, 0.25, &[("C", 0.5), (SELECTION_DISTANCE, 0.0)])],
+            None,
+            &[],
+        );
         let knob = PrecisionKnob {
             name: "percentiles".to_owned(),
             about: String::new(),
-            source: Source::Discretization,
+            source: ErrorSource::Discretization,
             curves: vec![curve],
         };
         let found = PrecisionDiagram {
@@ -388,14 +406,14 @@ mod tests {
             digest: String::new(),
             gaussians: 1,
             frames: 1,
-            frames_looked_at: 1,
+            frames_scored: 1,
             pictures: 1,
             judged: 1,
             cameras: String::new(),
             kept: 1,
             threads: 1,
             runs: 1,
-            enough: 1.0,
+            max_setting_seconds: 1.0,
             knobs: vec![knob],
             notes: Vec::new(),
         };

@@ -65,12 +65,12 @@ pub struct EffortCurve {
     /// Name of the parameter in the recipe.
     pub parameter: String,
     /// Measurements, one for each value of the parameter, by increasing value.
-    pub settings: Vec<Setting>,
+    pub settings: Vec<EffortSetting>,
 }
 
 /// Measurements at one value of the parameter of an [`EffortCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Setting {
+pub struct EffortSetting {
     /// Value of the parameter.
     pub value: u32,
     /// Method, kept fraction and measurements.
@@ -98,7 +98,7 @@ impl TradeOff {
     /// Returns a CSV table with one row per value of every varied parameter.
     pub fn knobs_csv(&self) -> String {
         let settings = self.knobs.iter().flat_map(|knob| knob.settings.iter().map(move |setting| (knob, setting)));
-        let row = |(knob, setting): (&EffortCurve, &Setting)| {
+        let row = |(knob, setting): (&EffortCurve, &EffortSetting)| {
             [vec![knob.parameter.clone(), setting.value.to_string()], self.row(&setting.point)].concat()
         };
         table(&[&["parameter", "value"], &COLUMNS[..]].concat(), settings.map(row))
@@ -110,7 +110,7 @@ impl TradeOff {
             point.method.clone(),
             known(point.asked),
             point.count.to_string(),
-            self.fraction(point).to_string(),
+            self.kept_fraction(point).to_string(),
             point.bytes.to_string(),
             point.psnr.to_string(),
             point.ssim.to_string(),
@@ -138,7 +138,7 @@ impl TradeOff {
             let _ = writeln!(out, "  {}{more}", self.line(point));
         }
         for knob in &self.knobs {
-            for Setting { value, point } in &knob.settings {
+            for EffortSetting { value, point } in &knob.settings {
                 let _ = writeln!(out, "  {}  ({} {value})", self.line(point), knob.parameter);
             }
         }
@@ -159,7 +159,7 @@ impl TradeOff {
             "{:<12} {:>9} {:>5.1}% {:>12} {:>8.2} {:>8.5} {temporal:>9} {:>6.2} s {memory:>9}",
             point.method,
             point.count,
-            100.0 * self.fraction(point),
+            100.0 * self.kept_fraction(point),
             point.bytes,
             point.psnr,
             point.ssim,
@@ -168,7 +168,7 @@ impl TradeOff {
     }
 
     /// Returns the fraction of the Gaussians that a point keeps; 1 for an empty input.
-    pub fn fraction(&self, point: &TradeOffPoint) -> f64 {
+    pub fn kept_fraction(&self, point: &TradeOffPoint) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
     }
 }
@@ -197,7 +197,7 @@ mod tests {
             peak_memory_bytes: None,
             ..point.clone()
         };
-        let settings = vec![Setting { value: 100, point: point.clone() }];
+        let settings = vec![EffortSetting { value: 100, point: point.clone() }];
         let found = TradeOff {
             tool: String::new(),
             path: String::new(),

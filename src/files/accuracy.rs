@@ -18,7 +18,7 @@
 use std::path::Path;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::model::{AttributeValues, Gaussians, color, opacity};
+use crate::model::{AttributeValues, Gaussians, color_from_sh, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
 const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
@@ -54,7 +54,7 @@ impl RenderedAttributes {
             position: state.position.row::<3>(row).map(f64::from),
             scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),
             opacity: opacity(state.opacity_logit.row::<1>(row)[0]),
-            color: state.sh.row::<3>(row).map(color),
+            color: state.sh.row::<3>(row).map(color_from_sh),
         }
     }
 
@@ -90,7 +90,7 @@ struct Excess {
 
 /// Largest coding errors of a file, collected Gaussian by Gaussian.
 #[derive(Debug)]
-pub struct Accuracy {
+pub struct CodingErrors {
     /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
     /// Index of the Gaussian that is furthest from the median position of all Gaussians.
@@ -101,9 +101,9 @@ pub struct Accuracy {
     worst: Option<Excess>,
 }
 
-impl Accuracy {
+impl CodingErrors {
     /// Creates the record for a file of Gaussians at `positions`. No Gaussian has been compared yet.
-    pub fn new(positions: &AttributeValues) -> Accuracy {
+    pub fn new(positions: &AttributeValues) -> CodingErrors {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
         let middle = [0, 1, 2].map(|k| median(axis(k).collect()));
@@ -113,7 +113,7 @@ impl Accuracy {
         };
         let distances: Vec<f64> = (0..count).map(distance).collect();
         let furthest = (0..count).max_by(|&a, &b| distances[a].total_cmp(&distances[b])).unwrap_or(0);
-        Accuracy { scene: median(distances), furthest, position: 0.0, worst: None }
+        CodingErrors { scene: median(distances), furthest, position: 0.0, worst: None }
     }
 
     /// Returns the largest position error among the Gaussians added so far, in scene units.
@@ -208,10 +208,10 @@ mod tests {
 
     /// Returns the record for six Gaussians: five at distances of 2 from one another and one far away. The scene size
     /// is 2.
-    fn accuracy() -> Accuracy {
+    fn accuracy() -> CodingErrors {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);
-        Accuracy::new(&positions)
+        CodingErrors::new(&positions)
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //!
 //! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` syncs it to disk and
 //! publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an output
-//! without `commit` removes it. When a signal ends the process, [`withdraw_all`] removes all outputs that have not been
+//! without `commit` removes it. When a signal ends the process, [`remove_unfinished`] removes all outputs that have not been
 //! published. The workspaces of killed runs are repaired and removed by the next run with the same output
 //! ([`leftovers`]). Runs in different containers and on different machines may share folders.
 //!
@@ -22,15 +22,15 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result, ShowPath};
 use destination::{Destination, check_replace, destination, real_parent};
-pub use destination::{Kind, Replace};
+pub use destination::{Replace, TargetKind};
 use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
-pub use named::MARKER;
+pub use named::SUMMARY_FILE;
 use named::{add_file_list, entries, exists, files_below, split_target};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
+pub use workspace::{ExitGuard, remove_unfinished};
 use workspace::{SCRATCH, Workspace, user_path};
-pub use workspace::{Withdrawn, withdraw_all};
 
 /// Checks, before any work, that a run reading `inputs` may write an output to `target`. Completes or removes an output
 /// with this name that a killed run left unfinished.
@@ -42,7 +42,7 @@ pub use workspace::{Withdrawn, withdraw_all};
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
-pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
+pub fn check_target(target: &Path, kind: TargetKind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.shown();
     let real_parent = real_parent(target)?;
     let (_, name) = split_target(target)?;
@@ -66,7 +66,7 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
     }
-    if kind == Kind::File && destination(target)? == Destination::Stream {
+    if kind == TargetKind::File && destination(target)? == Destination::Stream {
         return Ok(());
     }
     clean_up(target);
@@ -96,7 +96,7 @@ fn check_writable(target: &Path, parent: &Path) -> Result<()> {
 /// Fails like [`check_target`], and if one of these paths is a device or FIFO, which can hold only one file.
 pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], replace: Replace) -> Result<()> {
     for path in std::iter::once(target).chain(companions.iter().map(PathBuf::as_path)) {
-        check_target(path, Kind::File, inputs, replace)?;
+        check_target(path, TargetKind::File, inputs, replace)?;
         if destination(path)? == Destination::Stream {
             return Err(Error::usage(format!(
                 "{} is a device or FIFO, and the result is several files; give the name of a file",
@@ -130,7 +130,7 @@ impl StagedFile {
         let workspace = match is_stream {
             // Write in the system's folder for temporary files, because no folder can be created beside a device.
             true => scratch_workspace(&std::env::temp_dir())?,
-            false => output_workspace(target, Kind::File, replace)?,
+            false => output_workspace(target, TargetKind::File, replace)?,
         };
         Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
     }
@@ -171,7 +171,7 @@ impl StagedFiles {
     pub fn new(target: &Path, companions: Vec<PathBuf>, replace: Replace) -> Result<StagedFiles> {
         let file = StagedFile::new(target, replace)?;
         for companion in &companions {
-            check_replace(companion, Kind::File, replace)?;
+            check_replace(companion, TargetKind::File, replace)?;
         }
         Ok(StagedFiles { file, companions })
     }
@@ -182,7 +182,7 @@ impl StagedFiles {
     }
 
     /// Returns the hidden path to which the caller writes the companion file with index `index`.
-    pub fn companion(&self, index: usize) -> PathBuf {
+    pub fn companion_path(&self, index: usize) -> PathBuf {
         self.file.workspace.folder.join(companion_name(index))
     }
 
@@ -202,11 +202,11 @@ impl StagedFiles {
         let mut names = names.collect::<Result<Vec<String>>>()?;
         names.sort();
         if !companions.is_empty() {
-            add_file_list(&self.companion(0), &names)?;
+            add_file_list(&self.companion_path(0), &names)?;
         }
         let mut files: Vec<(String, &Path)> = Vec::new();
         for (index, target) in companions.iter().enumerate() {
-            sync(&self.companion(index))?;
+            sync(&self.companion_path(index))?;
             files.push((companion_name(index), target));
         }
         sync(file.path())?;
@@ -236,7 +236,7 @@ impl StagedFolder {
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
     /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
-        let workspace = output_workspace(target, Kind::Folder, replace)?;
+        let workspace = output_workspace(target, TargetKind::Folder, replace)?;
         let content = workspace.content();
         fs::create_dir(&content).map_err(Error::io("create", &content))?;
         Ok(StagedFolder { target: target.to_owned(), content, replace, workspace })
@@ -259,7 +259,7 @@ impl StagedFolder {
     /// Fails if the summary is not a JSON object, if the target appeared meanwhile and may not be replaced, or if a
     /// system call fails. The target is then unchanged.
     pub fn commit(self) -> Result<()> {
-        let summary = self.content.join(MARKER);
+        let summary = self.content.join(SUMMARY_FILE);
         if exists(&summary) {
             add_file_list(&summary, &files_below(&self.content)?)?;
         }
@@ -270,7 +270,7 @@ impl StagedFolder {
 
 /// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the
 /// workspaces that killed runs with this output left behind.
-fn output_workspace(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
+fn output_workspace(target: &Path, kind: TargetKind, replace: Replace) -> Result<Workspace> {
     clean_up(target);
     check_replace(target, kind, replace)?;
     Workspace::beside(target)

@@ -22,7 +22,7 @@ use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
 
 /// Property by which the format is recognized.
-pub const MARKER: &str = "packed_position";
+pub const MARKER_PROPERTY: &str = "packed_position";
 /// Number of Gaussians per row of the element `chunk`.
 const CHUNK: usize = 256;
 /// Range of SH coefficients above degree 0 that a byte stands for: −4 to 4.

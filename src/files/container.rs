@@ -75,8 +75,8 @@ impl Prefetch for Container {
             {
                 let tiles = || self.unheld(want, gaussian_block, frame_block);
                 // Request all tiles first, then wait for each of them.
-                self.reader.expect(tiles());
-                self.reader.fetch(tiles());
+                self.reader.prefetch_in_background(tiles());
+                self.reader.prefetch_and_wait(tiles());
             }
         }
     }

@@ -17,21 +17,21 @@ use crate::files::ply::{Ply, PlyOptions};
 use crate::files::splatv::rows::ZeroRotation;
 use crate::model::{AttributeValues, Attributes, StoredParams};
 
-/// Index in [`StoredParams::own`] of the center of the time window.
+/// Index in [`StoredParams::format_specific`] of the center of the time window.
 pub const CENTER: usize = 0;
-/// Index in [`StoredParams::own`] of the natural logarithm of the standard deviation of the time window.
+/// Index in [`StoredParams::format_specific`] of the natural logarithm of the standard deviation of the time window.
 pub const LOG_DEVIATION: usize = 1;
-/// First of three indices in [`StoredParams::own`] of the velocity along x, y, z, per unit of time.
+/// First of three indices in [`StoredParams::format_specific`] of the velocity along x, y, z, per unit of time.
 pub const VELOCITY: usize = 2;
-/// Number of parameters in [`StoredParams::own`] of a Gaussian with linear motion in a Gaussian window of time.
-pub const WIDTH: usize = 5;
+/// Number of parameters in [`StoredParams::format_specific`] of a Gaussian with linear motion in a Gaussian window of time.
+pub const PARAMS_PER_GAUSSIAN: usize = 5;
 
 /// Minimum standard deviation of a time window that the player shows, as a fraction of the sequence.
 pub const MIN_DEVIATION: f64 = 0.02;
 /// Minimum opacity of a Gaussian at any time.
 const OPACITY_FLOOR: f64 = 1e-4;
-/// Properties that an INRIA PLY does not have, in the order of [`StoredParams::own`].
-const OWN_PROPERTIES: [&str; WIDTH] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
+/// Properties that an INRIA PLY does not have, in the order of [`StoredParams::format_specific`].
+const OWN_PROPERTIES: [&str; PARAMS_PER_GAUSSIAN] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
 /// Comment by which a file of this format is recognized.
 pub const MARKER_COMMENT: &str = "ftgs_version";
 
@@ -53,7 +53,7 @@ pub const FRAME_RATE: f64 = 30.0;
 
 impl ClipTimes {
     /// Times of a sequence that is not mapped, with an unknown number of frames.
-    pub const UNIT: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
+    pub const UNIT_INTERVAL: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
 
     /// Returns the mapping of `times`, which increase, to the range from 0 to 1.
     pub fn from_times(times: &[f64]) -> ClipTimes {
@@ -70,7 +70,7 @@ impl ClipTimes {
     /// Returns the times of a sequence from `first` to `last`; `None` if they are not finite or do not increase.
     pub(crate) fn from_range(first: f64, last: f64) -> Option<ClipTimes> {
         let is_range = first.is_finite() && last.is_finite() && last - first > 1e-12 * first.abs().max(last.abs());
-        is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT })
+        is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL })
     }
 }
 
@@ -140,7 +140,7 @@ impl FtgsHeader {
             number("opacity_floor", OPACITY_FLOOR, &|x| (0.0..1.0).contains(&x), "a number from 0 to below 1")?;
         let frames = number("n_frames", 0.0, &|x| (1.0..=1e9).contains(&x) && x.fract() == 0.0, "a number of frames")?;
         let clip = match value("splatsieve_times") {
-            None => ClipTimes::UNIT,
+            None => ClipTimes::UNIT_INTERVAL,
             Some(text) => {
                 let numbers: Vec<f64> = text.split_ascii_whitespace().filter_map(|word| word.parse().ok()).collect();
                 let clip = if let [first, last] = numbers[..] { ClipTimes::from_range(first, last) } else { None };
@@ -164,9 +164,9 @@ impl Ftgs {
     pub fn open(path: &Path, options: &PlyOptions, zero_rotation: ZeroRotation) -> Result<Ftgs> {
         let ply = Ply::open_with(path, options)?;
         let header = FtgsHeader::parse(path, ply.comments(), ply.sh_degree())?;
-        let own_bytes = 4 * WIDTH as u64 * ply.count() as u64;
+        let own_bytes = 4 * PARAMS_PER_GAUSSIAN as u64 * ply.count() as u64;
         options.memory.check(path, "element vertex", "the Gaussians of the file", own_bytes)?;
-        let mut own = AttributeValues::zeros(WIDTH, ply.count());
+        let mut own = AttributeValues::zeros(PARAMS_PER_GAUSSIAN, ply.count());
         for (plane, name) in OWN_PROPERTIES.into_iter().enumerate() {
             let values = ply.values(name)?;
             let values =
@@ -175,7 +175,7 @@ impl Ftgs {
                 own.plane_mut(plane).copy_from_slice(&values);
             }
         }
-        let mut params = StoredParams { gaussians: ply.whole()?, own };
+        let mut params = StoredParams { gaussians: ply.whole()?, format_specific: own };
         let (defects, kept) = inspect(&params, zero_rotation);
         if defects.dropped > 0 && kept.is_empty() {
             let kinds: Vec<String> =
@@ -198,8 +198,11 @@ impl Ftgs {
 /// Returns the defects of the rows (Gaussians) of `params`, and the indices of the rows that are kept.
 fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<u32>) {
     let mut defects = Defects::new(params.len());
-    let columns: Vec<&AttributeValues> =
-        Attributes::all().iter().map(|column| params.gaussians.column(column)).chain([&params.own]).collect();
+    let columns: Vec<&AttributeValues> = Attributes::all()
+        .iter()
+        .map(|column| params.gaussians.column(column))
+        .chain([&params.format_specific])
+        .collect();
     let zero = match zero_rotation {
         ZeroRotation::Drop => ZERO_QUATERNION,
         ZeroRotation::Identity => KEPT_ZERO_QUATERNION,
@@ -237,8 +240,11 @@ pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Resul
     if (clip.first, clip.last) != (0.0, 1.0) {
         comments.push(format!("splatsieve_times {} {}", clip.first, clip.last));
     }
-    let own: Vec<(&str, &[f32])> =
-        OWN_PROPERTIES.into_iter().enumerate().map(|(plane, name)| (name, params.own.plane(plane))).collect();
+    let own: Vec<(&str, &[f32])> = OWN_PROPERTIES
+        .into_iter()
+        .enumerate()
+        .map(|(plane, name)| (name, params.format_specific.plane(plane)))
+        .collect();
     write_inria_with(&params.gaussians, &comments, &own, path)
 }
 
@@ -251,10 +257,12 @@ mod tests {
 
     /// Returns `count` Gaussians with linear motion in time windows.
     fn params(count: usize, sh_degree: usize) -> StoredParams {
-        let mut made =
-            StoredParams { gaussians: Gaussians::zeros(count, sh_degree), own: AttributeValues::zeros(WIDTH, count) };
+        let mut made = StoredParams {
+            gaussians: Gaussians::zeros(count, sh_degree),
+            format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, count),
+        };
         let mut next = 0.0f64;
-        let columns = made.gaussians.columns_mut(Attributes::all()).chain([&mut made.own]);
+        let columns = made.gaussians.columns_mut(Attributes::all()).chain([&mut made.format_specific]);
         for value in columns.flat_map(AttributeValues::planes_mut) {
             next = (next + 0.618_034).fract();
             *value = next as f32 - 0.4;
@@ -271,7 +279,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
         for (degree, bytes_per_row) in [(0, 88), (1, 124), (2, 184), (3, 268)] {
-            let clip = ClipTimes { first: -0.5, last: 2.0, frames: Some(31), ..ClipTimes::UNIT };
+            let clip = ClipTimes { first: -0.5, last: 2.0, frames: Some(31), ..ClipTimes::UNIT_INTERVAL };
             write_ftgs(&params(7, degree), &clip, &path).unwrap();
             let found = read(&path).unwrap();
             assert_eq!((&found.params, found.header.clip), (&params(7, degree), clip));
@@ -286,7 +294,7 @@ mod tests {
     fn headers_have_the_comments_of_the_format() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
-        write_ftgs(&params(1, 0), &ClipTimes { frames: Some(60), ..ClipTimes::UNIT }, &path).unwrap();
+        write_ftgs(&params(1, 0), &ClipTimes { frames: Some(60), ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
         let file = std::fs::read(&path).unwrap();
         let text = String::from_utf8_lossy(&file[..file.len().min(1000)]).into_owned();
         let expected = "ply\nformat binary_little_endian 1.0\ncomment ftgs_version 1\ncomment time_units normalized\n\
@@ -302,7 +310,7 @@ mod tests {
     fn read_changed(from: &str, to: &str) -> Result<Ftgs> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
-        write_ftgs(&params(4, 0), &ClipTimes { frames: Some(9), ..ClipTimes::UNIT }, &path).unwrap();
+        write_ftgs(&params(4, 0), &ClipTimes { frames: Some(9), ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
         let file = std::fs::read(&path).unwrap();
         let at = file.windows(from.len()).position(|bytes| bytes == from.as_bytes()).unwrap();
         std::fs::write(&path, [&file[..at], to.as_bytes(), &file[at + from.len()..]].concat()).unwrap();
@@ -330,8 +338,8 @@ mod tests {
     #[test]
     fn velocities_count_only_if_the_header_says_so() {
         let still = read_changed("use_velocity 1", "use_velocity 0").unwrap();
-        assert!((VELOCITY..WIDTH).all(|plane| still.params.own.plane(plane) == [0.0; 4]));
-        assert_eq!(still.params.own.plane(CENTER), params(4, 0).own.plane(CENTER));
+        assert!((VELOCITY..PARAMS_PER_GAUSSIAN).all(|plane| still.params.format_specific.plane(plane) == [0.0; 4]));
+        assert_eq!(still.params.format_specific.plane(CENTER), params(4, 0).format_specific.plane(CENTER));
     }
 
     #[test]
@@ -339,10 +347,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");
         let mut odd = params(6, 1);
-        odd.own.plane_mut(VELOCITY + 1)[1] = f32::NAN;
+        odd.format_specific.plane_mut(VELOCITY + 1)[1] = f32::NAN;
         odd.gaussians.sh.plane_mut(7)[2] = f32::INFINITY;
         odd.gaussians.rotation.set_row(4, [0.0; 4]);
-        write_ftgs(&odd, &ClipTimes::UNIT, &path).unwrap();
+        write_ftgs(&odd, &ClipTimes::UNIT_INTERVAL, &path).unwrap();
         let found = read(&path).unwrap();
         assert_eq!((found.params.len(), found.defects.dropped), (3, 3));
         assert_eq!(found.params, params(6, 1).pick(&[0, 3, 5]));
@@ -353,8 +361,8 @@ mod tests {
         );
         let kept = Ftgs::open(&path, &PlyOptions::default(), ZeroRotation::Identity).unwrap();
         assert_eq!((kept.params.len(), kept.params.gaussians.rotation.row(2)), (4, [1.0, 0.0, 0.0, 0.0]));
-        odd.own.plane_mut(CENTER).fill(f32::NAN);
-        write_ftgs(&odd, &ClipTimes::UNIT, &path).unwrap();
+        odd.format_specific.plane_mut(CENTER).fill(f32::NAN);
+        write_ftgs(&odd, &ClipTimes::UNIT_INTERVAL, &path).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("NaN or infinite value in 6"));
     }
 
@@ -363,7 +371,7 @@ mod tests {
         fn changed_bytes_never_panic(at in 0..700usize, value in any::<u8>()) {
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("a.ftgs.ply");
-            write_ftgs(&params(2, 0), &ClipTimes::UNIT, &path).unwrap();
+            write_ftgs(&params(2, 0), &ClipTimes::UNIT_INTERVAL, &path).unwrap();
             let mut file = std::fs::read(&path).unwrap();
             let at = at % file.len();
             file[at] = value;

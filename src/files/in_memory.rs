@@ -10,7 +10,7 @@ use crate::error::Result;
 
 /// Reads a pickle, using at most `memory` bytes of memory, and formats a description of each value, to
 /// test that this does not fail. Returns the number of values, or `None` if the pickle cannot be read.
-pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
+pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     let pickle = Pickle::read(bytes, memory).ok()?;
     let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();
     let _ = (pickle.items(pickle.root()).map(Iterator::count), pickle.call(pickle.root()));
@@ -22,7 +22,7 @@ pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
 ///
 /// # Errors
 /// Fails if the text is not JSON or exceeds the limits on strings, numbers and nesting.
-pub fn cameras_json(bytes: &[u8]) -> Result<usize> {
+pub fn check_cameras_json(bytes: &[u8]) -> Result<usize> {
     let path = Path::new("cameras.json");
     let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };
     let outline = read_from(bytes, path, &ParseAbort::default(), keep)?;

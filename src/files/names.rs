@@ -25,7 +25,7 @@ pub fn shown_name(path: &Path) -> String {
 
 /// Returns `path` relative to `folder`, which need not exist yet. Returns only the last component of `path` if the two
 /// have too few folders in common ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
-pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
+pub fn relative_to_folder(path: &Path, folder: &Path) -> PathBuf {
     let found = (|| {
         let (path, folder) = (real_path(path)?, real_path(folder)?);
         let shared = path.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
@@ -79,19 +79,19 @@ mod tests {
         fs::write(top.join("data/cameras.json"), "here").unwrap();
         for folder in ["small", "a/b/small", "."] {
             let folder = top.join(folder);
-            let named = from_folder(&top.join("data/cameras.json"), &folder);
+            let named = relative_to_folder(&top.join("data/cameras.json"), &folder);
             assert!(named.is_relative(), "{named:?}");
             fs::create_dir_all(&folder).unwrap();
             assert_eq!(fs::read_to_string(folder.join(&named)).unwrap(), "here", "{named:?}");
         }
-        assert_eq!(from_folder(&top.join("data"), &top.join("small")), Path::new("../data"));
-        assert_eq!(from_folder(&top, &top), Path::new("."));
+        assert_eq!(relative_to_folder(&top.join("data"), &top.join("small")), Path::new("../data"));
+        assert_eq!(relative_to_folder(&top, &top), Path::new("."));
     }
 
     #[test]
     fn distant_file_is_named_by_its_last_name() {
         for (path, folder) in [("/secret/client/data", "/elsewhere/small"), ("/home/b/data", "/home/a/small")] {
-            assert_eq!(from_folder(Path::new(path), Path::new(folder)), Path::new("data"));
+            assert_eq!(relative_to_folder(Path::new(path), Path::new(folder)), Path::new("data"));
         }
     }
 }

@@ -7,13 +7,13 @@ use sha2::{Digest, Sha256};
 
 /// Returns the policy entry (a digest in quotes) that allows an inline script or style. `content` is the text between
 /// its tags.
-pub fn digest_of(content: &str) -> String {
+pub fn policy_digest(content: &str) -> String {
     format!("'sha256-{}'", STANDARD.encode(Sha256::digest(content)))
 }
 
 /// Returns the `<meta>` element of a content security policy that allows only `directives`. Each directive is a name
 /// with its allowed sources.
-pub fn policy(directives: &[(&str, &[String])]) -> String {
+pub fn policy_meta_element(directives: &[(&str, &[String])]) -> String {
     let mut content = "default-src 'none'; base-uri 'none'; form-action 'none'".to_owned();
     for (name, sources) in directives.iter().filter(|(_, sources)| !sources.is_empty()) {
         content += &format!("; {name} {}", sources.join(" "));
@@ -28,12 +28,12 @@ mod tests {
     #[test]
     fn digest_matches_the_specification() {
         // Example from "Content Security Policy Level 3", section 8.3.
-        assert_eq!(digest_of("doSomething();"), "'sha256-RFWPLDbv2BY+rCkDzsE+0fr8ylGr2R2faWMhq4lfEQc='");
+        assert_eq!(policy_digest("doSomething();"), "'sha256-RFWPLDbv2BY+rCkDzsE+0fr8ylGr2R2faWMhq4lfEQc='");
     }
 
     #[test]
     fn a_policy_allows_nothing_else() {
-        let policy = policy(&[("script-src", &[]), ("img-src", &["data:".to_owned()])]);
+        let policy = policy_meta_element(&[("script-src", &[]), ("img-src", &["data:".to_owned()])]);
         let content = "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:";
         assert_eq!(policy, format!("<meta http-equiv=\"Content-Security-Policy\" content=\"{content}\">"));
     }

@@ -53,7 +53,7 @@ impl PlyFrames {
     ///
     /// # Errors
     /// Fails like [`Ply::open`].
-    pub fn single(path: &Path, options: &PlyOptions) -> Result<PlyFrames> {
+    pub fn open_single(path: &Path, options: &PlyOptions) -> Result<PlyFrames> {
         Self::from_paths(path, vec![path.to_owned()], options)
     }
 
@@ -87,7 +87,7 @@ impl PlyFrames {
     }
 
     /// Returns the number of Gaussians in each frame.
-    pub fn counts(&self) -> &[u32] {
+    pub fn gaussian_counts(&self) -> &[u32] {
         &self.counts
     }
 
@@ -97,7 +97,7 @@ impl PlyFrames {
     }
 
     /// Returns the first frame whose number of Gaussians differs from that of frame 0; `None` if all are equal.
-    pub fn other_count(&self) -> Option<usize> {
+    pub fn first_differing_frame(&self) -> Option<usize> {
         self.counts.iter().position(|count| *count != self.counts[0])
     }
 

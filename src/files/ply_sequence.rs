@@ -10,7 +10,7 @@ use super::ply::{Ply, PlyOptions, check_ids};
 use super::ply_frames::PlyFrames;
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
-use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
 
 /// Dynamic scene stored as one PLY file per frame, with the same Gaussians in every file.
 #[derive(Debug)]
@@ -18,8 +18,8 @@ pub struct PlySequence {
     frames: PlyFrames,
     info: SequenceInfo,
     note: Option<String>,
-    bytes: Count,
-    states: Count,
+    bytes: SharedCounter,
+    states: SharedCounter,
 }
 
 impl PlySequence {
@@ -35,9 +35,9 @@ impl PlySequence {
     /// Opens one PLY file as a sequence of one frame, in which no attribute varies.
     ///
     /// # Errors
-    /// Fails like [`PlyFrames::single`].
-    pub fn single(path: &Path, options: &PlyOptions) -> Result<PlySequence> {
-        Self::new(PlyFrames::single(path, options)?)
+    /// Fails like [`PlyFrames::open_single`].
+    pub fn open_single(path: &Path, options: &PlyOptions) -> Result<PlySequence> {
+        Self::new(PlyFrames::open_single(path, options)?)
     }
 
     /// Builds a sequence from frames with the same Gaussians in the same order. Frame i of T has time i / T; all
@@ -46,20 +46,20 @@ impl PlySequence {
     /// # Errors
     /// Fails if frames differ in their number of Gaussians.
     pub fn new(frames: PlyFrames) -> Result<PlySequence> {
-        if let Some(other) = frames.other_count() {
-            let counts = frames.counts();
+        if let Some(other) = frames.first_differing_frame() {
+            let counts = frames.gaussian_counts();
             let expected = format!("{} Gaussians, as in {}", counts[0], frames.paths()[0].shown());
             let found = format!("{} Gaussians", counts[other]);
             return Err(Error::input(&frames.paths()[other], "element vertex", expected, found)
                 .hint("every frame must hold the same Gaussians in the same order, unless they are linked (--link)"));
         }
         let info = SequenceInfo {
-            count: frames.counts()[0] as usize,
+            count: frames.gaussian_counts()[0] as usize,
             times: frames.times(),
             sh_degree: frames.sh_degree(),
             varying: if frames.paths().len() == 1 { Attributes::empty() } else { Attributes::all() },
         };
-        let (bytes, states) = (Count::default(), Count::default());
+        let (bytes, states) = (SharedCounter::default(), SharedCounter::default());
         Ok(PlySequence { frames, info, note: None, bytes, states })
     }
 

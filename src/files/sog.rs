@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 /// Version of the format that is read and written.
 pub const VERSION: u64 = 2;
 /// Name of the file in the archive that describes the images.
-pub const META: &str = "meta.json";
+pub const META_FILE: &str = "meta.json";
 
 /// Content of `meta.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]

@@ -13,7 +13,7 @@ use super::map::FileMap;
 use super::sog::images::decode_opacity;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Gaussians, harmonic};
+use crate::model::{Gaussians, sh_from_color};
 
 /// Number of bytes per Gaussian.
 pub const ROW_BYTES: usize = 32;
@@ -48,7 +48,7 @@ pub fn read_splat(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
         }
         gaussians.position.set_row(i, position);
         gaussians.log_scale.set_row(i, scale.map(|s| f64::from(s.abs().max(MIN_SCALE)).ln() as f32));
-        gaussians.sh.set_row(i, [24, 25, 26].map(|at| harmonic(f64::from(row[at]) / 255.0)));
+        gaussians.sh.set_row(i, [24, 25, 26].map(|at| sh_from_color(f64::from(row[at]) / 255.0)));
         gaussians.opacity_logit.set_row(i, [decode_opacity(row[27])]);
         gaussians.rotation.set_row(i, unit([28, 29, 30, 31].map(|at| (f32::from(row[at]) - 128.0) / 128.0)));
     }
@@ -64,7 +64,7 @@ fn unit(q: [f32; 4]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{color, opacity};
+    use crate::model::{color_from_sh, opacity};
 
     /// Returns the row of a Gaussian without symmetry.
     fn row() -> Vec<u8> {
@@ -84,7 +84,7 @@ mod tests {
         let found = read(&[row(), row()].concat()).unwrap();
         assert_eq!((found.len(), found.position.row::<3>(1)), (2, [1.5, -2.0, 0.25]));
         assert_eq!(found.log_scale.row::<3>(0), [0.5f64.ln() as f32, 1e-7f64.ln() as f32, 2f64.ln() as f32]);
-        let rgb = found.sh.row::<3>(0).map(|dc| (255.0 * color(dc)).round());
+        let rgb = found.sh.row::<3>(0).map(|dc| (255.0 * color_from_sh(dc)).round());
         assert_eq!((rgb, (255.0 * opacity(found.opacity_logit.plane(0)[0])).round()), ([255.0, 0.0, 51.0], 204.0));
         let half = std::f32::consts::FRAC_1_SQRT_2;
         assert_eq!(found.rotation.row::<4>(0), [0.0, half, -half, 0.0]);

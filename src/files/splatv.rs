@@ -21,7 +21,7 @@ use crate::error::{Error, Result, quoted};
 /// First 32-bit word of every `.splatv` file.
 pub const MAGIC: u32 = 0x674b;
 /// Number of texels in a row of the texture.
-pub const TEXELS: usize = 4096;
+pub const TEXELS_PER_ROW: usize = 4096;
 /// Number of bytes that store one Gaussian: four texels.
 pub const ROW_BYTES: usize = 64;
 /// Number of bytes per texel: four 32-bit words.
@@ -30,7 +30,7 @@ const TEXEL_BYTES: usize = 16;
 /// much memory.
 const MAX_TEXT_BYTES: usize = 1 << 20;
 /// Number of 32-bit words that store one Gaussian.
-pub const WORDS: usize = 16;
+pub const WORDS_PER_GAUSSIAN: usize = 16;
 
 /// Gaussian whose position is a cubic polynomial of dt = time − center and whose quaternion is linear in dt. Its
 /// opacity is multiplied by exp(−(dt/width)²).
@@ -59,7 +59,7 @@ pub struct SplatvGaussian {
 
 impl SplatvGaussian {
     /// Decodes a Gaussian from the words that store it.
-    pub fn from_words(words: &[u32; WORDS]) -> SplatvGaussian {
+    pub fn from_words(words: &[u32; WORDS_PER_GAUSSIAN]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
         let byte = |k: usize| f64::from((words[7] >> (8 * k)) & 0xff) / 255.0;
@@ -189,7 +189,7 @@ impl Splatv {
     }
 
     /// Returns the 32-bit words that store Gaussian `i`.
-    pub fn words(&self, i: usize) -> [u32; WORDS] {
+    pub fn words(&self, i: usize) -> [u32; WORDS_PER_GAUSSIAN] {
         self.map.touched(self.start + i * ROW_BYTES..self.start + (i + 1) * ROW_BYTES);
         let row = &self.map[self.start + i * ROW_BYTES..][..ROW_BYTES];
         std::array::from_fn(|k| u32::from_le_bytes(std::array::from_fn(|b| row[4 * k + b])))

@@ -23,9 +23,9 @@ use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 
-use super::accuracy::{Accuracy, RenderedAttributes, check_positions};
+use super::accuracy::{CodingErrors, RenderedAttributes, check_positions};
 use crate::error::{Error, Result, ShowPath};
-use crate::model::{Gaussians, color, opacity};
+use crate::model::{Gaussians, color_from_sh, opacity};
 
 /// First word of a file, "NGSP", of a gzip file after decompression.
 pub const MAGIC: u32 = 0x5053_474e;
@@ -153,10 +153,10 @@ const ARRAYS: [WriteArray; 6] = [
 /// # Errors
 /// Fails if an error exceeds its bound in [`accuracy`](super::accuracy).
 fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
-    let mut accuracy = Accuracy::new(&state.position);
+    let mut accuracy = CodingErrors::new(&state.position);
     for row in 0..state.len() {
         let wanted = RenderedAttributes::from_state(state, row);
-        let color = |dc: f32| color(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
+        let color = |dc: f32| color_from_sh(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
         let found = RenderedAttributes {
             position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),
             scale: state.log_scale.row::<3>(row).map(|scale| (f64::from(scale_byte(scale)) / 16.0 - 10.0).exp()),
@@ -229,7 +229,7 @@ mod tests {
     use flate2::read::GzDecoder;
 
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::Attributes;
     use crate::passes::gather_all;
 
@@ -282,7 +282,7 @@ mod tests {
 
     #[test]
     fn independent_reader_finds_the_written_values() {
-        let mut state = gather_all(&Scene::new(300, 1), 0, Attributes::all()).unwrap();
+        let mut state = gather_all(&DemoScene::new(300, 1), 0, Attributes::all()).unwrap();
         state.sh = crate::model::AttributeValues::zeros(48, 300);
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();

@@ -19,7 +19,7 @@ pub mod write;
 use serde::{Deserialize, Serialize};
 
 use super::sog::Meta;
-use crate::files::ftgs::{ClipTimes, WIDTH};
+use crate::files::ftgs::{ClipTimes, PARAMS_PER_GAUSSIAN};
 use crate::model::StoredParams;
 
 /// Version of the format that is read and written.
@@ -34,21 +34,21 @@ const DEFAULT_FRAMES: usize = 300;
 pub enum Timeline {
     /// A still: every Gaussian is visible at every time and does not move.
     Still,
-    /// Each Gaussian is seen in one of the given number of frames only. [`StoredParams::own`] holds the index of this
+    /// Each Gaussian is seen in one of the given number of frames only. [`StoredParams::format_specific`] holds the index of this
     /// frame.
     Frames(usize),
-    /// Linear motion in Gaussian windows of time. [`StoredParams::own`] holds the parameters of
+    /// Linear motion in Gaussian windows of time. [`StoredParams::format_specific`] holds the parameters of
     /// [`crate::files::ftgs`].
     Windows,
 }
 
 impl Timeline {
-    /// Returns the number of further parameters of a Gaussian, in [`StoredParams::own`].
-    pub fn width(self) -> usize {
+    /// Returns the number of further parameters of a Gaussian, in [`StoredParams::format_specific`].
+    pub fn param_count(self) -> usize {
         match self {
             Timeline::Still => 0,
             Timeline::Frames(_) => 1,
-            Timeline::Windows => WIDTH,
+            Timeline::Windows => PARAMS_PER_GAUSSIAN,
         }
     }
 }

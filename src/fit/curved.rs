@@ -9,7 +9,7 @@
 //! multiplicative updates that keep all depths positive (Richardson 1972, Lucy 1974).
 
 use super::least_squares::polynomial;
-use super::{FittedTrack, MIN_VISIBLE_OPACITY, Misfit, Tolerance};
+use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
 
 /// Gaussian with cubic motion and linear rotation, visible in a window of time.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,10 +93,15 @@ const MIN_WEIGHT: f64 = 1e-3;
 
 /// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,
 /// if none do, the closest ones that were tried. Adds their errors to `misfit`.
-pub fn curved(track: &FittedTrack, form: CurveForm, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
-    let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
-    let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
-    let mut best: Option<(f64, Vec<CubicTrack>, Misfit)> = None;
+pub fn fit_curves(
+    track: &FittedTrack,
+    form: CurveForm,
+    tolerance: &Tolerance,
+    misfit: &mut FitError,
+) -> Vec<CubicTrack> {
+    let Some(first) = (0..track.len()).find(|&frame| track.is_visible(frame)) else { return Vec::new() };
+    let last = (first..track.len()).rev().find(|&frame| track.is_visible(frame)).unwrap_or(first);
+    let mut best: Option<(f64, Vec<CubicTrack>, FitError)> = None;
     let mut attempt = |curves: Vec<CubicTrack>| {
         let (excess, found) = measure_misfit(track, &curves, tolerance);
         if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
@@ -118,7 +123,7 @@ pub fn curved(track: &FittedTrack, form: CurveForm, tolerance: &Tolerance, misfi
         done = done || attempt(overlapping_curves(track, form, visible, count));
     }
     let (_, curves, found) = best.unwrap_or_default();
-    *misfit = misfit.and(found);
+    *misfit = misfit.merged_with(found);
     curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
 }
 
@@ -133,7 +138,7 @@ fn depth(opacity: f64) -> f64 {
 /// Returns one curve of constant opacity, whose window is infinitely wide.
 fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
-    let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
+    let seen = (0..track.len()).filter(|&frame| track.is_visible(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
     let curve = fit_motion(track, form, center, f64::INFINITY, |_| 1.0);
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
@@ -145,7 +150,7 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
 fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     let (first, last) = (track.times[0], track.times[track.len() - 1]);
     let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
-    let seen: Vec<usize> = (0..track.len()).filter(|&frame| track.is_seen(frame)).collect();
+    let seen: Vec<usize> = (0..track.len()).filter(|&frame| track.is_visible(frame)).collect();
     if seen.len() < 3 {
         return None;
     }
@@ -239,7 +244,7 @@ fn fit_motion(
     width: f64,
     weight: impl Fn(usize) -> f64,
 ) -> CubicTrack {
-    let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
+    let weight = |frame: usize| if track.is_visible(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let samples: Vec<(usize, f64)> = (0..track.len())
         .map(|frame| (frame, weight(frame)))
         .filter(|(_, weight)| *weight > MIN_WEIGHT * MIN_VISIBLE_OPACITY)
@@ -274,8 +279,8 @@ fn fit_motion(
 
 /// Returns the largest error of `curves` in units of `tolerance`, and the errors over all visible frames. Where several
 /// curves are visible, each must be close to the Gaussian, in proportion to its share of the optical depth.
-fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
-    let (mut worst, mut misfit) = (0.0f64, Misfit::default());
+fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
+    let (mut worst, mut misfit) = (0.0f64, FitError::default());
     for frame in 0..track.len() {
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
@@ -290,7 +295,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
             let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
-            let distance = track.distance(frame, curve.position_at(time));
+            let distance = track.relative_distance(frame, curve.position_at(time));
             away += share * distance;
             worst = [
                 distance / tolerance.position,
@@ -304,7 +309,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             .fold(worst, f64::max);
         }
         let apart = 1.0 - (-shown).exp() - track.opacity[frame];
-        if track.is_seen(frame) || apart > MIN_VISIBLE_OPACITY {
+        if track.is_visible(frame) || apart > MIN_VISIBLE_OPACITY {
             worst = worst.max(apart.abs() / tolerance.opacity);
             misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart, track.opacity[frame]);
         }
@@ -331,12 +336,12 @@ mod tests {
     #[test]
     fn cubic_and_fading_tracks_are_recovered_exactly() {
         let cubic = |t: f64| [t - 2.0 * t * t + t.powi(3), 0.3, -t];
-        let mut misfit = Misfit::default();
-        let one = curved(&track(60, cubic, |_| 0.8), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
+        let mut misfit = FitError::default();
+        let one = fit_curves(&track(60, cubic, |_| 0.8), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(one.len() == 1 && one[0].width.is_infinite() && (one[0].opacity - 0.8).abs() < 1e-9);
         assert!(misfit.position < 1e-3 && misfit.states == 60, "{misfit:?}");
         let fading = track(60, cubic, |t| 0.9 * window(t, 0.4, 0.15));
-        let one = curved(&fading, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
+        let one = fit_curves(&fading, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
         assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.opacity < 0.01);
@@ -345,20 +350,20 @@ mod tests {
     #[test]
     fn complex_tracks_are_shared_by_curves_whose_opacity_adds_up() {
         let wave = |t: f64| [(18.0 * t).sin(), 0.0, 0.0];
-        let mut misfit = Misfit::default();
-        let many = curved(&track(120, wave, |_| 0.6), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
+        let mut misfit = FitError::default();
+        let many = fit_curves(&track(120, wave, |_| 0.6), CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!((4..=33).contains(&many.len()), "{} curves", many.len());
         assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
-        let mut misfit = Misfit::default();
+        let mut misfit = FitError::default();
         let half_seen = track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 });
-        let step = curved(&half_seen, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
+        let step = fit_curves(&half_seen, CurveForm::CUBIC, &Tolerance::default(), &mut misfit);
         assert!(step.len() > 2 && misfit.opacity < 0.4, "{} curves, {misfit:?}", step.len());
     }
 
     #[test]
     fn invisible_track_has_no_curve_and_single_frame_has_one() {
         for form in [CurveForm::CUBIC, CurveForm::linear(0.02)] {
-            let fit = |track: FittedTrack| curved(&track, form, &Tolerance::default(), &mut Misfit::default());
+            let fit = |track: FittedTrack| fit_curves(&track, form, &Tolerance::default(), &mut FitError::default());
             assert!(fit(track(20, |_| [0.0; 3], |_| 1e-3)).is_empty());
             let still = fit(track(1, |_| [1.0; 3], |_| 0.5));
             assert!(still.len() == 1 && still[0].position_at(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
@@ -368,10 +373,10 @@ mod tests {
 
     #[test]
     fn a_window_cut_by_the_end_of_the_sequence_is_one_line() {
-        let mut misfit = Misfit::default();
+        let mut misfit = FitError::default();
         let cut = track(40, |t| [2.0 * t, 1.0 - t, 0.0], |t| 0.8 * window(t, -0.1, 0.6));
         let cut = FittedTrack { rotation: vec![[1.0, 0.0, 0.0, 0.0]; 40], ..cut };
-        let one = curved(&cut, CurveForm::linear(0.0), &Tolerance::default(), &mut misfit);
+        let one = fit_curves(&cut, CurveForm::linear(0.0), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].center + 0.1).abs() < 1e-6 && (one[0].width - 0.6).abs() < 1e-6, "{:?}", one[0]);
         assert!((one[0].opacity - 0.8).abs() < 1e-6 && (one[0].position[1][0] - 2.0).abs() < 1e-2, "{:?}", one[0]);
@@ -380,9 +385,9 @@ mod tests {
 
     #[test]
     fn lines_have_no_higher_terms_and_no_narrow_window() {
-        let mut misfit = Misfit::default();
+        let mut misfit = FitError::default();
         let turning = track(60, |t| [(3.0 * t).sin(), (3.0 * t).cos(), 0.0], |t| 0.6 + 0.2 * (9.0 * t).sin());
-        let lines = curved(&turning, CurveForm::linear(0.1), &Tolerance::default(), &mut misfit);
+        let lines = fit_curves(&turning, CurveForm::linear(0.1), &Tolerance::default(), &mut misfit);
         assert!((2..=9).contains(&lines.len()), "{} lines", lines.len());
         for line in &lines {
             assert_eq!((&line.position[2..], line.rotation[1]), (&[[0.0; 3]; 2][..], [0.0; 4]));

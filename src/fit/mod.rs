@@ -9,9 +9,9 @@ mod least_squares;
 mod straight;
 mod track;
 
-pub use curved::{CubicTrack, CurveForm, curved};
+pub use curved::{CubicTrack, CurveForm, fit_curves};
 pub(crate) use least_squares::polynomial;
-pub use straight::{LinearPiece, straight};
+pub use straight::{LinearPiece, fit_lines};
 pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 
 /// Maximum error of a fit at every frame in which the Gaussian is visible.
@@ -55,7 +55,7 @@ const FAR: [f64; 2] = [1.0, 0.1];
 
 /// Error of fits, over all Gaussians and the frames in which they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Misfit {
+pub struct FitError {
     /// Number of compared states (Gaussians × visible frames).
     pub states: u64,
     /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
@@ -73,7 +73,7 @@ pub struct Misfit {
     pub opacity: f64,
 }
 
-impl Misfit {
+impl FitError {
     /// Adds the errors of one Gaussian of opacity `visible` at one frame: of its position, in units of its middle scale,
     /// and of its opacity.
     pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
@@ -88,8 +88,8 @@ impl Misfit {
 
     /// Returns the error over all states of `self` and of `other`: counts and sums are added, and each largest
     /// difference is the larger of the two.
-    pub fn and(self, other: Misfit) -> Misfit {
-        Misfit {
+    pub fn merged_with(self, other: FitError) -> FitError {
+        FitError {
             states: self.states + other.states,
             squares: self.squares + other.squares,
             opacity_squares: self.opacity_squares + other.opacity_squares,
@@ -107,7 +107,7 @@ impl Misfit {
 
     /// Returns the fraction of the visible states, weighted by their opacity, that are off by more than the middle scale
     /// or by more than 0.1 of opacity. Unlike the other errors, this one hardly counts Gaussians that are hardly seen.
-    pub fn far_share(&self) -> f64 {
+    pub fn far_off_fraction(&self) -> f64 {
         self.far / self.visible.max(f64::MIN_POSITIVE)
     }
 

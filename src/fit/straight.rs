@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::least_squares::polynomial;
-use super::{FittedTrack, Misfit, Tolerance};
+use super::{FitError, FittedTrack, Tolerance};
 
 /// Piece of a track: linear motion of a Gaussian during consecutive frames.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,13 +30,13 @@ pub struct LinearPiece {
 /// at every frame. Spans are the sequence, its halves, their halves and so on: 2ᵏ frames from a multiple of 2ᵏ.
 /// Therefore all Gaussians together have at most twice as many different spans as there are frames. Frames in which the
 /// Gaussian is invisible have no piece. Adds the errors of the pieces to `misfit`.
-pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
+pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitError) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
     for piece in &pieces {
         for frame in piece.frames.clone() {
             misfit.add(
-                track.distance(frame, position_at(piece, track.times[frame])),
+                track.relative_distance(frame, position_at(piece, track.times[frame])),
                 track.opacity[frame] - piece.opacity,
                 track.opacity[frame],
             );
@@ -49,7 +49,7 @@ pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit)
 /// has 2ᵏ frames and may extend beyond the last frame.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
-    let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
+    let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();
     if seen == 0 {
         return;
     }
@@ -98,7 +98,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
 fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
-        track.distance(frame, position_at(piece, track.times[frame])) <= tolerance.position
+        track.relative_distance(frame, position_at(piece, track.times[frame])) <= tolerance.position
             && track.rotation_error(frame, piece.rotation) <= tolerance.rotation
             && near(track.opacity[frame], piece.opacity, tolerance.opacity)
             && (0..3).all(|c| near(track.log_scale[frame][c], piece.log_scale[c], tolerance.log_scale))
@@ -129,12 +129,12 @@ mod tests {
 
     #[test]
     fn linear_motion_is_one_piece_and_a_bend_splits_it() {
-        let mut misfit = Misfit::default();
-        let one = straight(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
+        let mut misfit = FitError::default();
+        let one = fit_lines(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
         let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
-        let pieces = straight(&bent, &Tolerance::default(), &mut misfit);
+        let pieces = fit_lines(&bent, &Tolerance::default(), &mut misfit);
         // The motion bends in frame 20, so the pieces are frames 0 to 15, 16 to 19, and from 20 on.
         assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
         assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
@@ -143,26 +143,26 @@ mod tests {
 
     #[test]
     fn invisible_frames_have_no_piece_and_tracks_may_pause() {
-        let mut misfit = Misfit::default();
+        let mut misfit = FitError::default();
         let blink = track(60, |_| [0.0; 3], |t| if (0.2..0.4).contains(&t) || t > 0.7 { 0.5 } else { 0.001 });
-        let pieces = straight(&blink, &Tolerance::default(), &mut misfit);
+        let pieces = fit_lines(&blink, &Tolerance::default(), &mut misfit);
         let frames: Vec<_> = pieces.iter().map(|piece| piece.frames.clone()).collect();
         assert_eq!(frames, [12..16, 16..24, 43..44, 44..48, 48..60]);
         let mut broken = track(5, |_| [0.0; 3], |_| 0.5);
         broken.position[2][1] = f64::NAN;
         // The pieces are frames 0 and 1, frame 3, and frame 4.
-        assert_eq!(straight(&broken, &Tolerance::default(), &mut misfit).len(), 3);
+        assert_eq!(fit_lines(&broken, &Tolerance::default(), &mut misfit).len(), 3);
     }
 
     #[test]
     fn every_frame_of_a_wild_track_is_within_tolerance() {
-        let mut misfit = Misfit::default();
+        let mut misfit = FitError::default();
         let mut wild = track(200, |t| [(37.0 * t).sin(), (23.0 * t).cos(), t * t], |t| 0.5 + 0.4 * (50.0 * t).sin());
         for (frame, (rotation, scale)) in wild.rotation.iter_mut().zip(&mut wild.log_scale).enumerate() {
             let angle = frame as f64 / 40.0;
             (*rotation, *scale) = ([angle.cos(), angle.sin(), 0.0, 0.0], [-3.0, -2.0, -4.0 + angle]);
         }
-        let pieces = straight(&wild, &Tolerance::default(), &mut misfit);
+        let pieces = fit_lines(&wild, &Tolerance::default(), &mut misfit);
         assert!(pieces.iter().all(|piece| is_within(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
         assert!(pieces.windows(2).all(|pair| pair[0].frames.end == pair[1].frames.start));
         assert!(misfit.position <= 0.1 && misfit.opacity <= 0.02 && misfit.states == 200, "{misfit:?}");

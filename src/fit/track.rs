@@ -63,7 +63,7 @@ impl FittedTrack {
     }
 
     /// Returns whether the Gaussian is visible at `frame` and its values are finite.
-    pub fn is_seen(&self, frame: usize) -> bool {
+    pub fn is_visible(&self, frame: usize) -> bool {
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
         self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }
@@ -81,7 +81,7 @@ impl FittedTrack {
     }
 
     /// Returns the distance between `position` and the position at `frame`, in units of the middle scale at `frame`.
-    pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
+    pub fn relative_distance(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         apart / self.middle_scale(frame)
     }

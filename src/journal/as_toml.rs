@@ -29,7 +29,7 @@ mod tests {
 
     use super::*;
     use crate::journal::Journal;
-    use crate::journal::records::{BandsSummary, FieldSummary, RefinedSummary, Saved};
+    use crate::journal::records::{FieldSummary, RefinedSummary, SavedCost, ShDegreeSummary};
     use crate::pipeline::summary::{ArchiveSummary, GoalSummary};
 
     fn kept<T: Serialize + DeserializeOwned>(value: T) -> T {
@@ -59,12 +59,12 @@ mod tests {
             same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_pictures, tried: tried.clone() });
             let mut journal = Journal::default();
             journal.leave_out("a", "b");
-            journal.spare("c", "d", Saved::Stage { seconds: odd, reads: 2.0 });
-            journal.spare("e", "f", Saved::Values { bytes: 1 << 50 });
+            journal.record_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });
+            journal.record_saving("e", "f", SavedCost::Values { bytes: 1 << 50 });
             journal.notes.push("several\nlines, 40.1 dB".to_owned());
             journal.field =
                 Some(FieldSummary { half: true, pictures: 3, rounding: odd, result: Some(odd), least: odd });
-            journal.bands = Some(BandsSummary { sh_degree: 2, pictures: 3, tried, result: odd, least: odd });
+            journal.bands = Some(ShDegreeSummary { sh_degree: 2, pictures: 3, tried, result: odd, least: odd });
             journal.refined = Some(RefinedSummary { pictures: 3, before: odd, result: odd });
             let shown = format!("{journal:?}");
             assert_eq!(format!("{:?}", kept(journal)), shown);

@@ -14,23 +14,23 @@ use crate::cache::{Cache, CacheKey, Spill};
 use crate::error::Result;
 use crate::journal::as_toml::AsToml;
 use crate::journal::records::Forecast;
-use crate::journal::records::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, StageRecord};
+use crate::journal::records::{FieldSummary, LeftOut, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord};
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
 
 /// Clock that measures a period of work, in wall-clock time and processor time.
 #[derive(Debug, Clone, Copy)]
-pub struct Clock {
+pub struct Stopwatch {
     wall: Instant,
     /// Processor time that the process had used at the start, seconds; `None` if the system does not report it.
     processors: Option<f64>,
 }
 
-impl Clock {
+impl Stopwatch {
     /// Starts a measurement now.
-    pub fn start() -> Clock {
-        Clock { wall: Instant::now(), processors: processor_seconds() }
+    pub fn start() -> Stopwatch {
+        Stopwatch { wall: Instant::now(), processors: processor_seconds() }
     }
 
     /// Returns the wall-clock time since the start, seconds.
@@ -67,7 +67,7 @@ pub struct Journal {
     /// Measured effect on renders of writing the deformation field in half precision.
     pub field: Option<FieldSummary>,
     /// Measured effect on renders of dropping SH degrees.
-    pub bands: Option<BandsSummary>,
+    pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement.
     pub refined: Option<RefinedSummary>,
     /// Forecast of time and memory that was made before the run, if there was one.
@@ -80,21 +80,21 @@ impl Journal {
     ///
     /// # Errors
     /// Fails if `work` fails; the stage is not recorded then.
-    pub fn stage<T>(
+    pub fn run_stage<T>(
         &mut self,
         name: &'static str,
         gaussians_in: usize,
         source: &dyn FrameSource,
         work: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
-        let (start, before, scratch) = (Clock::start(), source.reads(), Spill::read_back());
+        let (start, before, scratch) = (Stopwatch::start(), source.reads(), Spill::bytes_read_back());
         let (value, gaussians_out) = work(self)?;
-        let (reads, scratch) = (source.reads() - before, Spill::read_back() - scratch);
+        let (reads, scratch) = (source.reads() - before, Spill::bytes_read_back() - scratch);
         self.add(name, [gaussians_in, gaussians_out], start, reads, scratch);
         Ok(value)
     }
 
-    /// Runs a stage that cannot be divided among processes, like [`Journal::stage`], or returns its result from the
+    /// Runs a stage that cannot be divided among processes, like [`Journal::run_stage`], or returns its result from the
     /// cache. The result is stored under `key` in the work folder of the scene.
     ///
     /// # Errors
@@ -108,9 +108,9 @@ impl Journal {
         key: CacheKey,
         compute: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
-        self.kept(&scene.work, name, key, |journal| {
+        self.cached(&scene.work, name, key, |journal| {
             scene.work.end_shard_before(name)?;
-            journal.stage(name, gaussians_in, scene.source(), compute)
+            journal.run_stage(name, gaussians_in, scene.source(), compute)
         })
     }
 
@@ -127,24 +127,24 @@ impl Journal {
     ///
     /// # Errors
     /// Fails if `compute` fails or the cache cannot be used.
-    pub fn kept<T: Serialize + DeserializeOwned>(
+    pub fn cached<T: Serialize + DeserializeOwned>(
         &mut self,
         work: &Cache,
         stage: &str,
         key: CacheKey,
         compute: impl FnOnce(&mut Journal) -> Result<T>,
     ) -> Result<T> {
-        if !work.keeps() {
+        if !work.is_enabled() {
             return compute(self);
         }
         let mut is_new = false;
-        let (found, AsToml(mut own)) = work.known(stage, key, || {
+        let (found, AsToml(mut own)) = work.get_or_compute(stage, key, || {
             is_new = true;
             let mut own = Journal { whole: self.whole, ..Journal::default() };
             let found = compute(&mut own)?;
             Ok((found, AsToml(own)))
         })?;
-        own.stages.iter_mut().for_each(|stage| stage.kept |= !is_new);
+        own.stages.iter_mut().for_each(|stage| stage.from_cache |= !is_new);
         self.stages.extend(own.stages);
         self.left_out.extend(own.left_out);
         self.notes.extend(own.notes);
@@ -156,7 +156,7 @@ impl Journal {
 
     /// Records the opening of the input as stage `name`, which began at `start`, found `gaussians` Gaussians and read
     /// the amounts `reads`.
-    pub fn opened(&mut self, name: &'static str, start: Clock, gaussians: usize, reads: Reads) {
+    pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
     }
 
@@ -166,7 +166,7 @@ impl Journal {
     }
 
     /// Adds an entry for the omitted work `what` with the reason `why` and the cost `saved` by omitting it.
-    pub fn spare(&mut self, what: impl Into<String>, why: impl Into<String>, saved: Saved) {
+    pub fn record_saving(&mut self, what: impl Into<String>, why: impl Into<String>, saved: SavedCost) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }
 
@@ -174,7 +174,7 @@ impl Journal {
         &mut self,
         name: &str,
         [gaussians_in, gaussians_out]: [usize; 2],
-        start: Clock,
+        start: Stopwatch,
         reads: Reads,
         scratch_bytes: u64,
     ) {
@@ -187,7 +187,7 @@ impl Journal {
             reads,
             full_reads: read as f64 / whole.max(1) as f64,
             scratch_bytes,
-            kept: false,
+            from_cache: false,
             seconds: start.seconds(),
             processor_seconds: start.processor_seconds(),
             peak_memory_bytes: peak_memory_bytes(),

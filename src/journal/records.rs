@@ -4,7 +4,7 @@ use bytesize::ByteSize;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::metrics::decibels_text;
-use crate::progress::duration;
+use crate::progress::format_duration;
 use crate::source::Reads;
 
 /// Time, memory, reads and counts of one stage of a run.
@@ -25,7 +25,8 @@ pub struct StageRecord {
     pub scratch_bytes: u64,
     /// Whether the result came from the cache. Times and reads are then those of the run that computed it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub kept: bool,
+    #[serde(rename = "kept")]
+    pub from_cache: bool,
     /// Wall-clock time, seconds.
     pub seconds: f64,
     /// Processor time summed over all processors, seconds; `None` if the system does not report it.
@@ -44,13 +45,13 @@ pub struct LeftOut {
     pub why: String,
     /// Time, reads or bytes that were saved, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub saved: Option<Saved>,
+    pub saved: Option<SavedCost>,
 }
 
 /// Cost that was saved by omitting work.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Saved {
+pub enum SavedCost {
     /// Estimated cost of a whole stage.
     Stage {
         /// Wall-clock time when all threads are busy, seconds.
@@ -65,12 +66,12 @@ pub enum Saved {
     },
 }
 
-impl Saved {
+impl SavedCost {
     /// Formats the saved cost for display, such as "about 12.0 s, 1.00 full reads".
     pub fn text(self) -> String {
         match self {
-            Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
-            Saved::Values { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
+            SavedCost::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", format_duration(seconds)),
+            SavedCost::Values { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
         }
     }
 }
@@ -184,7 +185,7 @@ pub struct QualitySummary {
 
 /// Effect on renders of dropping SH degrees of the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct BandsSummary {
+pub struct ShDegreeSummary {
     /// SH degree of the output.
     pub sh_degree: usize,
     /// Number of views on which renders were compared.
@@ -201,10 +202,10 @@ pub struct BandsSummary {
     pub least: f64,
 }
 
-impl BandsSummary {
+impl ShDegreeSummary {
     /// Returns, as text, the measured values that explain the SH degree of the output.
     pub(crate) fn why(&self) -> String {
-        let BandsSummary { pictures, tried, result, least, .. } = self;
+        let ShDegreeSummary { pictures, tried, result, least, .. } = self;
         let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
         let tried: Vec<String> = tried.iter().map(line).collect();
         format!(
@@ -218,7 +219,7 @@ impl BandsSummary {
 
 /// Estimated value with its lower and upper bound.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Range {
+pub struct EstimateRange {
     /// Lower bound; smaller values are unlikely.
     pub least: f64,
     /// Expected value.
@@ -240,9 +241,9 @@ pub struct StageForecast {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
     /// Expected wall-clock time, seconds.
-    pub seconds: Range,
+    pub seconds: EstimateRange,
     /// Expected processor time summed over all processors, seconds.
-    pub core_seconds: Range,
+    pub core_seconds: EstimateRange,
     /// Number of threads that the run uses.
     pub threads: u64,
     /// Whether the speed of this machine was measured on the scene for this forecast.
@@ -256,7 +257,7 @@ pub struct Forecast {
 /// Percentiles, over all Gaussians, of one term of the score by which Gaussians are ranked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::Quantity::name).
+    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::ScoredQuantity::name).
     pub name: String,
     /// Value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]

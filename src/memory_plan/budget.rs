@@ -50,27 +50,27 @@ impl Budget {
     /// Returns the default budget in bytes, and a text that says how it follows from the memory of this machine.
     pub(super) fn by_default() -> (u64, String) {
         let (bytes, origin) = memory_limit();
-        (bytes / 4, format!("a quarter of {}, {origin}", size(bytes)))
+        (bytes / 4, format!("a quarter of {}, {origin}", format_bytes(bytes)))
     }
 
     /// Returns the budget as text, with a unit and where it comes from (the user or this machine).
-    pub fn named(self) -> String {
+    pub fn text(self) -> String {
         match self.bytes {
-            Some(bytes) => format!("{}, as asked for", size(bytes)),
+            Some(bytes) => format!("{}, as asked for", format_bytes(bytes)),
             None => {
                 let (bytes, origin) = Budget::by_default();
-                format!("{}, {origin}", size(bytes))
+                format!("{}, {origin}", format_bytes(bytes))
             }
         }
     }
 }
 
 /// Returns a message with the peak memory of this process so far; `None` if the operating system does not report it.
-pub fn taken() -> Option<String> {
-    peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", size(bytes)))
+pub fn peak_memory_text() -> Option<String> {
+    peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", format_bytes(bytes)))
 }
 
 /// Returns a number of bytes as text with a binary unit, such as `1.5 GiB`.
-pub fn size(bytes: u64) -> String {
+pub fn format_bytes(bytes: u64) -> String {
     ByteSize(bytes).display().iec().to_string()
 }

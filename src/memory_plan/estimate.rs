@@ -37,6 +37,6 @@ pub fn bytes_of_survivors(left: f64, bytes: u64) -> u64 {
 }
 
 /// Returns for each stage its name and its estimated time in seconds if all threads share the work.
-pub fn seconds(work: &Workload, estimates: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
+pub fn stage_seconds(work: &Workload, estimates: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
     estimates.iter().map(|estimate| (estimate.stage, estimate.seconds / work.threads as f64)).collect()
 }

@@ -2,7 +2,7 @@
 //! (`--memory`). This module knows no stage: every stage states its own [`ResourceEstimate`].
 //!
 //! The memory of a stage is a number of bytes per Gaussian plus a fixed number of bytes, both as sums of named parts.
-//! The stage that takes most determines the peak. [`Plan::fit`] starts with limits that cost no time, and halves the
+//! The stage that takes most determines the peak. [`MemoryPlan::fit_budget`] starts with limits that cost no time, and halves the
 //! limit that frees most memory until all stages fit. Results never depend on the limits. Only four parts of the memory
 //! grow with the number of frames, and they are named too: time stamps, lists of views, the number of Gaussians alive
 //! in each frame, and one byte per tile (values of consecutive Gaussians × frames) of a container.
@@ -12,9 +12,10 @@ mod estimate;
 mod plan;
 mod workload;
 
-pub use budget::{Budget, Verbosity, size, taken};
-pub use estimate::{ResourceEstimate, bytes_of_survivors, seconds};
-pub use plan::Plan;
+pub use budget::{Budget, Verbosity, format_bytes, peak_memory_text};
+pub use estimate::{ResourceEstimate, bytes_of_survivors, stage_seconds};
+pub use plan::MemoryPlan;
 pub use workload::{
-    LOOK, MemoryPart, REMOVE, RENDER, RenderCost, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput, Workload,
+    CONTRIBUTION_COST, MemoryPart, REMOVAL_COST, RENDER_COST, RenderCost, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput,
+    Workload,
 };

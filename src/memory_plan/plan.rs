@@ -2,14 +2,14 @@
 
 use std::fmt::Write as _;
 
-use super::budget::{Budget, PER_THREAD, PROGRAM_BYTES, Verbosity, size};
-use super::estimate::{ResourceEstimate, seconds};
+use super::budget::{Budget, PER_THREAD, PROGRAM_BYTES, Verbosity, format_bytes};
+use super::estimate::{ResourceEstimate, stage_seconds};
 use super::workload::{MemoryPart, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
-use crate::progress::{Events, Message, duration};
+use crate::progress::{Events, Message, format_duration};
 
 /// Divisor of the memory budget: all decoded tiles of a container (values of consecutive Gaussians × frames) stay in
 /// memory if they take at most 1/16 of the budget. The file system caches the stored bytes anyway. A larger part would
@@ -19,16 +19,16 @@ const HELD_TILES_DIVISOR: u64 = 16;
 /// Functions that each halve one limit. Halving a limit slows a run; the functions that slow it most come first. If
 /// several free equally much memory, the last of them is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
-    |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
+    |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
     |limits| Limits { gaussians_together: (limits.gaussians_together / 2).max(GAUSSIAN_BLOCK), ..*limits },
     |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
-    |limits| Limits { frames_held: limits.frames_held.div_ceil(2), ..*limits },
+    |limits| Limits { max_kept_frames: limits.max_kept_frames.div_ceil(2), ..*limits },
 ];
 
 /// Limits by which a run stays within its memory budget, and the estimates of its stages under these limits.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Plan {
+pub struct MemoryPlan {
     work: Workload,
     budget: u64,
     /// Maximum amounts (frames, views, Gaussians) that stages keep in memory at a time.
@@ -36,29 +36,29 @@ pub struct Plan {
     estimates: Vec<ResourceEstimate>,
 }
 
-impl Plan {
+impl MemoryPlan {
     /// Finds the fastest limits with which all stages fit into `budget`. `estimates` returns the estimates of all
     /// stages for given limits. Sends the plan as text to `events` if the budget asks for it, even if the stages do not
     /// fit.
     ///
     /// # Errors
     /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
-    pub fn fit(
+    pub fn fit_budget(
         work: Workload,
         budget: Budget,
         events: &Events,
         estimates: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
-    ) -> Result<Plan> {
+    ) -> Result<MemoryPlan> {
         let plan = Self::closest(work, budget.limit(), estimates);
         let fits = plan.excess_bytes() == 0;
         if budget.tell == Verbosity::Plan {
-            events.send(Message::Plan(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()));
+            events.send(Message::Plan(format!("budget: {}\n{}", budget.text(), plan.text()).trim_end()));
         }
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
     /// Returns whether there are limits with which all stages that `estimates` describes fit into `budget`.
-    pub fn fits(
+    pub fn fits_budget(
         work: Workload,
         budget: Budget,
         estimates: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
@@ -72,15 +72,15 @@ impl Plan {
         work: Workload,
         budget: u64,
         estimates: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
-    ) -> Plan {
+    ) -> MemoryPlan {
         let mut limits = Limits {
-            frames_held: FRAME_BLOCK,
+            max_kept_frames: FRAME_BLOCK,
             frames_together: VIEWS_PER_THREAD * work.threads as usize,
-            pictures_together: work.threads as usize,
+            views_together: work.threads as usize,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
-            rows_aside: false,
-            tiles_held: false,
+            statistics_on_disk: false,
+            keeps_tiles: false,
         };
         // The input is read entirely before anything else, if its model format requires this.
         let opening = vec![("file", work.input.opening)];
@@ -92,15 +92,15 @@ impl Plan {
         };
         // Moving statistics to a scratch file costs almost no time, so this is decided first.
         let [excess_bytes, less] = [false, true].map(|rows_aside| {
-            let limits = Limits { rows_aside, ..limits };
-            Plan { work, budget, limits, estimates: all(&limits) }.excess_bytes()
+            let limits = Limits { statistics_on_disk: rows_aside, ..limits };
+            MemoryPlan { work, budget, limits, estimates: all(&limits) }.excess_bytes()
         });
-        limits.rows_aside = less < excess_bytes;
+        limits.statistics_on_disk = less < excess_bytes;
         loop {
-            let plan = Plan { work, budget, limits, estimates: all(&limits) };
+            let plan = MemoryPlan { work, budget, limits, estimates: all(&limits) };
             let excess_bytes = plan.excess_bytes();
             let saved_bytes = |other: &Limits| {
-                excess_bytes - Plan { limits: *other, estimates: all(other), ..plan.clone() }.excess_bytes()
+                excess_bytes - MemoryPlan { limits: *other, estimates: all(other), ..plan.clone() }.excess_bytes()
             };
             let halved = HALVINGS.iter().filter_map(|halve| {
                 let smaller = std::iter::successors(Some(limits), |limits| Some(halve(limits)));
@@ -116,28 +116,28 @@ impl Plan {
 
     /// Allows all decoded tiles of the container to stay in memory if they take a small part of the budget. No tile is
     /// then read twice.
-    fn with_held_tiles(mut self) -> Plan {
+    fn with_held_tiles(mut self) -> MemoryPlan {
         let decoded = self.work.input.decoded;
-        let fits = self.excess_bytes() == 0 && self.peak().saturating_add(decoded) <= self.budget;
-        self.limits.tiles_held = decoded > 0 && fits && decoded <= self.budget / HELD_TILES_DIVISOR;
+        let fits = self.excess_bytes() == 0 && self.peak_bytes().saturating_add(decoded) <= self.budget;
+        self.limits.keeps_tiles = decoded > 0 && fits && decoded <= self.budget / HELD_TILES_DIVISOR;
         self
     }
 
     /// Returns how many times all stages together read the input in full, at most.
-    pub fn reads(&self) -> f64 {
+    pub fn full_reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
-        if self.limits.tiles_held { sum.min(1.0) } else { sum }
+        if self.limits.keeps_tiles { sum.min(1.0) } else { sum }
     }
 
     /// Returns the peak memory of the run in bytes: that of the stage that takes most.
-    pub fn peak(&self) -> u64 {
+    pub fn peak_bytes(&self) -> u64 {
         self.base() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
     }
 
     /// Returns the bytes of memory that are taken in every stage: program, threads, index, time stamps, cameras,
     /// decoded tiles.
     fn base(&self) -> u64 {
-        let held = if self.limits.tiles_held { self.work.input.decoded } else { 0 };
+        let held = if self.limits.keeps_tiles { self.work.input.decoded } else { 0 };
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
@@ -156,12 +156,12 @@ impl Plan {
             .max_by_key(|estimate| estimate.bytes(&self.work))
             .map_or("", |estimate| estimate.stage);
         // Rounded up to whole MiB, since the user will write it so.
-        let least = self.peak().div_ceil(1 << 20);
+        let least = self.peak_bytes().div_ceil(1 << 20);
         let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::MemoryLimit(format!(
             "--memory {}{origin}: expected at least {least}MiB, which the stage \"{largest}\" takes for {} Gaussians{}\n  \
              raise --memory to that or lower --threads; --explain lists the memory of every stage",
-            size(self.budget),
+            format_bytes(self.budget),
             self.work.gaussians,
             if self.work.frames > 0 { format!(" x {} frames", self.work.frames) } else { String::new() }
         ))
@@ -170,14 +170,14 @@ impl Plan {
     /// Returns the plan as text: the memory of each stage by its named parts, the limits, and the full reads of the
     /// input.
     pub fn text(&self) -> String {
-        let Plan { work, limits, .. } = self;
+        let MemoryPlan { work, limits, .. } = self;
         let mut out = String::new();
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
             "memory: at most {} of {} for {} Gaussians x {} frames, {} views, {} threads",
-            size(self.peak()),
-            size(self.budget),
+            format_bytes(self.peak_bytes()),
+            format_bytes(self.budget),
             work.gaussians,
             work.frames,
             work.pictures,
@@ -186,9 +186,9 @@ impl Plan {
         let _ = writeln!(
             out,
             "  = {} program and threads + {} frames, cameras, index + {} tiles held + the largest stage:",
-            size(PROGRAM_BYTES + PER_THREAD * work.threads),
-            size(work.known_bytes()),
-            size(self.base() - PROGRAM_BYTES - PER_THREAD * work.threads - work.known_bytes())
+            format_bytes(PROGRAM_BYTES + PER_THREAD * work.threads),
+            format_bytes(work.known_bytes()),
+            format_bytes(self.base() - PROGRAM_BYTES - PER_THREAD * work.threads - work.known_bytes())
         );
         for estimate in &self.estimates {
             let parts = |parts: &[MemoryPart], unit: fn(u64) -> String| -> String {
@@ -201,35 +201,35 @@ impl Plan {
                 out,
                 "  {:<8} {:>11} = N x {} ({}) + {}",
                 estimate.stage,
-                size(estimate.bytes(work)),
+                format_bytes(estimate.bytes(work)),
                 work.input.per_gaussian + estimate.bytes_per_gaussian(),
                 parts(&per_gaussian, |bytes| bytes.to_string()),
-                parts(&estimate.fixed, size)
+                parts(&estimate.fixed, format_bytes)
             );
         }
         let _ = writeln!(
             out,
             "  at a time: {} frames held by readers, {} frames ready, {} views, {} pairs measured",
-            limits.frames_held.min(work.input.frame_block as usize),
+            limits.max_kept_frames.min(work.input.frame_block as usize),
             limits.frames_together,
-            limits.pictures_together,
+            limits.views_together,
             limits.pairs_together
         );
         let reads = self.estimates.iter().filter(|estimate| estimate.reads > 0.0);
         let named: Vec<String> = reads.map(|estimate| format!("{:.2} {}", estimate.reads, estimate.stage)).collect();
-        let held = if limits.tiles_held { "all decoded tiles stay in memory; otherwise " } else { "" };
+        let held = if limits.keeps_tiles { "all decoded tiles stay in memory; otherwise " } else { "" };
         let named = named.join(" + ");
-        let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.reads());
+        let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.full_reads());
         out
     }
 
     /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan.
-    pub fn tell_time(&self, tell: Verbosity, events: &Events) {
+    pub fn send_times(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
-            let stages = seconds(&self.work, &self.estimates);
+            let stages = stage_seconds(&self.work, &self.estimates);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
-            let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
-            let text = format!("time: about {} ({})", duration(whole), named.collect::<Vec<_>>().join(" + "));
+            let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", format_duration(*seconds)));
+            let text = format!("time: about {} ({})", format_duration(whole), named.collect::<Vec<_>>().join(" + "));
             events.send(Message::Plan(&text));
         }
     }

@@ -6,7 +6,7 @@ use crate::model::{Attributes, Camera, Rig, SequenceInfo, ViewSchedule};
 use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
-use crate::passes::{BLOCK, VIEWS_PER_THREAD};
+use crate::passes::{GAUSSIANS_PER_BLOCK, VIEWS_PER_THREAD};
 use crate::render;
 
 /// Bytes of memory per tile of an open container: a flag that tells whether the tile's checksum has been verified.
@@ -56,7 +56,7 @@ pub struct Workload {
     /// Number of threads that share the work.
     pub threads: u64,
     /// Measured speed of these threads for the scene.
-    pub pace: Throughput,
+    pub throughput: Throughput,
 }
 
 impl Workload {
@@ -74,19 +74,19 @@ impl Workload {
             pictures: 0,
             rig: 0,
             threads: rayon::current_num_threads() as u64,
-            pace: Throughput::UNKNOWN,
+            throughput: Throughput::UNKNOWN,
         }
     }
 
     /// Creates the workload of an input without Gaussians, frames and cameras.
-    pub fn nothing() -> Workload {
+    pub fn empty() -> Workload {
         let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
         Workload::new(&info, MemoryProfile::for_tiles(0))
     }
 
     /// Adds the views of the cameras of `rig`; `schedule` lists the views at each frame.
-    pub fn seen(self, rig: &Rig, schedule: &ViewSchedule) -> Workload {
-        self.seen_by(rig, schedule.max_views_per_frame() as u64, schedule.pairs() as u64)
+    pub fn with_views(self, rig: &Rig, schedule: &ViewSchedule) -> Workload {
+        self.seen_by(rig, schedule.max_views_per_frame() as u64, schedule.pair_count() as u64)
     }
 
     fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
@@ -121,7 +121,7 @@ impl Workload {
     }
 
     /// Returns the number of Gaussians in the largest of blocks of `block`: fewer if the input has fewer Gaussians.
-    pub fn at_most(&self, block: u64) -> u64 {
+    pub fn largest_block(&self, block: u64) -> u64 {
         block.min(self.gaussians)
     }
 
@@ -132,25 +132,26 @@ impl Workload {
     }
 
     /// Returns the bytes that the attributes `columns` of one Gaussian take at one frame.
-    pub fn state(&self, columns: Attributes) -> u64 {
+    pub fn state_bytes(&self, columns: Attributes) -> u64 {
         state_bytes(self.sh_degree, columns)
     }
 
     /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. If the
-    /// smaller of `frames_held` and the frame block of the input is at most 1, it keeps none; otherwise it keeps two
+    /// smaller of `max_kept_frames` and the frame block of the input is at most 1, it keeps none; otherwise it keeps two
     /// more than this number.
-    pub fn held(&self, limits: &Limits, columns: Attributes) -> u64 {
-        let frames = match (limits.frames_held as u64).min(self.input.frame_block) {
+    pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
+        let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
             some => some + 2,
         };
-        frames * self.state(columns & self.varying)
+        frames * self.state_bytes(columns & self.varying)
     }
 
     /// Returns the memory of the blocks of Gaussians that the readers of all threads are filling, and of decoding these
     /// blocks.
-    pub fn arriving(&self) -> MemoryPart {
-        let block = self.at_most(BLOCK as u64) * (self.state(Attributes::all()) + self.input.reader);
+    pub fn filling_blocks(&self) -> MemoryPart {
+        let block =
+            self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
@@ -158,72 +159,78 @@ impl Workload {
     /// stored, the shuffled and the decoded bytes of the largest tile.
     fn decoding(&self) -> u64 {
         let MemoryProfile { frame_block, gaussian_block, .. } = self.input;
-        let gaussian_block = self.at_most(gaussian_block);
+        let gaussian_block = self.largest_block(gaussian_block);
         let frame_block = self.frames_at_most(frame_block);
         let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
-        let largest = Attributes::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        let largest =
+            Attributes::all().iter().map(|column| self.state_bytes(column) * frames(column)).max().unwrap_or(0);
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
     /// Returns the memory parts of a pass over views: those in bytes per Gaussian, and those of fixed size in bytes.
     /// They cover the attributes `columns` of frames that are ready, frames being read, and views being rendered, each
     /// with `sums` bytes per Gaussian for results.
-    pub fn looking(&self, limits: &Limits, columns: Attributes, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
-        let pictures = self.threads.min(limits.pictures_together as u64);
+    pub fn view_pass_memory(
+        &self,
+        limits: &Limits,
+        columns: Attributes,
+        sums: u64,
+    ) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
+        let pictures = self.threads.min(limits.views_together as u64);
         let ready = VIEWS_PER_THREAD as u64 * self.threads;
         let per_gaussian = vec![
-            ("states", ready.min(limits.frames_together as u64) * self.state(columns)),
+            ("states", ready.min(limits.frames_together as u64) * self.state_bytes(columns)),
             ("readers", self.input.reader),
-            ("held", self.held(limits, columns)),
+            ("held", self.kept_frames_bytes(limits, columns)),
             ("views", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
         ];
         let buffers = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
-        (per_gaussian, vec![self.arriving(), ("views", buffers)])
+        (per_gaussian, vec![self.filling_blocks(), ("views", buffers)])
     }
 
     /// Returns the memory that a list of `pictures` views takes.
-    pub fn listed(pictures: f64) -> MemoryPart {
+    pub fn view_list(pictures: f64) -> MemoryPart {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
     /// Returns the memory of the buffers for writing the result, as a container or as one file per frame.
-    pub fn writing(&self) -> Vec<MemoryPart> {
-        self.writing_together(FRAME_BLOCK)
+    pub fn write_buffers(&self) -> Vec<MemoryPart> {
+        self.tile_write_buffers(FRAME_BLOCK)
     }
 
     /// Returns the memory of the buffers for writing a container whose tiles hold `frames` frames.
-    pub fn writing_together(&self, frames: usize) -> Vec<MemoryPart> {
-        let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
-        let block =
-            self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Attributes::all()) + 3 * varying + self.input.reader);
-        vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
+    pub fn tile_write_buffers(&self, frames: usize) -> Vec<MemoryPart> {
+        let varying = self.frames_at_most(frames as u64) * self.state_bytes(self.varying);
+        let block = self.largest_block(GAUSSIAN_BLOCK as u64)
+            * (2 * self.state_bytes(Attributes::all()) + 3 * varying + self.input.reader);
+        vec![("blocks", 2 * self.threads * block), self.filling_blocks(), ("index", self.written_index())]
     }
 
     /// Returns the memory that the zstd compressors of all threads take at level `level` for tiles of `frames` frames.
-    pub fn compressing(&self, level: i32, frames: usize) -> MemoryPart {
-        let widest = Attributes::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
+    pub fn compressor_memory(&self, level: i32, frames: usize) -> MemoryPart {
+        let widest = Attributes::all().iter().map(|column| self.state_bytes(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
     /// Returns the maximum amount that is read for `frames` evenly spread frames, as a multiple (or fraction) of the whole
     /// input. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only some of its
     /// frames.
-    pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
+    pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
             return frames.min(all) as f64 / all as f64;
         }
         let blocks = self.frames.div_ceil(together);
         let of_block = frames.div_ceil(blocks).min(together);
-        let again = of_block.div_ceil(limits.frames_held.max(1) as u64);
+        let again = of_block.div_ceil(limits.max_kept_frames.max(1) as u64);
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns [`Workload::reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians of
+    /// Returns [`Workload::full_reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians of
     /// two blocks is read for each of the two.
-    pub fn scattered_reads(&self, frames: u64, limits: &Limits) -> f64 {
+    pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
-        shared * self.reads(frames, limits)
+        shared * self.full_reads(frames, limits)
     }
 
     /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians, given
@@ -234,16 +241,16 @@ impl Workload {
         gaussians: f64,
         RenderCost { gaussian, pixel, pace }: RenderCost,
     ) -> f64 {
-        pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+        pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
     /// Returns the time in seconds on one processor core for reading `gaussians` Gaussians at `frames` frames.
-    pub fn reading(&self, gaussians: f64, frames: f64) -> f64 {
-        self.pace.states * gaussians * frames * self.input.seconds_per_state
+    pub fn reading_seconds(&self, gaussians: f64, frames: f64) -> f64 {
+        self.throughput.states * gaussians * frames * self.input.seconds_per_state
     }
 
     /// Returns the number of Gaussians N as a floating-point number, since later stages process a fraction of them.
-    pub fn count(&self) -> f64 {
+    pub fn gaussian_count(&self) -> f64 {
         self.gaussians as f64
     }
 
@@ -272,12 +279,12 @@ impl Workload {
 pub struct Throughput {
     /// Time for reading Gaussians at a frame and processing them, as a multiple of the assumed time.
     pub states: f64,
-    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that [`LOOK`] assumes.
-    pub look: f64,
-    /// Time for finding removal errors in a view, as a multiple of the time that [`REMOVE`] assumes.
-    pub remove: f64,
-    /// Time for rendering and comparing a view, as a multiple of the time that [`RENDER`] assumes.
-    pub render: f64,
+    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that [`CONTRIBUTION_COST`] assumes.
+    pub contribution_time: f64,
+    /// Time for finding removal errors in a view, as a multiple of the time that [`REMOVAL_COST`] assumes.
+    pub removal_time: f64,
+    /// Time for rendering and comparing a view, as a multiple of the time that [`RENDER_COST`] assumes.
+    pub render_time: f64,
     /// Mean number of processor cores that were available to this process during the measurement; `None` if nothing was
     /// measured.
     pub processors: Option<f64>,
@@ -285,7 +292,8 @@ pub struct Throughput {
 
 impl Throughput {
     /// Speed that is assumed without a measurement.
-    pub const UNKNOWN: Throughput = Throughput { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
+    pub const UNKNOWN: Throughput =
+        Throughput { states: 1.0, contribution_time: 1.0, removal_time: 1.0, render_time: 1.0, processors: None };
 }
 
 /// Time that one view takes if it is rendered for a certain purpose: a part per Gaussian plus a part per pixel.
@@ -298,15 +306,16 @@ pub struct RenderCost {
     pace: fn(&Throughput) -> f64,
 }
 
-/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. [`LOOK`],
-/// [`REMOVE`] and [`RENDER`] are fitted to runs on three trained models; `scripts/estimate.py` compares estimated with
+/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. [`CONTRIBUTION_COST`],
+/// [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models; `scripts/estimate.py` compares estimated with
 /// measured times.
-pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
+pub const CONTRIBUTION_COST: RenderCost =
+    RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.contribution_time };
 /// Time for finding the removal error of every Gaussian in a view: the squared error that removing it alone would
 /// cause.
-pub const REMOVE: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
+pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.removal_time };
 /// Time for rendering a view and comparing it with another render.
-pub const RENDER: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
+pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
 
 /// Returns the bytes that zstd's tables for finding matches take at level `level`, for `bytes` bytes of input. They do
 /// not exceed the maximum of the level's group. They are two tables of 4-byte entries, each with at most twice as many

@@ -21,17 +21,17 @@ const MIN_THICKNESS: f64 = 0.1;
 /// Thresholds of tests 1 (place and size) and 2 (color) of one merging pass. The recipe may have several passes with
 /// different thresholds.
 #[derive(Debug, Clone, Copy)]
-pub struct Gates {
+pub struct AppearanceThresholds {
     d0: f64,
     rho: f64,
     max_log_scale_ratio: f64,
     max_color_difference: f64,
 }
 
-impl Gates {
+impl AppearanceThresholds {
     /// Creates the tests from the thresholds of the pass `pass` and from those of `merge`, which all passes share.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
-        Gates {
+        AppearanceThresholds {
             d0: pass.d0,
             rho: pass.rho,
             max_log_scale_ratio: merge.max_scale_ratio.ln(),
@@ -139,9 +139,9 @@ mod tests {
     use super::*;
     use crate::recipe::Recipe;
 
-    fn default_gates() -> Gates {
+    fn default_gates() -> AppearanceThresholds {
         let merge = Recipe::preset("default").unwrap().merge;
-        Gates::new(&merge, &merge.passes[0])
+        AppearanceThresholds::new(&merge, &merge.passes[0])
     }
 
     fn pair_from(edit: impl Fn(&mut Gaussians)) -> [Appearance; 2] {

@@ -11,7 +11,7 @@ pub struct MergeGroups {
 
 impl MergeGroups {
     /// Creates one group for each of the increasing `rows`: no Gaussian is merged.
-    pub fn alone(rows: &[u32]) -> Self {
+    pub fn singletons(rows: &[u32]) -> Self {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
@@ -80,12 +80,12 @@ mod tests {
     #[test]
     fn joining_twice_flattens_to_original_rows() {
         // Rows 2 and 4 join row 5. Then the group of row 5 joins that of row 1.
-        let once = MergeGroups::alone(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
+        let once = MergeGroups::singletons(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
         assert_eq!(once.leaders(), [1, 3, 5]);
         assert_eq!((once.members(0), once.members(1), once.members(2)), (&[1][..], &[3][..], &[2, 4, 5][..]));
         let twice = once.joined(&[0, 1, 0]);
         assert_eq!((twice.leaders(), twice.len()), (&[1, 3][..], 2));
         assert_eq!((twice.members(0), twice.members(1)), (&[1, 2, 4, 5][..], &[3][..]));
-        assert!(MergeGroups::alone(&[]).joined(&[]).is_empty());
+        assert!(MergeGroups::singletons(&[]).joined(&[]).is_empty());
     }
 }

@@ -1,20 +1,20 @@
 //! Cache of the motion similarities of pairs of Gaussians. A pair is measured only once, although several merging
 //! passes and trial sizes may request it.
 //!
-//! Memory: [`KNOWN_BYTES`] per pair.
+//! Memory: [`BYTES_PER_CACHED_PAIR`] per pair.
 
 /// Bytes of memory for one pair of Gaussians whose similarity is known.
-pub const KNOWN_BYTES: usize = size_of::<PairSimilarity>();
+pub const BYTES_PER_CACHED_PAIR: usize = size_of::<PairSimilarity>();
 
 /// Pair of Gaussians, as two row indices with the smaller first, and its motion similarity
-/// ([`super::motion::MotionGate::likeness`]).
+/// ([`super::motion::MotionThresholds::similarity`]).
 pub type PairSimilarity = (u32, u32, f64);
 
 /// Motion similarities of pairs of Gaussians, sorted by the row indices of the pair.
 #[derive(Debug, Default)]
-pub struct KnownPairs(Vec<PairSimilarity>);
+pub struct SimilarityCache(Vec<PairSimilarity>);
 
-impl KnownPairs {
+impl SimilarityCache {
     /// Returns those of `pairs` whose similarity is not known yet, without duplicates. Each has its smaller row first;
     /// the pairs are sorted.
     pub fn missing(&self, pairs: impl ExactSizeIterator<Item = (u32, u32)>) -> Vec<(u32, u32)> {
@@ -28,12 +28,12 @@ impl KnownPairs {
     /// Creates the cache from the measured pairs `found`: in any order, but without duplicates.
     pub fn new(mut found: Vec<PairSimilarity>) -> Self {
         found.sort_unstable_by_key(|&(a, b, _)| (a, b));
-        KnownPairs(found)
+        SimilarityCache(found)
     }
 
     /// Adds the measured pairs `found`, which must not be in the cache yet. Adds nothing if the cache would then hold
     /// more than `max_pairs` pairs.
-    pub fn add(&mut self, mut found: KnownPairs, max_pairs: usize) {
+    pub fn add(&mut self, mut found: SimilarityCache, max_pairs: usize) {
         if self.0.is_empty() {
             *self = found;
         } else if self.0.len() + found.0.len() <= max_pairs {
@@ -44,7 +44,7 @@ impl KnownPairs {
     }
 
     /// Returns the motion similarity of the pair (`a`, `b`), in either order; `None` if it is not known.
-    pub fn likeness(&self, (a, b): (u32, u32)) -> Option<f64> {
+    pub fn similarity(&self, (a, b): (u32, u32)) -> Option<f64> {
         self.position((a.min(b), a.max(b))).ok().map(|position| self.0[position].2)
     }
 
@@ -59,24 +59,24 @@ mod tests {
 
     #[test]
     fn a_pair_is_missing_once_and_known_in_either_order() {
-        let mut known = KnownPairs::default();
+        let mut known = SimilarityCache::default();
         let requested = [(7, 2), (2, 7), (1, 2), (7, 2)];
         assert_eq!(known.missing(requested.into_iter()), [(1, 2), (2, 7)]);
-        known.add(KnownPairs::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
+        known.add(SimilarityCache::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
         assert_eq!(known.missing([(7, 2), (9, 1)].into_iter()), [(1, 9)]);
-        known.add(KnownPairs::new(vec![(1, 9, -1.0)]), 3);
-        assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.likeness(pair)), [0.5, 0.5, -1.0].map(Some));
-        assert!(known.likeness((2, 1)).unwrap().is_nan() && known.likeness((4, 5)).is_none());
+        known.add(SimilarityCache::new(vec![(1, 9, -1.0)]), 3);
+        assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.similarity(pair)), [0.5, 0.5, -1.0].map(Some));
+        assert!(known.similarity((2, 1)).unwrap().is_nan() && known.similarity((4, 5)).is_none());
         assert!(known.missing(requested.into_iter()).is_empty());
-        known.add(KnownPairs::new(vec![(4, 5, 1.0)]), 3);
-        assert!(known.likeness((4, 5)).is_none(), "a fourth pair is known");
+        known.add(SimilarityCache::new(vec![(4, 5, 1.0)]), 3);
+        assert!(known.similarity((4, 5)).is_none(), "a fourth pair is known");
     }
 
     #[test]
     fn known_pairs_stay_within_the_stated_memory() {
-        let mut known = KnownPairs::default();
-        known.add(KnownPairs::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
-        known.add(KnownPairs::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);
-        assert!(known.0.capacity() * KNOWN_BYTES <= 1777 * 16, "{}", known.0.capacity());
+        let mut known = SimilarityCache::default();
+        known.add(SimilarityCache::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
+        known.add(SimilarityCache::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);
+        assert!(known.0.capacity() * BYTES_PER_CACHED_PAIR <= 1777 * 16, "{}", known.0.capacity());
     }
 }

@@ -4,7 +4,7 @@
 //! The state of a proxy at a frame has the weighted mean and covariance of its members (the Gaussians of its cluster)
 //! at that frame. The weights are those of the reference frame for all frames, so the trajectory is Σ w_i x_i(t). No
 //! proxy is stored; only the members being read are in memory. The members of a proxy may be anywhere in the source.
-//! Many Gaussians are best read by [`MergedSequence::together`], because a block of the source that is decoded for one
+//! Many Gaussians are best read by [`MergedSequence::open_together`], because a block of the source that is decoded for one
 //! of them then serves all.
 
 use std::ops::Range;
@@ -15,7 +15,7 @@ use crate::error::Result;
 use crate::merging::proxy::{ProxyState, merge_state};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::passes::FrameReaders;
-use crate::recipe::{MergeParams, Placement};
+use crate::recipe::{MergeParams, ProxyPosition};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Attributes of a proxy that cannot be computed separately: moments mix position, rotation and scale, and opacity
@@ -62,7 +62,7 @@ impl<'a> MergedSequence<'a> {
             info,
             survivors,
             members,
-            merge: MergeParams { placement: Placement::Mean, ..merge.clone() },
+            merge: MergeParams { placement: ProxyPosition::Mean, ..merge.clone() },
         }
     }
 }
@@ -72,14 +72,14 @@ impl MergedSequence<'_> {
     /// proxies together, on all threads.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
-    pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
+    pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
         let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), wanted)?;
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
     /// Returns how many Gaussians of the source Gaussian `place` of this sequence replaces; 1 if it is not a proxy.
-    pub fn members(&self, place: usize) -> usize {
+    pub fn member_count(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
 }
@@ -96,7 +96,7 @@ impl FrameSource for MergedSequence<'_> {
     }
 
     fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(self.together(0..self.survivors.len(), wanted))
+        Some(self.open_together(0..self.survivors.len(), wanted))
     }
 
     fn reads(&self) -> Reads {

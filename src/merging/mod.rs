@@ -35,9 +35,9 @@ use serde::{Deserialize, Serialize};
 use crate::model::hash_id;
 use crate::model::{Attributes, Gaussians};
 use crate::recipe;
-use gates::{Appearance, Gates};
+use gates::{Appearance, AppearanceThresholds};
 pub use groups::MergeGroups;
-use known::KNOWN_BYTES;
+use known::BYTES_PER_CACHED_PAIR;
 use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
 use tree::TreePoint;
@@ -49,8 +49,8 @@ pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
 /// its copy in the list to be measured, the known similarities of this pair and of one pair of earlier passes
-/// ([`known::KnownPairs`]), and its motion similarity.
-pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES + size_of::<f64>();
+/// ([`known::SimilarityCache`]), and its motion similarity.
+pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
 /// list.
@@ -84,7 +84,7 @@ pub struct RequestedPairs<'a> {
     pairs: &'a [(u32, u32)],
     row: &'a [u32],
     /// Maximum distance ε of the two nodes of a pair at the reference frame, in scene units.
-    pub reach: f64,
+    pub max_distance: f64,
     /// Whether further pairs of the same pass are requested in other calls.
     pub is_part: bool,
 }
@@ -98,7 +98,7 @@ impl<'a> RequestedPairs<'a> {
 
 /// Result of merging: groups of Gaussians, and a proxy for each group that has more than one.
 #[derive(Debug, Clone)]
-pub struct Merged {
+pub struct MergeResult {
     /// Groups of the survivors (Gaussians left by pruning). Every survivor is in exactly one group.
     pub groups: MergeGroups,
     /// Proxies: one merged Gaussian for each group of more than one, in the order of the groups, as it is at the
@@ -149,10 +149,10 @@ pub fn run<E>(
     limit: Option<usize>,
     most_pairs: usize,
     mut measure: impl FnMut(RequestedPairs<'_>) -> Result<Vec<f64>, E>,
-) -> Result<Merged, E> {
+) -> Result<MergeResult, E> {
     let importance = &survivors.importance;
     let unit = recipe.length_unit.in_scene_units(survivors.extent);
-    let mut groups = MergeGroups::alone(survivors.rows);
+    let mut groups = MergeGroups::singletons(survivors.rows);
     let mut proxies = survivors.states.pick(&[]);
     let (mut passes, mut remaining_joins) = (Vec::new(), limit);
     for pass in &recipe.passes {
@@ -166,7 +166,7 @@ pub fn run<E>(
             let mut pairs = Vec::new();
             let take = |some: &[(u32, u32)], is_part| {
                 let request =
-                    RequestedPairs { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
+                    RequestedPairs { pairs: some, row: groups.leaders(), max_distance: pass.epsilon * unit, is_part };
                 let likeness = measure(request)?;
                 debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
                 let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
@@ -175,7 +175,7 @@ pub fn run<E>(
                 Ok::<_, E>(())
             };
             if coincident {
-                each_coincident(&nodes, &rank, &Gates::new(recipe, pass), most_pairs, take)?;
+                each_coincident(&nodes, &rank, &AppearanceThresholds::new(recipe, pass), most_pairs, take)?;
                 if pairs.is_empty() {
                     continue;
                 }
@@ -196,7 +196,7 @@ pub fn run<E>(
         }
         passes.push(counts);
     }
-    Ok(Merged { groups, proxies, passes })
+    Ok(MergeResult { groups, proxies, passes })
 }
 
 /// Returns the rank of every group: by the descending sum of the contributions C of its Gaussians, ties by the hash of
@@ -281,7 +281,7 @@ impl<'a> MergeNodes<'a> {
 fn each_coincident<E>(
     nodes: &MergeNodes<'_>,
     rank: &[u32],
-    gates: &Gates,
+    gates: &AppearanceThresholds,
     max_batch: usize,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<(), E> {
@@ -327,7 +327,7 @@ fn each_candidate<E>(
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
     let points = usable.map(|node| TreePoint { at: nodes.position(node), index: node as u32 }).collect();
     let index = PointIndex::new(points, pass.epsilon * unit);
-    let gates = Gates::new(recipe, pass);
+    let gates = AppearanceThresholds::new(recipe, pass);
     let find_pairs = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
         for &TreePoint { at, index: i } in leaders {

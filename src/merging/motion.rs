@@ -2,7 +2,7 @@
 //! frame.
 //!
 //! Input: pairs of nodes (Gaussians or merged groups), then at each frame the position of every node and whether it is
-//! alive. Output: one [`PairMeasure`] per pair, which depends on no threshold. A [`MotionGate`] turns it into the
+//! alive. Output: one [`PairMeasure`] per pair, which depends on no threshold. A [`MotionThresholds`] turns it into the
 //! similarity that merging passes compare with their minimum τ_m. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`]
 //! per node, whatever the number of frames. Each pair is summed by one thread in frame order, so the thread count does
 //! not change the sums.
@@ -11,7 +11,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::gates::COSINE_EPSILON;
-use crate::recipe::{self, MotionParams, Trajectory};
+use crate::recipe::{self, MotionParams, MotionSimilarity};
 
 /// Bytes of memory for one pair during the measurement.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
@@ -55,7 +55,7 @@ impl PairMeasure {
 
     /// Returns in which fraction of the frames with at least one Gaussian alive only one is alive; 1 if neither is ever
     /// alive.
-    pub fn dead_time(&self) -> f64 {
+    pub fn one_alive_fraction(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
 }
@@ -63,19 +63,19 @@ impl PairMeasure {
 /// Thresholds of test 3 (motion) that all merging passes share. Lengths are in scene units. The minimum similarity τ_m
 /// differs between passes and is not stored here.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MotionGate {
-    trajectory: Trajectory,
+pub struct MotionThresholds {
+    trajectory: MotionSimilarity,
     noise: f64,
     max_drift: f64,
     max_dead_time: f64,
 }
 
-impl MotionGate {
+impl MotionThresholds {
     /// Creates the test from the thresholds of `merge`. `unit`: length of one unit of the recipe, in scene units.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
-        MotionGate {
+        MotionThresholds {
             trajectory: merge.trajectory,
             noise: merge.motion_noise * unit,
             max_drift,
@@ -86,12 +86,13 @@ impl MotionGate {
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
     /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two are never alive together, if the
     /// fraction of frames with only one alive is too large, or if the two drift too far apart.
-    pub fn likeness(&self, pair: &PairMeasure) -> f64 {
-        let together = pair.common > 0 && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time;
+    pub fn similarity(&self, pair: &PairMeasure) -> f64 {
+        let together =
+            pair.common > 0 && pair.drift <= self.max_drift && pair.one_alive_fraction() <= self.max_dead_time;
         match self.trajectory {
             _ if !together => f64::NAN,
-            Trajectory::Cosine => pair.cosine,
-            Trajectory::Alignment => pair.alignment(self.noise),
+            MotionSimilarity::Cosine => pair.cosine,
+            MotionSimilarity::Alignment => pair.alignment(self.noise),
         }
     }
 }
@@ -158,7 +159,7 @@ impl PairMotion {
     }
 
     /// Adds the next frame. `state` returns for the index of a node its position and whether it is alive.
-    pub fn frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
+    pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);
             (track.now, track.alive) = state(i);
@@ -247,7 +248,7 @@ mod tests {
         let reference = (0..2).map(|node| state(0, node).0);
         let mut pairs = PairMotion::new([(0, 1)].into_iter(), reference, motion);
         for t in 0..a.len() {
-            pairs.frame(|node| state(t, node));
+            pairs.add_frame(|node| state(t, node));
         }
         pairs.finish().next().unwrap()
     }
@@ -260,12 +261,12 @@ mod tests {
     /// `extent`.
     fn merges(a: &Path, b: &Path, extent: f64) -> bool {
         let merge = Recipe::preset("default").unwrap().merge;
-        MotionGate::new(&merge, extent).likeness(&measure(a, b, MotionParams::Runs)) > merge.passes[0].tau_m
+        MotionThresholds::new(&merge, extent).similarity(&measure(a, b, MotionParams::Runs)) > merge.passes[0].tau_m
     }
 
     fn merges_in_paper(a: &Path, b: &Path) -> bool {
         let merge = Recipe::preset("paper").unwrap().merge;
-        MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Literal)) > merge.passes[0].tau_m
+        MotionThresholds::new(&merge, 1.0).similarity(&measure(a, b, MotionParams::Literal)) > merge.passes[0].tau_m
     }
 
     #[test]
@@ -325,7 +326,7 @@ mod tests {
         merge.max_drift = f64::INFINITY;
         // The pair passes at no threshold, not even at one that every alignment exceeds.
         let exceeds = |a: &Path, b: &Path, tau: f64| {
-            MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Runs)) > tau
+            MotionThresholds::new(&merge, 1.0).similarity(&measure(a, b, MotionParams::Runs)) > tau
         };
         assert!(!exceeds(&first, &last, f64::NEG_INFINITY));
         let never: Path = vec![(0.0, false); 20];
@@ -338,7 +339,7 @@ mod tests {
         let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
         let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
         let pair = measure(&long, &short, MotionParams::Runs);
-        assert_eq!((pair.common, pair.union, pair.steps, pair.dead_time()), (12, 16, 11, 0.25));
+        assert_eq!((pair.common, pair.union, pair.steps, pair.one_alive_fraction()), (12, 16, 11, 0.25));
         assert!(!merges(&long, &short, 1.0), "a quarter dead is more than a tenth");
     }
 

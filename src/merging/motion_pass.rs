@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use super::trajectories::{NEEDED, Trajectories};
 use crate::error::Result;
 use crate::merging::known::PairSimilarity;
-use crate::merging::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
+use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merging::voxels::voxel_order;
 use crate::model::{AttributeValues, opacity};
 use crate::outputs::container::FRAME_BLOCK;
@@ -42,10 +42,10 @@ pub struct PairMeter<'a> {
     /// the steps between frames that count as motion.
     pub scan: &'a recipe::ScanParams,
     /// Thresholds of test 3 (motion).
-    pub gate: MotionGate,
+    pub gate: MotionThresholds,
     /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
     /// time.
-    pub frames_held: usize,
+    pub max_kept_frames: usize,
     /// Folder in which the scratch file for trajectories is created.
     pub scratch: PathBuf,
     /// Receiver of progress events.
@@ -65,7 +65,7 @@ pub struct GatheredTrajectories {
 
 impl PairMeter<'_> {
     /// Returns a copy of this meter with the same settings but without gathered trajectories.
-    pub fn fresh(&self) -> Self {
+    pub fn without_trajectories(&self) -> Self {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
@@ -98,7 +98,7 @@ impl PairMeter<'_> {
             let places = rows.iter().map(|&row| reference.row(row as usize));
             let mut motion = PairMotion::new(local_indices(&pairs, &rows), places, self.scan.motion);
             self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
-            let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
+            let measured = motion.finish().map(|pair| self.gate.similarity(&pair));
             return Ok(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)).collect());
         };
         for (a, b) in &mut pairs {
@@ -110,12 +110,12 @@ impl PairMeter<'_> {
         let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
         let mut motion = PairMotion::new(local_indices(&pairs, &places), at, self.scan.motion);
         trajectories.play(&places, |moments| {
-            motion.frame(|node| {
+            motion.add_frame(|node| {
                 let [x, y, z, logit] = moments[node];
                 ([x, y, z], opacity(logit) >= self.scan.alpha_min)
             });
         })?;
-        let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
+        let measured = motion.finish().map(|pair| self.gate.similarity(&pair));
         let by_row = |(&(i, j), likeness): (&(u32, u32), f64)| {
             let (a, b) = (order[i as usize], order[j as usize]);
             (a.min(b), a.max(b), likeness)
@@ -129,7 +129,7 @@ impl PairMeter<'_> {
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
         let ordered_ids: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
         let trajectories =
-            Trajectories::gather(self.source, &ordered_ids, self.frames_held, &self.scratch, &self.events)?;
+            Trajectories::gather(self.source, &ordered_ids, self.max_kept_frames, &self.scratch, &self.events)?;
         let mut place = rows;
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
@@ -144,13 +144,13 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = self.events.task("merge", "states", (ids.len() * frames) as u64);
-        let wanted = ReadPlan::new(0..frames).holding(self.frames_held);
+        let wanted = ReadPlan::new(0..frames).keeping_at_most(self.max_kept_frames);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
-        let mut state = readers.state();
+        let mut state = readers.state_buffer();
         for frame in 0..frames {
             readers.read(frame, if frame == 0 { NEEDED } else { varying }, &mut state)?;
             progress.advance(ids.len() as u64);
-            motion.frame(|node| {
+            motion.add_frame(|node| {
                 (state.position.row(node), opacity(state.opacity_logit.plane(0)[node]) >= self.scan.alpha_min)
             });
         }
@@ -177,7 +177,7 @@ fn local_indices<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactS
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::error::Error;
     use crate::model::{Attributes, Gaussians, SequenceInfo};
     use crate::passes::gather;
@@ -189,7 +189,7 @@ mod tests {
 
     /// Test case: every third Gaussian of a demo scene, and all pairs of these that are at most `reach` apart.
     struct Case {
-        scene: Scene,
+        scene: DemoScene,
         recipe: Recipe,
         ids: Vec<u32>,
         reference: AttributeValues,
@@ -198,7 +198,7 @@ mod tests {
 
     impl Case {
         fn new(reach: f64) -> Case {
-            let scene = Scene::new(1500, 9);
+            let scene = DemoScene::new(1500, 9);
             let ids: Vec<u32> = (0..1500).step_by(3).collect();
             let reference = gather(&scene, &ids, REFERENCE, Attributes::POSITION).unwrap().position;
             let at = |i: u32| glam::DVec3::from(reference.row::<3>(i as usize).map(f64::from));
@@ -213,8 +213,8 @@ mod tests {
             let mut meter = PairMeter {
                 source,
                 scan: &self.recipe.scan,
-                gate: MotionGate::new(&self.recipe.merge, 4.0),
-                frames_held: 4,
+                gate: MotionThresholds::new(&self.recipe.merge, 4.0),
+                max_kept_frames: 4,
                 scratch: folder.path().to_owned(),
                 events: Events::IGNORED,
                 gathered: None,
@@ -239,15 +239,15 @@ mod tests {
         /// without dividing the pairs into partitions. Returns for each pair the indices of its Gaussians in `ids` and
         /// the bits of the similarity (`f64::to_bits`), so that NaN equals NaN.
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
-            let gate = MotionGate::new(&self.recipe.merge, 4.0);
+            let gate = MotionThresholds::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
             let mut motion = PairMotion::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
             for frame in 0..self.scene.info().times.len() {
                 let state = gather(&self.scene, &self.ids, frame, NEEDED).unwrap();
                 let alive = |i| opacity(state.opacity_logit.plane(0)[i]) >= self.recipe.scan.alpha_min;
-                motion.frame(|i| (state.position.row(i), alive(i)));
+                motion.add_frame(|i| (state.position.row(i), alive(i)));
             }
-            let likeness = motion.finish().map(|pair| gate.likeness(&pair).to_bits());
+            let likeness = motion.finish().map(|pair| gate.similarity(&pair).to_bits());
             self.pairs.iter().zip(likeness).map(|(&(a, b), likeness)| (a, b, likeness)).collect()
         }
     }
@@ -293,7 +293,7 @@ mod tests {
 
     /// Scene whose frames from number `from` on cannot be read.
     struct Failing<'a> {
-        scene: &'a Scene,
+        scene: &'a DemoScene,
         from: usize,
     }
 

@@ -19,8 +19,8 @@ use std::ops::Range;
 use hashbrown::HashTable;
 use rayon::prelude::*;
 
-use super::tree::{Nearest, Tree, TreePoint};
-use super::voxels::{Voxels, along, voxel_of};
+use super::tree::{NearestPoints, Tree, TreePoint};
+use super::voxels::{VoxelGrid, morton_bits, voxel_of};
 use crate::model::hash_id;
 
 /// Maximum number of points in a voxel without a tree. Trees in voxels of 8 to 64 points would cost up to a third more
@@ -35,7 +35,7 @@ const ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 #[derive(Debug)]
 pub struct PointIndex {
     epsilon: f64,
-    voxels: Voxels,
+    voxels: VoxelGrid,
     /// Points sorted by voxel.
     points: Vec<TreePoint>,
     /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in the order of the voxels.
@@ -67,12 +67,12 @@ impl PointIndex {
         points.retain(|point| point.at.iter().all(|x| x.is_finite()));
         // Sides are slightly longer than ε, so that rounding never puts a point at the exact distance ε two voxels
         // away.
-        let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
+        let voxels = VoxelGrid::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
         let rows: Vec<u32> = (0..points.len() as u32).collect();
-        let order = voxels.order(&rows, |row| points[row as usize].at);
+        let order = voxels.sort_rows(&rows, |row| points[row as usize].at);
         drop(rows);
         points = order.into_iter().map(|row| points[row as usize]).collect();
-        let number = |point: &TreePoint| voxels.number(point.at);
+        let number = |point: &TreePoint| voxels.morton_code(point.at);
         let in_same_voxel = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
         let trees: Vec<Tree> =
             points.par_chunk_by_mut(in_same_voxel).filter(|all| all.len() > MAX_WITHOUT_TREE).map(Tree::new).collect();
@@ -95,11 +95,11 @@ impl PointIndex {
 
     /// Creates a reusable query object; each thread needs its own.
     pub fn search(&self) -> NeighborSearch<'_> {
-        NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: Nearest::default() }
+        NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: NearestPoints::default() }
     }
 
     fn find_voxel(&self, number: u64) -> Option<Occupied> {
-        let has_number = |voxel: &Occupied| self.voxels.number(self.points[voxel.start as usize].at) == number;
+        let has_number = |voxel: &Occupied| self.voxels.morton_code(self.points[voxel.start as usize].at) == number;
         self.table.find(hash(number), has_number).copied()
     }
 }
@@ -120,7 +120,7 @@ pub struct NeighborSearch<'a> {
     /// Voxels with points among the last queried voxel and the 26 around it, each with its step along the three axes,
     /// encoded as in [`STEPS`].
     around: Vec<([u8; 3], Occupied)>,
-    nearest: Nearest,
+    nearest: NearestPoints,
 }
 
 impl NeighborSearch<'_> {
@@ -132,9 +132,9 @@ impl NeighborSearch<'_> {
     pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
         let index = self.index;
         // One neighbor more than `k` is sought, to know whether there are more.
-        self.nearest.start(query, at, k + 1, index.epsilon);
+        self.nearest.start_query(query, at, k + 1, index.epsilon);
         if at.iter().all(|x| x.is_finite()) {
-            let position = index.voxels.place(at);
+            let position = index.voxels.grid_coordinates(at);
             let voxel = voxel_of(position);
             if self.last_voxel != Some(voxel) {
                 self.look_up(voxel);
@@ -147,11 +147,11 @@ impl NeighborSearch<'_> {
                 [0.0, gap(inside), gap(1.0 - inside)]
             });
             for &(step, occupied) in &self.around {
-                if self.nearest.reaches((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
+                if self.nearest.could_improve_at((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
                     let points = &index.points[occupied.points()];
                     match index.trees.get(occupied.tree as usize) {
                         Some(tree) => tree.search(points, &mut self.nearest),
-                        None => self.nearest.scan(points),
+                        None => self.nearest.add_points(points),
                     }
                 }
             }
@@ -164,8 +164,9 @@ impl NeighborSearch<'_> {
     fn look_up(&mut self, voxel: [u32; 3]) {
         self.last_voxel = Some(voxel);
         // One below 0 wraps to a number beyond the last voxel, for which there is no voxel.
-        let numbers: [[Option<u64>; 3]; 3] =
-            std::array::from_fn(|c| [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| along(c, number)));
+        let numbers: [[Option<u64>; 3]; 3] = std::array::from_fn(|c| {
+            [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| morton_bits(c, number))
+        });
         let index = self.index;
         self.around.clear();
         self.around.extend(STEPS.iter().filter_map(|&step| {

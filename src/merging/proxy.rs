@@ -12,7 +12,7 @@ use super::MergeGroups;
 use super::gates::unit_rotation;
 use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Attributes, Gaussians};
-use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
+use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};
 
 /// Number of proxies that are computed before their values are written to the output.
 const BATCH: usize = 4096;
@@ -100,7 +100,7 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 /// Computes the proxy that replaces the cluster `members`: rows of `states` and their weights, which sum to 1. The row
 /// `leader` is one of them.
 ///
-/// Mean and covariance are those of the weighted mixture. With [`Placement::Leader`] the proxy has the leader's
+/// Mean and covariance are those of the weighted mixture. With [`ProxyPosition::Leader`] the proxy has the leader's
 /// position, and the second moments are taken about it. The base color is the weighted mean; coefficients of higher SH
 /// degrees are the weighted mean or those of the member with the largest weight (the first on a tie). Opacity follows
 /// [`ProxyOpacity`], with the area of an ellipsoid projected in all directions and averaged. Exact duplicates give the
@@ -131,8 +131,8 @@ pub fn merge_state(
     };
     let parts: Vec<WeightedGaussian> = members.iter().map(part).collect();
     let about = match merge.placement {
-        Placement::Mean => None,
-        Placement::Leader => Some(DVec3::ZERO),
+        ProxyPosition::Mean => None,
+        ProxyPosition::Leader => Some(DVec3::ZERO),
     };
     let local = align_axes(&moments(&parts, about), DQuat::IDENTITY);
     ProxyState {
@@ -231,7 +231,7 @@ fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid,
     opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
 }
 
-fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHigh) -> Vec<f64> {
+fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ProxyHigherSh) -> Vec<f64> {
     let heaviest = members
         .iter()
         .fold((leader, f64::NEG_INFINITY), |best, &(i, weight)| if weight > best.1 { (i, weight) } else { best })
@@ -242,7 +242,7 @@ fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHi
         base + members.iter().map(|&(i, weight)| weight * (f64::from(plane[i as usize]) - base)).sum::<f64>()
     };
     let coefficient = |(k, plane): (usize, &[f32])| match high {
-        ShHigh::Heaviest if k >= 3 => f64::from(plane[heaviest as usize]),
+        ProxyHigherSh::Heaviest if k >= 3 => f64::from(plane[heaviest as usize]),
         _ => average(plane),
     };
     (0..states.sh.width()).map(|k| (k, states.sh.plane(k))).map(coefficient).collect()
@@ -255,7 +255,7 @@ mod tests {
     use super::*;
     use crate::recipe::{MergeParams, Recipe};
 
-    fn recipe(placement: Placement, opacity: ProxyOpacity) -> MergeParams {
+    fn recipe(placement: ProxyPosition, opacity: ProxyOpacity) -> MergeParams {
         MergeParams { placement, opacity, ..Recipe::preset("default").unwrap().merge }
     }
 
@@ -281,7 +281,7 @@ mod tests {
         for (rule, expected) in
             [(ProxyOpacity::Sum, 0.6), (ProxyOpacity::Union, 1.0 - 0.8f64.powi(3)), (ProxyOpacity::Area, 0.6)]
         {
-            for placement in [Placement::Mean, Placement::Leader] {
+            for placement in [ProxyPosition::Mean, ProxyPosition::Leader] {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
@@ -306,8 +306,9 @@ mod tests {
             for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
-                let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, rule), Attributes::all())
-                    .opacity_logit;
+                let got =
+                    merge_state(&equal_weights(2), &states, 0, &recipe(ProxyPosition::Mean, rule), Attributes::all())
+                        .opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
         }
@@ -324,7 +325,7 @@ mod tests {
                 &equal_weights(2),
                 &states,
                 0,
-                &recipe(Placement::Mean, ProxyOpacity::Area),
+                &recipe(ProxyPosition::Mean, ProxyOpacity::Area),
                 Attributes::all(),
             );
             for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
@@ -336,8 +337,13 @@ mod tests {
     #[test]
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
-        let got =
-            merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Attributes::all());
+        let got = merge_state(
+            &equal_weights(2),
+            &states,
+            0,
+            &recipe(ProxyPosition::Mean, ProxyOpacity::Sum),
+            Attributes::all(),
+        );
         assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
     }
 
@@ -350,7 +356,7 @@ mod tests {
             &[(0, 0.3), (1, 0.7)],
             &states,
             0,
-            &recipe(Placement::Leader, ProxyOpacity::Area),
+            &recipe(ProxyPosition::Leader, ProxyOpacity::Area),
             Attributes::all(),
         );
         assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(0));
@@ -362,7 +368,7 @@ mod tests {
             &[(0, 0.3), (1, 0.7)],
             &states,
             0,
-            &recipe(Placement::Mean, ProxyOpacity::Area),
+            &recipe(ProxyPosition::Mean, ProxyOpacity::Area),
             Attributes::all(),
         );
         assert!((mean.position.x - (1000.25 * 0.3 + f64::from(1000.3f32) * 0.7)).abs() < 1e-9);
@@ -375,9 +381,9 @@ mod tests {
         states.sh.set_row(0, [1.0f32; 12]);
         states.sh.set_row(1, [0.0f32; 12]);
         let members = [(0, 0.25), (1, 0.75)];
-        let average = merged_sh(&members, &states, 0, ShHigh::Average);
+        let average = merged_sh(&members, &states, 0, ProxyHigherSh::Average);
         assert_eq!(average, vec![0.25; 12]);
-        let heaviest = merged_sh(&members, &states, 0, ShHigh::Heaviest);
+        let heaviest = merged_sh(&members, &states, 0, ProxyHigherSh::Heaviest);
         assert_eq!((&heaviest[..3], &heaviest[3..]), (&[0.25; 3][..], &[0.0; 9][..]));
     }
 
@@ -417,7 +423,7 @@ mod tests {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
             states.position.set_row(1, [1000.25 + offset[0], -7.125 + offset[1], 0.1 + offset[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Attributes::all());
+            let got = merge_state(&equal_weights(2), &states, 0, &recipe(ProxyPosition::Mean, ProxyOpacity::Area), Attributes::all());
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use glam::{DQuat, DVec3};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
-use super::motion::{MotionGate, PairMotion};
+use super::motion::{MotionThresholds, PairMotion};
 use super::*;
 use crate::model::AttributeValues;
 use crate::recipe::{MergeParams, MotionParams, Recipe};
@@ -56,13 +56,13 @@ impl MergeScene {
         merge
     }
 
-    fn merge(&self, recipe: &MergeParams, limit: Option<usize>) -> Merged {
+    fn merge(&self, recipe: &MergeParams, limit: Option<usize>) -> MergeResult {
         self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
     /// Merges all Gaussians of this scene. `frames`: positions at each frame, the first of which is the reference
     /// frame. All Gaussians are alive at all frames.
-    fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[AttributeValues]) -> Merged {
+    fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[AttributeValues]) -> MergeResult {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
@@ -74,7 +74,7 @@ impl MergeScene {
         recipe: &MergeParams,
         limit: Option<usize>,
         frames: &[AttributeValues],
-    ) -> Merged {
+    ) -> MergeResult {
         self.merge_in_batches(rows, recipe, limit, frames, usize::MAX).0
     }
 
@@ -87,17 +87,17 @@ impl MergeScene {
         limit: Option<usize>,
         frames: &[AttributeValues],
         max_pairs: usize,
-    ) -> (Merged, Vec<usize>) {
+    ) -> (MergeResult, Vec<usize>) {
         let MergeScene { states, classes, extent, .. } = self;
         let survivors = Survivors { states, rows, importance: self.importance(), classes, extent: *extent };
-        let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
+        let gate = MotionThresholds::new(recipe, recipe.length_unit.in_scene_units(*extent));
         let mut batches = Vec::new();
         let measure = |request: RequestedPairs<'_>| {
             batches.push(request.pairs().len());
             let reference = (0..states.len()).map(|i| frames[0].row(i));
             let mut motion = PairMotion::new(request.pairs(), reference, MotionParams::Runs);
-            frames.iter().for_each(|frame| motion.frame(|i| (frame.row(i), true)));
-            Ok::<_, Infallible>(motion.finish().map(|pair| gate.likeness(&pair)).collect())
+            frames.iter().for_each(|frame| motion.add_frame(|i| (frame.row(i), true)));
+            Ok::<_, Infallible>(motion.finish().map(|pair| gate.similarity(&pair)).collect())
         };
         match run(&survivors, recipe, limit, max_pairs, measure) {
             Ok(merged) => (merged, batches),
@@ -124,7 +124,7 @@ impl MergeScene {
     }
 }
 
-fn joins(merged: &Merged) -> usize {
+fn joins(merged: &MergeResult) -> usize {
     merged.passes.iter().map(|pass| pass.joins).sum()
 }
 

@@ -22,7 +22,7 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::outputs::container::FRAME_BLOCK;
-use crate::passes::BLOCK;
+use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids, ReadPlan};
 
@@ -166,9 +166,9 @@ fn read_frames(
     };
     // Only one batch of blocks is processed at a time, which bounds the memory of states that are not yet copied to
     // `values`.
-    for batch in places.chunks(2 * rayon::current_num_threads() * BLOCK) {
-        let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
-        for (block, states) in batch.chunks(BLOCK).zip(&blocks) {
+    for batch in places.chunks(2 * rayon::current_num_threads() * GAUSSIANS_PER_BLOCK) {
+        let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(GAUSSIANS_PER_BLOCK).map(read).collect::<Result<_>>()?;
+        for (block, states) in batch.chunks(GAUSSIANS_PER_BLOCK).zip(&blocks) {
             for (frame, state) in states.iter().enumerate() {
                 let planes = columns.iter().flat_map(|column| state.column(column).planes().chunks_exact(block.len()));
                 for (c, plane) in planes.enumerate() {
@@ -185,16 +185,16 @@ fn read_frames(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::SequenceInfo;
     use crate::source::BlockReader;
 
     /// Test scene that declares fewer attributes as varying with time and keeps all others as they are at frame 0.
-    struct PartlyStatic(Scene, SequenceInfo);
+    struct PartlyStatic(DemoScene, SequenceInfo);
 
     impl PartlyStatic {
         fn new(varying: Attributes) -> PartlyStatic {
-            let scene = Scene::new(3000, 7);
+            let scene = DemoScene::new(3000, 7);
             let info = SequenceInfo { varying, ..scene.info().clone() };
             PartlyStatic(scene, info)
         }

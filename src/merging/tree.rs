@@ -30,7 +30,7 @@ type NeighborCandidate = (u64, u32);
 /// The list holds up to twice as many unsorted candidates before the farther half is dropped. A heap would move about
 /// log K candidates for each one found.
 #[derive(Debug, Default)]
-pub struct Nearest {
+pub struct NearestPoints {
     query: u32,
     at: [f64; 3],
     wanted: usize,
@@ -38,19 +38,19 @@ pub struct Nearest {
     found: Vec<NeighborCandidate>,
 }
 
-impl Nearest {
+impl NearestPoints {
     /// Starts a new query: for the `wanted` nearest points to `at`, other than the point with index `query`, within the
     /// distance `epsilon`.
     ///
     /// Squared distances are summed in f64 and compared with ε².
-    pub fn start(&mut self, query: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
+    pub fn start_query(&mut self, query: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
         self.found.clear();
         (self.query, self.at, self.wanted) = (query, at.map(f64::from), wanted);
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 
     /// Adds those of `points` that are nearer than the worst candidate found so far.
-    pub fn scan(&mut self, points: &[TreePoint]) {
+    pub fn add_points(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
             if found <= self.worst && point.index != self.query {
@@ -63,7 +63,7 @@ impl Nearest {
     }
 
     /// Returns whether a point could still be among the nearest if its squared distance is `bound` or more.
-    pub fn reaches(&self, bound: f64) -> bool {
+    pub fn could_improve_at(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
 
@@ -108,16 +108,23 @@ impl Tree {
 
     /// Adds to `nearest` those of `points` that belong there, skipping subtrees that are too far away. `points` must be
     /// in the order that [`Tree::new`] gave them.
-    pub fn search(&self, points: &[TreePoint], nearest: &mut Nearest) {
+    pub fn search(&self, points: &[TreePoint], nearest: &mut NearestPoints) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }
 
-    fn visit(&self, node: usize, depth: u32, points: &[TreePoint], bound: NeighborCandidate, nearest: &mut Nearest) {
+    fn visit(
+        &self,
+        node: usize,
+        depth: u32,
+        points: &[TreePoint],
+        bound: NeighborCandidate,
+        nearest: &mut NearestPoints,
+    ) {
         if bound > nearest.worst {
             return;
         }
         if depth == 0 {
-            nearest.scan(points);
+            nearest.add_points(points);
             return;
         }
         let (before, behind) = points.split_at(points.len() / 2);

@@ -13,13 +13,13 @@ const MAX_PER_AXIS: u32 = 1 << 21;
 
 /// Grid of voxels that covers a set of points.
 #[derive(Debug, Clone, Copy)]
-pub struct Voxels {
+pub struct VoxelGrid {
     low: [f64; 3],
     side: f64,
     per_unit: f64,
 }
 
-impl Voxels {
+impl VoxelGrid {
     /// Creates a grid that starts at the lowest coordinates of `points`, with voxels of side `side`. The voxels are
     /// wider if there would be more than 2²¹ along an axis. Edge cases: if all points are at one position and the side
     /// is zero, there is one voxel. Coordinates that are not finite are ignored.
@@ -33,7 +33,7 @@ impl Voxels {
         }
         let widest = (0..3).map(|c| high[c] - low[c]).fold(0.0, f64::max);
         let side = side.max(widest / f64::from(MAX_PER_AXIS));
-        Voxels { low, side, per_unit: side.recip() }
+        VoxelGrid { low, side, per_unit: side.recip() }
     }
 
     /// Returns the side length of a voxel, in scene units.
@@ -42,31 +42,31 @@ impl Voxels {
     }
 
     /// Returns the position of `at` relative to the lowest corner of the grid, in voxel sides.
-    pub fn place(&self, at: [f32; 3]) -> [f64; 3] {
+    pub fn grid_coordinates(&self, at: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|c| (f64::from(at[c]) - self.low[c]) * self.per_unit)
     }
 
     /// Returns the Morton code of the voxel that contains the position `at`.
-    pub fn number(&self, at: [f32; 3]) -> u64 {
-        let voxel = voxel_of(self.place(at));
-        (0..3).filter_map(|c| along(c, voxel[c])).sum()
+    pub fn morton_code(&self, at: [f32; 3]) -> u64 {
+        let voxel = voxel_of(self.grid_coordinates(at));
+        (0..3).filter_map(|c| morton_bits(c, voxel[c])).sum()
     }
 
     /// Returns `rows` sorted by the Morton code of their voxel, ties by row. `at` returns the position of a row, in
     /// scene units.
-    pub fn order(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
-        let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.number(at(row)), row)).collect();
+    pub fn sort_rows(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
+        let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.morton_code(at(row)), row)).collect();
         keyed.par_sort_unstable();
         keyed.into_iter().map(|(_, row)| row).collect()
     }
 }
 
-/// Returns `rows` sorted as by [`Voxels::order`], in a grid of voxels of side `side` that covers their positions.
+/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their positions.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
-    Voxels::around(rows.iter().map(|&row| at(row)), side).order(rows, at)
+    VoxelGrid::around(rows.iter().map(|&row| at(row)), side).sort_rows(rows, at)
 }
 
-/// Returns the number along each axis of the voxel at `place`, a result of [`Voxels::place`]. Outside of the grid it is
+/// Returns the number along each axis of the voxel at `place`, a result of [`VoxelGrid::grid_coordinates`]. Outside of the grid it is
 /// the nearest voxel; NaN gives the first voxel.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
     // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
@@ -75,7 +75,7 @@ pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
 
 /// Returns the bits of a Morton code that a voxel gets from its number `number` along `axis`; `None` if the grid has no
 /// such voxel.
-pub fn along(axis: usize, number: u32) -> Option<u64> {
+pub fn morton_bits(axis: usize, number: u32) -> Option<u64> {
     (number < MAX_PER_AXIS).then(|| spread_bits(number.into()) << axis)
 }
 

@@ -6,7 +6,7 @@ use super::linked::LinkedFrames;
 use super::size::bytes_read_for;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
-use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, TimeOrigin};
 use crate::source::FrameSource;
 
 /// Container that stores the state of every Gaussian at every frame (`.gseq`).
@@ -16,7 +16,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
         let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;
         if options.link.always_links() && container.info().times.len() > 1 {
-            let joins = options.link.joins();
+            let joins = options.link.joins_tracks();
             return Ok(Box::new(LinkedFrames::relink(&container, "linked gseq container", joins, &options.ply())?));
         }
         Ok(Box::new(container))
@@ -48,7 +48,7 @@ impl InputModel for Container {
         true
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let layout = self.reader().layout();
         // The tiles of the file (blocks of Gaussians × frames) determine which Gaussians are decoded together.
         MemoryProfile {
@@ -63,8 +63,8 @@ impl InputModel for Container {
         Container::hold_decoded(self, self.decoded_bytes());
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Stamped
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Stamped
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {

@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::size::{Size, bytes_below};
+use super::size::{ModelSize, bytes_below};
 use super::trajectories::{DEFAULT_OUTPUT, NO_ARCHIVE, check_output, reduced_trajectories, write_trajectories};
-use crate::archive::Content;
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::archive::ArchiveContent;
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result, ShowPath};
-use crate::files::cameras::Clock;
+use crate::files::cameras::TimeConvention;
 use crate::files::open::open_file;
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
@@ -51,8 +51,8 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if a file no longer exists.
-    fn size(&self) -> Result<Size> {
-        Ok(Size::from_frames(self.bytes()?))
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize::from_frames(self.bytes()?))
     }
 
     /// Returns the size of the output that [`InputModel::write`] wrote to `path` as `kind`, divided into Gaussians,
@@ -60,9 +60,9 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if a file no longer exists.
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         let _ = kind;
-        Ok(Size::from_frames(bytes_below(path)?))
+        Ok(ModelSize::from_frames(bytes_below(path)?))
     }
 
     /// Returns the size in bytes of the files that frames are read from.
@@ -74,17 +74,17 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Returns the memory that the open input takes and the time and memory that reading it takes.
-    fn residence(&self) -> MemoryProfile;
+    fn memory_profile(&self) -> MemoryProfile;
 
     /// Allows the input to keep decoded values in memory if [`MemoryProfile::decoded`] is not 0.
     fn hold_decoded(&self) {}
 
     /// Returns where the time stamps of frames come from.
-    fn timing(&self) -> Timing;
+    fn timing(&self) -> TimeOrigin;
 
     /// Returns the unit of the camera times, for models whose frame times come from cameras.
-    fn clock(&self) -> Clock {
-        Clock::Normalized
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Normalized
     }
 
     /// Returns the duration of the model in its own time unit. It is used if no frame times are given.
@@ -92,7 +92,7 @@ pub trait InputModel: Send + Sync {
         1.0
     }
 
-    /// Returns the input with frames at `times`. Inputs whose files store frame times ([`Timing::Stamped`]) refuse.
+    /// Returns the input with frames at `times`. Inputs whose files store frame times ([`TimeOrigin::Stamped`]) refuse.
     ///
     /// # Errors
     /// Fails if times are not finite or do not increase, or if the input has a fixed number of frames and `times` has
@@ -161,7 +161,7 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if frames cannot be read.
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         let _ = (clusters, reference, rule);
         Ok(Proxies::default())
     }
@@ -183,7 +183,7 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if the input cannot be archived or its files cannot be read.
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
         let _ = reduction;
         Err(Error::usage(NO_ARCHIVE))
     }
@@ -193,7 +193,7 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// Fails if `content` belongs to another kind of input.
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         let _ = content;
         Err(Error::usage(NO_ARCHIVE))
     }
@@ -205,7 +205,7 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Returns whether the state of every Gaussian is stored for every frame. Refinement may then add a delta that
-    /// varies in time ([`CompressedModel::course`]).
+    /// varies in time ([`CompressedModel::trajectory_delta`]).
     fn has_explicit_frames(&self) -> bool {
         false
     }
@@ -243,7 +243,7 @@ pub trait InputModel: Send + Sync {
 
 /// Origin of the time stamps of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Timing {
+pub enum TimeOrigin {
     /// The model is continuous in time: a frame can be at any time.
     Continuous,
     /// The number of frames is fixed; their times may come from cameras.
@@ -334,7 +334,7 @@ pub struct ColumnInfo {
 pub(super) struct ModelFormat {
     /// Returns whether the input has this format, judged by the content of its files.
     pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input. If the model is continuous in time ([`Timing::Continuous`]), it has no frames until frame times
+    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame times
     /// are set.
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
@@ -386,12 +386,12 @@ pub struct OpenOptions {
     /// Whether frame numbers may be missing in a folder of frames.
     pub allow_gaps: bool,
     /// Whether frames are linked, so that the same Gaussian is found across frames.
-    pub link: Link,
+    pub link: LinkMode,
     /// Folder for temporary files (decoded archives, linked frames) while the input is open; `None` selects the
     /// temporary folder of the system.
     pub scratch: Option<PathBuf>,
     /// Training conventions that the files of the model do not record.
-    pub conventions: Conventions,
+    pub conventions: TrainingConventions,
     /// Maximum memory that may be used to open the input.
     pub memory: ReadLimit,
     /// Receiver of progress events while the input is opened.
@@ -400,7 +400,7 @@ pub struct OpenOptions {
 
 /// Training conventions that the files of some formats do not record, and how ambiguous values are treated.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Conventions {
+pub struct TrainingConventions {
     /// Length of `time_duration` of 4D Gaussian Splatting, the period after which colors repeat, in the model's time
     /// unit. `None` uses the guess of the model format and adds a note.
     pub time_duration: Option<f64>,
@@ -413,7 +413,7 @@ pub struct Conventions {
 /// Whether frames are linked: whether Gaussians of successive frames are matched, to find the same Gaussian in each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Link {
+pub enum LinkMode {
     /// Links the frames of a folder only if their numbers of Gaussians differ or the order of Gaussians does not
     /// identify them.
     #[default]
@@ -427,15 +427,15 @@ pub enum Link {
     Never,
 }
 
-impl Link {
+impl LinkMode {
     /// Returns whether inputs that already identify each Gaussian across frames are linked as well.
     pub fn always_links(self) -> bool {
-        matches!(self, Link::Always | Link::Apart)
+        matches!(self, LinkMode::Always | LinkMode::Apart)
     }
 
     /// Returns whether tracks (Gaussians followed through frames) that seem to be one Gaussian are joined.
-    pub fn joins(self) -> bool {
-        self != Link::Apart
+    pub fn joins_tracks(self) -> bool {
+        self != LinkMode::Apart
     }
 }
 

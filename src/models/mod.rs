@@ -33,11 +33,13 @@ use std::fs;
 use std::path::Path;
 
 pub use crate::files::splatv::rows::ZeroRotation;
-pub use crate::models::input_model::{ColumnInfo, Conventions, InputModel, Link, MemoryProfile, OpenOptions, Timing};
+pub use crate::models::input_model::{
+    ColumnInfo, InputModel, LinkMode, MemoryProfile, OpenOptions, TimeOrigin, TrainingConventions,
+};
 use deform_folder::Arguments;
 pub use four_d_gaussians::ModelFolder;
 pub use linked::LinkedFrames;
-pub use size::Size;
+pub use size::ModelSize;
 
 use crate::error::{Error, Result, ShowPath};
 use crate::models::input_model::{FoundInput, ModelFormat};

@@ -12,22 +12,22 @@ use super::archive::files::add_cloud;
 use super::linked::LinkedFrames;
 use super::size::bytes_read_for;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
-use crate::archive::Content;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::names::shown_name;
-use crate::files::ply::write::{rows_of_model, write_like};
+use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply_frames::PlyFrames;
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians};
-use crate::models::input_model::{InputModel, Link, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::models::input_model::{InputModel, LinkMode, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{HeldFrames, gather_all};
+use crate::passes::{FramesInMemory, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
-use crate::tracking::{OrderDifference, identity};
+use crate::tracking::{OrderDifference, compare_order};
 
 /// Folder with one PLY file per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
@@ -48,7 +48,7 @@ fn has_ply(folder: &Path) -> bool {
 /// Single PLY file, read as one frame.
 pub(super) const FILE: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
-    open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
+    open: |path, options| open_frames(PlyFrames::open_single(path, &options.ply())?, path, options),
 };
 
 /// Opens `frames` as they are if the same index means the same Gaussian in all of them; else links the frames.
@@ -57,14 +57,14 @@ pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions)
     let order = match options.link {
         _ if frames.paths().len() == 1 => FrameOrder::Assumed,
         link if link.always_links() => FrameOrder::Lost("as requested".to_owned()),
-        Link::Auto => measure_order(&frames)?,
+        LinkMode::Auto => measure_order(&frames)?,
         _ => FrameOrder::Assumed,
     };
     match order {
         FrameOrder::Assumed => Ok(Box::new(PlySequence::new(frames)?)),
         FrameOrder::Confirmed(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
         FrameOrder::Lost(why) => {
-            Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins(), &options.ply())?))
+            Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins_tracks(), &options.ply())?))
         }
     }
 }
@@ -87,8 +87,8 @@ enum FrameOrder {
 ///
 /// Frames with different numbers of Gaussians have no common order.
 fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
-    if let Some(other) = frames.other_count() {
-        let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
+    if let Some(other) = frames.first_differing_frame() {
+        let (counts, name) = (frames.gaussian_counts(), shown_name(&frames.paths()[other]));
         return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first frame {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
@@ -97,15 +97,24 @@ fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
         let first = k * pairs / pairs.min(MAX_MEASURED_PAIRS);
         let state = |frame: usize| -> Result<Gaussians> {
             let mut state = Gaussians::zeros(0, frames.sh_degree());
-            frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Attributes::all(), &mut state)?;
+            frames.frame(frame)?.gaussians(
+                0..frames.gaussian_counts()[frame] as usize,
+                Attributes::all(),
+                &mut state,
+            )?;
             Ok(state)
         };
-        found.push(identity(&state(first)?, &state(first + 1)?));
+        found.push(compare_order(&state(first)?, &state(first + 1)?));
     }
-    let lost = found.iter().filter(|identity| !identity.holds).count();
+    let lost = found.iter().filter(|identity| !identity.is_common).count();
     let is_lost = 2 * lost > found.len();
-    let Some(OrderDifference { moved, apart, unlike, strangers, .. }) =
-        found.iter().find(|found| found.holds != is_lost)
+    let Some(OrderDifference {
+        position_difference: moved,
+        apart,
+        appearance_difference: unlike,
+        unrelated_pairs: strangers,
+        ..
+    }) = found.iter().find(|found| found.is_common != is_lost)
     else {
         return Ok(FrameOrder::Assumed);
     };
@@ -151,7 +160,7 @@ impl InputModel for PlySequence {
         self.paths().len() > 1
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
             opening: 0,
@@ -169,8 +178,8 @@ impl InputModel for PlySequence {
         }
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Numbered
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Numbered
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -184,16 +193,16 @@ impl InputModel for PlySequence {
         }
     }
 
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
-        let mut content = Content { times: [0.0, 1.0], ..Content::default() };
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        let mut content = ArchiveContent { times: [0.0, 1.0], ..ArchiveContent::default() };
         content.cloud = gather_all(&*self.reduced(reduction)?, 0, Attributes::all())?;
         add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
         Ok(content)
     }
 
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
-        let mut frames = HeldFrames::new(count, degree, Attributes::empty(), content.cloud.clone());
+        let mut frames = FramesInMemory::new(count, degree, Attributes::empty(), content.cloud.clone());
         self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
         Ok(Box::new(frames))
     }
@@ -235,7 +244,7 @@ fn write_files(
             _ => path.to_owned(),
         };
         let change = reduction.delta_at(frame, sequence.paths().len());
-        write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
+        write_like_template(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
         progress.advance(1);
         Ok(())
     };

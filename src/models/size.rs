@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 /// Size in bytes of all files of a model that a renderer opens, divided into parts. Files that only training reads are
 /// not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Size {
+pub struct ModelSize {
     /// Bytes of the canonical Gaussians.
     pub cloud: u64,
     /// Bytes of the deformation field.
@@ -22,50 +22,50 @@ pub struct Size {
     pub rest: u64,
 }
 
-impl From<ArchiveSize> for Size {
-    fn from(ArchiveSize { cloud, field, rest }: ArchiveSize) -> Size {
-        Size { cloud, field, rest, ..Size::default() }
+impl From<ArchiveSize> for ModelSize {
+    fn from(ArchiveSize { cloud, field, rest }: ArchiveSize) -> ModelSize {
+        ModelSize { cloud, field, rest, ..ModelSize::default() }
     }
 }
 
-impl Size {
+impl ModelSize {
     /// Returns the size of a model that consists only of stored frames, which take `frames` bytes.
-    pub fn from_frames(frames: u64) -> Size {
-        Size { frames, ..Size::default() }
+    pub fn from_frames(frames: u64) -> ModelSize {
+        ModelSize { frames, ..ModelSize::default() }
     }
 
     /// Returns the size of the whole model in bytes.
-    pub fn whole(&self) -> u64 {
+    pub fn total(&self) -> u64 {
         self.cloud + self.field + self.frames + self.rest
     }
 
     /// Returns the name and the size in bytes of each part.
-    pub fn named(&self) -> [(&'static str, u64); 4] {
+    pub fn named_parts(&self) -> [(&'static str, u64); 4] {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
     /// Formats the parts that are not 0 for messages, in bytes: `cloud 248, field 1000`.
-    pub fn parts(&self) -> String {
-        let parts = self.named().into_iter().filter(|part| part.1 > 0);
+    pub fn parts_text(&self) -> String {
+        let parts = self.named_parts().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
     /// Formats the size of each part next to the same part of `before` for messages: `cloud 248 of 2480 (10.0%)`. A
     /// part that only one of the two models has is compared with `none`.
-    pub fn format_relative_to(&self, before: &Size) -> String {
+    pub fn format_relative_to(&self, before: &ModelSize) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
             (0, before) => Some(format!("{name} none of {before}")),
             (after, 0) => Some(format!("{name} {after} of none")),
-            (after, before) => Some(format!("{name} {}", compared(after, before))),
+            (after, before) => Some(format!("{name} {}", format_ratio(after, before))),
         };
-        self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
+        self.named_parts().into_iter().zip(before.named_parts()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
 
     /// Returns a message that explains why this size of an output is larger than the size `before` of the input; `None`
     /// if it is not larger.
-    pub fn why_larger_than(&self, before: &Size) -> Option<String> {
-        let (after, whole) = (self.whole(), before.whole());
+    pub fn why_larger_than(&self, before: &ModelSize) -> Option<String> {
+        let (after, whole) = (self.total(), before.total());
         let why = match (self.frames > 0, before.frames > 0) {
             (true, false) => {
                 "it holds the states of every frame, while the input holds parameters from which all \
@@ -78,7 +78,7 @@ impl Size {
 }
 
 /// Formats two numbers of bytes as `{after} of {before}` with a percentage.
-pub fn compared(after: u64, before: u64) -> String {
+pub fn format_ratio(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }
 
@@ -113,27 +113,27 @@ mod tests {
 
     #[test]
     fn each_part_is_compared_with_its_counterpart() {
-        let model = Size { cloud: 1000, field: 4000, rest: 10, ..Size::default() };
-        let small = Size { cloud: 100, field: 2000, rest: 10, ..Size::default() };
-        assert_eq!(small.whole(), 2110);
-        assert_eq!(small.parts(), "cloud 100, field 2000, rest 10");
+        let model = ModelSize { cloud: 1000, field: 4000, rest: 10, ..ModelSize::default() };
+        let small = ModelSize { cloud: 100, field: 2000, rest: 10, ..ModelSize::default() };
+        assert_eq!(small.total(), 2110);
+        assert_eq!(small.parts_text(), "cloud 100, field 2000, rest 10");
         assert_eq!(
             small.format_relative_to(&model),
             "cloud 100 of 1000 (10.0%), field 2000 of 4000 (50.0%), rest 10 of 10 (100.0%)"
         );
         assert_eq!(
-            Size::from_frames(9).format_relative_to(&model),
+            ModelSize::from_frames(9).format_relative_to(&model),
             "cloud none of 1000, field none of 4000, frames 9 of none, rest none of 10"
         );
     }
 
     #[test]
     fn only_larger_results_are_explained() {
-        let model = Size { cloud: 1000, field: 4000, ..Size::default() };
-        assert_eq!(Size::from_frames(5000).why_larger_than(&model), None);
-        let why = Size::from_frames(5001).why_larger_than(&model).unwrap();
+        let model = ModelSize { cloud: 1000, field: 4000, ..ModelSize::default() };
+        assert_eq!(ModelSize::from_frames(5000).why_larger_than(&model), None);
+        let why = ModelSize::from_frames(5001).why_larger_than(&model).unwrap();
         assert!(why.contains("5001 bytes instead of 5000") && why.contains("every frame"), "{why}");
-        let why = Size::from_frames(3).why_larger_than(&Size::from_frames(2)).unwrap();
+        let why = ModelSize::from_frames(3).why_larger_than(&ModelSize::from_frames(2)).unwrap();
         assert!(why.contains("fewer bytes"), "{why}");
     }
 }

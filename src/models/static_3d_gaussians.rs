@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
 use super::iterations::find_iteration;
-use super::size::{Size, bytes_below, bytes_read_for};
-use crate::archive::Content;
+use super::size::{ModelSize, bytes_below, bytes_read_for};
+use crate::archive::ArchiveContent;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -61,7 +61,7 @@ impl StaticModel {
         Ok(StaticModel {
             root: root.to_owned(),
             iteration,
-            cloud: PlySequence::single(&folder.join(POINT_CLOUD_FILE), &options.ply())?,
+            cloud: PlySequence::open_single(&folder.join(POINT_CLOUD_FILE), &options.ply())?,
         })
     }
 
@@ -90,31 +90,31 @@ impl InputModel for StaticModel {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.whole())
+        Ok(self.size()?.total())
     }
 
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         let rest = self.copied_files().collect::<Vec<_>>();
         let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_read_for(rest.iter().map(PathBuf::as_path))?);
-        Ok(Size { cloud, rest, ..Size::default() })
+        Ok(ModelSize { cloud, rest, ..ModelSize::default() })
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
             OutputKind::Model => {
                 let cloud = bytes_read_for([&*self.cloud_path(path)])?;
-                Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
+                Ok(ModelSize { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..ModelSize::default() })
             }
             _ => self.cloud.size_written(kind, path),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
-        self.cloud.residence()
+    fn memory_profile(&self) -> MemoryProfile {
+        self.cloud.memory_profile()
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Numbered
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Numbered
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -136,11 +136,11 @@ impl InputModel for StaticModel {
         self.root.join("cfg_args").exists().then_some("cfg_args fixes the SH degree")
     }
 
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
-        self.cloud.content(reduction)
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.cloud.archive_content(reduction)
     }
 
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.cloud.decode_frames(content)
     }
 
@@ -202,7 +202,7 @@ mod tests {
         assert_eq!(left, all.pick(&[1, 3]));
         assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(root.join("cfg_args")).unwrap());
         assert!(result.join("point_cloud/iteration_30000/point_cloud.ply").is_file());
-        assert_eq!(model.size_written(OutputKind::Model, &result).unwrap().whole(), bytes_below(&result).unwrap());
+        assert_eq!(model.size_written(OutputKind::Model, &result).unwrap().total(), bytes_below(&result).unwrap());
         let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Attributes::POSITION).unwrap();
         assert_eq!(first.position.row::<1>(0), [7000.0]);
         assert!(open(&root, Some(8)).err().unwrap().to_string().contains("iteration_7000, iteration_30000"));

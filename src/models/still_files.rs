@@ -11,7 +11,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::ply_sequence::open_frames;
 use super::size::bytes_read_for;
-use crate::archive::Content;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::ScratchFolder;
@@ -27,7 +27,7 @@ use crate::files::spz;
 use crate::files::spz::read::read_spz;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
-use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::models::input_model::{FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -84,7 +84,9 @@ const FORMATS: [StillFormat; 5] = [
 /// Returns whether the file is a PLY whose header has an element `chunk` first or a packed property near its start.
 fn has_packed_positions(found: &FoundInput) -> bool {
     let has = |text: &str| found.head.windows(text.len()).any(|part| part == text.as_bytes());
-    !found.is_folder && found.head.starts_with(b"ply") && (has("\nelement chunk ") || has(compressed_ply::MARKER))
+    !found.is_folder
+        && found.head.starts_with(b"ply")
+        && (has("\nelement chunk ") || has(compressed_ply::MARKER_PROPERTY))
 }
 
 /// File of a web viewer, or a folder of such files.
@@ -181,15 +183,15 @@ impl InputModel for StillFiles {
         self.inner.stored_bytes()
     }
 
-    fn residence(&self) -> MemoryProfile {
-        self.inner.residence()
+    fn memory_profile(&self) -> MemoryProfile {
+        self.inner.memory_profile()
     }
 
     fn hold_decoded(&self) {
         self.inner.hold_decoded();
     }
 
-    fn timing(&self) -> Timing {
+    fn timing(&self) -> TimeOrigin {
         self.inner.timing()
     }
 
@@ -210,11 +212,11 @@ impl InputModel for StillFiles {
         self.inner.check_output(kind, path)
     }
 
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
-        self.inner.content(reduction)
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.inner.archive_content(reduction)
     }
 
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.inner.decode_frames(content)
     }
 

@@ -18,9 +18,9 @@ use crate::files::atomic::ScratchFile;
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
-use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, Packing};
-use crate::passes::HeldFrames;
+use crate::passes::FramesInMemory;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -48,11 +48,11 @@ impl ReceivedStream {
     ///
     /// # Errors
     /// Fails if the stream is damaged or a write fails.
-    pub fn receive(
+    pub fn receive_and_pack(
         stream: FrameStream<impl Read + Send + 'static>,
         folder: &Path,
         events: &Events,
-        take: impl FnMut(&HeldFrames) -> Result<()>,
+        take: impl FnMut(&FramesInMemory) -> Result<()>,
     ) -> Result<ReceivedStream> {
         let scratch = ScratchFile::new(folder)?;
         let received = pack_stream(stream, scratch.path(), COMPRESSION, events, take)?;
@@ -90,16 +90,16 @@ impl InputModel for ReceivedStream {
         true
     }
 
-    fn residence(&self) -> MemoryProfile {
-        self.container.residence()
+    fn memory_profile(&self) -> MemoryProfile {
+        self.container.memory_profile()
     }
 
     fn hold_decoded(&self) {
         InputModel::hold_decoded(&self.container);
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Stamped
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Stamped
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -114,15 +114,15 @@ pub fn pack_stream(
     path: &Path,
     packing: impl Into<Packing>,
     events: &Events,
-    mut take: impl FnMut(&HeldFrames) -> Result<()>,
+    mut take: impl FnMut(&FramesInMemory) -> Result<()>,
 ) -> Result<u64> {
     let StreamHeader { count, sh_degree, varying, .. } = *stream.header();
-    let block = frame_block(stream.header());
+    let block = frames_per_tile(stream.header());
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
-    let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
+    let mut held = FramesInMemory::new(count, sh_degree, varying, stream.take_constant_attributes());
     let progress = events.counting_task("receive", "frames");
-    let mut flush = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
-        writer.append(held, 0..held.len(), |_| ())?;
+    let mut flush = |held: &mut FramesInMemory| -> Result<Vec<Gaussians>> {
+        writer.append_block(held, 0..held.len(), |_| ())?;
         take(held)?;
         Ok(held.drain().collect())
     };
@@ -143,7 +143,7 @@ pub fn pack_stream(
                 break;
             }
         }
-        stream.received()
+        stream.received_bytes()
     });
     for frame in &arrived {
         let Some((time, state)) = frame? else { break };
@@ -164,6 +164,6 @@ pub fn pack_stream(
 
 /// Returns the number of frames per tile of the container: as many as fit into [`HELD_BYTES`], between 1 and
 /// [`FRAME_BLOCK`]. It depends only on the header of the stream, so that the bytes of the container do too.
-pub fn frame_block(header: &StreamHeader) -> usize {
+pub fn frames_per_tile(header: &StreamHeader) -> usize {
     (HELD_BYTES / header.frame_bytes().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
 }

@@ -12,7 +12,7 @@ use crate::compressed_model::{CompressedModel, TrajectoryDelta};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::glb::write::write_glb;
 use crate::files::ply::write::write_inria;
-use crate::files::sog::write::{SogErrors, drawn, write_sog};
+use crate::files::sog::write::{SogErrors, visible_only, write_sog};
 use crate::files::spz::{SpzVersion, write_spz};
 use crate::limits::Limits;
 use crate::merging::merged::MergedSequence;
@@ -22,8 +22,8 @@ use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::gsd::write_gsd;
 use crate::outputs::kind::OutputKind;
-use crate::outputs::windows::write_fitted_windows;
-use crate::passes::{HeldFrames, States, WithDelta, gather_all};
+use crate::outputs::time_windows::write_fitted_windows;
+use crate::passes::{FrameStates, FramesInMemory, SourceWithDeltas, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -45,7 +45,7 @@ pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
 /// Returns the frames of `source` after Gaussians have been removed and merged as `reduction` says.
 pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
     let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
-    MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
+    MergedSequence::new(source, &reduction.kept, members, &reduction.merge_params)
 }
 
 /// Returns the frames of the compressed model: Gaussians of `source` removed and merged, parameter deltas added and the
@@ -54,8 +54,8 @@ pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a CompressedModel,
 ) -> Box<dyn FrameSource + 'a> {
-    let CompressedModel { change, course, sh_degree, .. } = reduction;
-    Box::new(WithDelta::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
+    let CompressedModel { delta: change, trajectory_delta: course, sh_degree, .. } = reduction;
+    Box::new(SourceWithDeltas::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
 /// Checks that a sequence of `frames` frames can be written as the kind of output `kind` to `path`.
@@ -87,7 +87,7 @@ pub(super) fn write_trajectories(
         write_merged(source, reduction, path, limits.gaussians_together, events)?;
         return Ok(Vec::new());
     }
-    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held, events)
+    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.max_kept_frames, events)
 }
 
 /// Writes a container of a compressed model with proxies. The members of a proxy can be anywhere in the source, so
@@ -108,14 +108,15 @@ fn write_merged(
     let parts = block_ranges(&merged, max_gaussians);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
         let of_block = start..times.len().min(start + FRAME_BLOCK);
-        writer.begin(&times[of_block.clone()])?;
+        writer.begin_block(&times[of_block.clone()])?;
         for part in &parts {
-            let mut frames = merged.together(part.clone(), &ReadPlan::new(of_block.clone()).holding(FRAME_BLOCK))?;
+            let mut frames =
+                merged.open_together(part.clone(), &ReadPlan::new(of_block.clone()).keeping_at_most(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
                 frames.read(start, Attributes::all().difference(*varying), &mut constant)?;
             }
-            let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
+            let mut held = FramesInMemory::new(part.len(), *sh_degree, *varying, constant);
             for frame in of_block.clone() {
                 let mut state = Gaussians::zeros(0, *sh_degree);
                 frames.read(frame, *varying, &mut state)?;
@@ -123,11 +124,11 @@ fn write_merged(
             }
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
-            let change = reduction.change.pick(&places);
+            let change = reduction.delta.pick(&places);
             // Compressed models with proxies have no delta that varies in time.
             let course = TrajectoryDelta::default();
-            let held = WithDelta::new(Box::new(held), &change, &course, reduction.sh_degree);
-            writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
+            let held = SourceWithDeltas::new(Box::new(held), &change, &course, reduction.sh_degree);
+            writer.add_gaussians(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }
     writer.finish()
@@ -140,7 +141,7 @@ fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<
     let (mut parts, mut start, mut source_gaussians) = (Vec::new(), 0, 0);
     for block in (0..count).step_by(GAUSSIAN_BLOCK) {
         let places = block..count.min(block + GAUSSIAN_BLOCK);
-        let members: usize = places.map(|place| merged.members(place)).sum();
+        let members: usize = places.map(|place| merged.member_count(place)).sum();
         if source_gaussians > 0 && source_gaussians + members > max_gaussians {
             parts.push(start..block);
             (start, source_gaussians) = (block, 0);
@@ -191,13 +192,13 @@ pub fn write_sequence(
         _ => (),
     }
     let progress = events.task("emit", "frames", info.times.len() as u64);
-    let mut states = States::open(source, &ReadPlan::every().holding(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
     for frame in 0..info.times.len() {
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),
         };
-        write_inria(states.at(frame)?, &[], &file)?;
+        write_inria(states.read(frame)?, &[], &file)?;
         progress.advance(1);
     }
     Ok(Vec::new())
@@ -208,10 +209,10 @@ pub fn write_sequence(
 fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<Vec<String>> {
     let frames = source.info().times.len();
     let progress = events.task("emit", "frames", frames as u64);
-    let mut states = States::open(source, &ReadPlan::every().holding(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
     let mut errors = SogErrors::default();
     for frame in 0..frames {
-        let state = drawn(states.at(frame)?);
+        let state = visible_only(states.read(frame)?);
         errors = errors.max(write_sog(&state, &path.join(format!("frame_{frame:04}.sog")))?);
         progress.advance(1);
     }

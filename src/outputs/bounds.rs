@@ -10,7 +10,7 @@ use crate::model::Attributes;
 /// Maximum error of each attribute in its own unit, in the order of [`Attributes::all`]. 0 stores the attribute without
 /// loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub struct Bounds([f64; 5]);
+pub struct ErrorBounds([f64; 5]);
 
 /// Requested maximum error of one attribute: `position=1e-3` in the attribute's unit, or `position=0.01%` of the scene
 /// extent.
@@ -22,10 +22,10 @@ pub struct MaxError {
     is_relative: bool,
 }
 
-impl Bounds {
+impl ErrorBounds {
     /// Creates error bounds from the maximum errors of all attributes, in the order of [`Attributes::all`].
-    pub fn new(bounds: [f64; 5]) -> Bounds {
-        Bounds(bounds)
+    pub fn new(bounds: [f64; 5]) -> ErrorBounds {
+        ErrorBounds(bounds)
     }
 
     /// Creates error bounds from the maximum errors that the user requests. `extent` returns the scene extent in scene
@@ -33,8 +33,8 @@ impl Bounds {
     ///
     /// # Errors
     /// Fails if an attribute is named twice, or if `extent` fails.
-    pub fn from_errors(requested: &[MaxError], extent: impl Fn() -> Result<f64>) -> Result<Bounds> {
-        let mut bounds = Bounds::default();
+    pub fn from_errors(requested: &[MaxError], extent: impl Fn() -> Result<f64>) -> Result<ErrorBounds> {
+        let mut bounds = ErrorBounds::default();
         for &MaxError { column, bound, is_relative } in requested {
             let slot = &mut bounds.0[column.bits().trailing_zeros() as usize];
             if *slot != 0.0 {
@@ -46,7 +46,7 @@ impl Bounds {
     }
 
     /// Returns the maximum error of the attribute `column`; 0 if it is stored without loss.
-    pub fn column(&self, column: Attributes) -> f64 {
+    pub fn max_error(&self, column: Attributes) -> f64 {
         self.0[column.bits().trailing_zeros() as usize]
     }
 }
@@ -82,12 +82,12 @@ mod tests {
     #[test]
     fn bounds_are_read_by_attribute_or_as_a_percentage() {
         let requested = ["position=0.5%", "sh=1e-2"].map(|text| text.parse::<MaxError>().unwrap());
-        let bounds = Bounds::from_errors(&requested, || Ok(20.0)).unwrap();
-        let found: Vec<f64> = Attributes::all().iter().map(|column| bounds.column(column)).collect();
+        let bounds = ErrorBounds::from_errors(&requested, || Ok(20.0)).unwrap();
+        let found: Vec<f64> = Attributes::all().iter().map(|column| bounds.max_error(column)).collect();
         assert_eq!(found, [0.1, 0.0, 0.0, 0.0, 0.01]);
-        assert!(Bounds::from_errors(&requested, || Err(Error::usage("no extent"))).is_err());
+        assert!(ErrorBounds::from_errors(&requested, || Err(Error::usage("no extent"))).is_err());
         let twice = [requested[1], requested[1]];
-        assert!(Bounds::from_errors(&twice, || Ok(1.0)).unwrap_err().to_string().contains("sh is named twice"));
+        assert!(ErrorBounds::from_errors(&twice, || Ok(1.0)).unwrap_err().to_string().contains("sh is named twice"));
     }
 
     #[test]

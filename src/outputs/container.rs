@@ -12,7 +12,7 @@ use std::path::Path;
 use gseq::{ColumnSpec, Compression, EncodedTile, Layout, TileId, Writer, encode_tile};
 use rayon::prelude::*;
 
-use super::bounds::Bounds;
+use super::bounds::ErrorBounds;
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
@@ -31,25 +31,25 @@ pub const BOUNDED_FRAME_BLOCK: usize = 64;
 #[derive(Debug, Clone, Copy)]
 pub struct Packing {
     compression: Compression,
-    bounds: Bounds,
+    bounds: ErrorBounds,
 }
 
 impl From<Compression> for Packing {
     /// Creates the lossless encoding that uses `compression`.
     fn from(compression: Compression) -> Packing {
-        Packing { compression, bounds: Bounds::default() }
+        Packing { compression, bounds: ErrorBounds::default() }
     }
 }
 
 impl Packing {
     /// Creates the encoding with errors of at most `bounds`, compressed by zstd at `level`.
-    pub fn within(bounds: Bounds, level: i32) -> Packing {
+    pub fn with_bounds(bounds: ErrorBounds, level: i32) -> Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
     /// Returns the number of frames per tile: more if there are error bounds.
     pub fn frame_block(&self) -> usize {
-        if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
+        if self.bounds == ErrorBounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }
 
     /// Returns the number of frame blocks (ranges of consecutive frames, as many as a tile has) that `source` needs.
@@ -58,13 +58,13 @@ impl Packing {
     }
 
     /// Returns the frames of `source` that are in frame block number `block`.
-    pub fn frames(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
+    pub fn frames_of_block(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
         let start = block * self.frame_block();
         start..source.info().times.len().min(start + self.frame_block())
     }
 
     /// Returns the cache key of this encoding. The values to be encoded are not part of it.
-    pub fn key(&self) -> CacheKey {
+    pub fn cache_key(&self) -> CacheKey {
         let column_key = |column| match self.column(column) {
             Compression::Raw => (0, 0.0, 0),
             Compression::Zstd(level) => (1, 0.0, level),
@@ -76,7 +76,7 @@ impl Packing {
 
     /// Returns the compression of the attribute `column`.
     fn column(&self, column: Attributes) -> Compression {
-        match (self.compression, self.bounds.column(column)) {
+        match (self.compression, self.bounds.max_error(column)) {
             (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
             (compression, _) => compression,
         }
@@ -95,7 +95,7 @@ pub fn write_container(
     let packing = packing.into();
     let mut writer = ContainerWriter::from_source(source, path, packing, attributes)?;
     for block in 0..packing.frame_blocks(source) {
-        writer.append(source, packing.frames(source, block), &advance)?;
+        writer.append_block(source, packing.frames_of_block(source, block), &advance)?;
     }
     writer.finish()
 }
@@ -115,7 +115,7 @@ pub fn spill_blocks(
 ) -> Result<()> {
     for block in blocks {
         let presence = uniform_presence(source, block == 0);
-        encode_frames(source, packing.frames(source, block), &presence, &packing, &advance, |_, _, tile| {
+        encode_frames(source, packing.frames_of_block(source, block), &presence, &packing, &advance, |_, _, tile| {
             to.write_record(&tile.map_or(Vec::new(), EncodedTile::to_bytes))
         })?;
     }
@@ -140,7 +140,7 @@ pub fn join_container(
     for (blocks, spill) in spills {
         let mut at = 0;
         for block in blocks.clone() {
-            writer.begin(&info.times[packing.frames(source, block)])?;
+            writer.begin_block(&info.times[packing.frames_of_block(source, block)])?;
             for gaussian_block in 0..info.count.div_ceil(GAUSSIAN_BLOCK) {
                 for column in 0..Attributes::all().iter().count() {
                     at = spill.read_record(at, &mut bytes)?;
@@ -175,7 +175,7 @@ impl ContainerWriter {
         let column = |column: Attributes| ColumnSpec {
             name: column.name().to_owned(),
             width: column.width(sh_degree) as u32,
-            max_error: packing.bounds.column(column),
+            max_error: packing.bounds.max_error(column),
         };
         let layout = Layout {
             gaussians: count as u64,
@@ -200,19 +200,19 @@ impl ContainerWriter {
 
     /// Adds the next frame block: `frames` of `source`. There must be as many frames as in a block; a block with fewer
     /// must be the last one. Attributes that do not vary with time must have the same values as in the blocks before.
-    pub fn append(
+    pub fn append_block(
         &mut self,
         source: &dyn FrameSource,
         frames: Range<usize>,
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
-        self.begin(&source.info().times[frames.clone()])?;
-        self.add(source, 0, frames, advance)
+        self.begin_block(&source.info().times[frames.clone()])?;
+        self.add_gaussians(source, 0, frames, advance)
     }
 
-    /// Begins a frame block with frames at `times`. Afterwards [`ContainerWriter::add`] must add all Gaussians, in one
+    /// Begins a frame block with frames at `times`. Afterwards [`ContainerWriter::add_gaussians`] must add all Gaussians, in one
     /// or several parts.
-    pub fn begin(&mut self, times: &[f64]) -> Result<()> {
+    pub fn begin_block(&mut self, times: &[f64]) -> Result<()> {
         self.writer.append_times(times)?;
         self.frame_blocks += 1;
         Ok(())
@@ -220,7 +220,7 @@ impl ContainerWriter {
 
     /// Adds some Gaussians to the present frame block: all those of `source`, at its `frames`. In the container they
     /// are Gaussian `first` and those that follow. `first` is a multiple of [`GAUSSIAN_BLOCK`].
-    pub fn add(
+    pub fn add_gaussians(
         &mut self,
         source: &dyn FrameSource,
         first: usize,
@@ -234,7 +234,7 @@ impl ContainerWriter {
         })
     }
 
-    /// Adds a frame block like [`ContainerWriter::append`]: `frames` of `source`, with the time stamps `times`.
+    /// Adds a frame block like [`ContainerWriter::append_block`]: `frames` of `source`, with the time stamps `times`.
     /// `presence` tells how each block of Gaussians changes within the frame block. A block that does not change is
     /// read and encoded once for all frames, or not at all if it equals that of the frame block before.
     pub fn append_with_presence(
@@ -244,7 +244,7 @@ impl ContainerWriter {
         times: &[f64],
         presence: &[BlockChange],
     ) -> Result<()> {
-        self.begin(times)?;
+        self.begin_block(times)?;
         let packing = self.packing;
         encode_frames(
             source,

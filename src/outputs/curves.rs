@@ -6,12 +6,12 @@
 use std::path::Path;
 
 use crate::error::Result;
-use crate::files::accuracy::Accuracy;
+use crate::files::accuracy::CodingErrors;
 use crate::files::splatv::SplatvGaussian;
-use crate::files::splatv::write::{default_cameras, measure, words, write};
-use crate::fit::{CubicTrack, CurveForm, Misfit, Tolerance, curved};
-use crate::model::{Attributes, color};
-use crate::passes::{gather_all, tracks};
+use crate::files::splatv::write::{add_errors, default_cameras, encode_words, write_splatv};
+use crate::fit::{CubicTrack, CurveForm, FitError, Tolerance, fit_curves};
+use crate::model::{Attributes, color_from_sh};
+use crate::passes::{gather_all, map_tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -25,19 +25,19 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let times = scale_to_unit(&info.times);
     let tolerance = Tolerance::default();
-    let found = tracks(source, &times, &progress, |track| {
-        let mut misfit = Misfit::default();
-        (curved(track, CurveForm::CUBIC, &tolerance, &mut misfit), misfit)
+    let found = map_tracks(source, &times, &progress, |track| {
+        let mut misfit = FitError::default();
+        (fit_curves(track, CurveForm::CUBIC, &tolerance, &mut misfit), misfit)
     })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
+    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
     let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(splatv_gaussian).collect();
     let first = gather_all(source, 0, Attributes::POSITION)?;
-    let mut accuracy = Accuracy::new(&first.position);
+    let mut accuracy = CodingErrors::new(&first.position);
     let row_ids = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
-    row_ids.zip(&rows).for_each(|(id, row)| measure(row, id, &mut accuracy));
+    row_ids.zip(&rows).for_each(|(id, row)| add_errors(row, id, &mut accuracy));
     accuracy.check("a .splatv")?;
-    let rows: Vec<_> = rows.iter().map(words).collect();
-    write(path, rows.len(), rows.iter().copied(), &default_cameras(&first.position))?;
+    let rows: Vec<_> = rows.iter().map(encode_words).collect();
+    write_splatv(path, rows.len(), rows.iter().copied(), &default_cameras(&first.position))?;
     let sh_loss = if info.sh_degree > 0 { ", in colors that do not change with direction" } else { "" };
     Ok(format!(
         "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} \
@@ -70,7 +70,7 @@ fn splatv_gaussian(curve: &CubicTrack) -> SplatvGaussian {
         rotation: curve.rotation[0].map(narrow),
         omega: curve.rotation[1].map(narrow),
         scale: curve.log_scale.map(|scale| narrow(scale.exp())),
-        rgb: std::array::from_fn(|c| color(curve.sh[c])),
+        rgb: std::array::from_fn(|c| color_from_sh(curve.sh[c])),
         opacity: curve.opacity,
         center: narrow(curve.center),
         // Players do not support infinity in half precision.
@@ -81,7 +81,7 @@ fn splatv_gaussian(curve: &CubicTrack) -> SplatvGaussian {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::files::splatv::Splatv;
     use crate::model::opacity;
 
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn the_viewer_formulas_reproduce_every_gaussian() {
-        let scene = Scene::new(300, 30);
+        let scene = DemoScene::new(300, 30);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.splatv");
         let message = write_curves(&scene, &path, &Events::IGNORED).unwrap();

@@ -137,7 +137,7 @@ impl FilmOutput {
     /// # Errors
     /// Fails if the frame has another size, if it cannot be written, or if the encoder ended early; the message then
     /// contains the encoder's output.
-    pub fn add(&mut self, image: &Image) -> Result<()> {
+    pub fn add_frame(&mut self, image: &Image) -> Result<()> {
         let added = if (image.width, image.height) == self.size {
             self.write(image)
         } else {
@@ -288,7 +288,7 @@ mod tests {
         let path = folder.path().join("x.gif");
         let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, (4, 3), 60, 24).unwrap();
         for _ in 0..60 {
-            film.add(&Image { width: 4, height: 3, data: vec![0.25; 36] }).unwrap();
+            film.add_frame(&Image { width: 4, height: 3, data: vec![0.25; 36] }).unwrap();
         }
         film.finish().unwrap();
         let mut decoder = gif::DecodeOptions::new().read_info(File::open(&path).unwrap()).unwrap();
@@ -310,7 +310,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.png");
         let mut film = FilmOutput::create((&path, &path), &FilmFormat::Apng, (4, 3), 2, 10).unwrap();
-        let message = film.add(&Image { width: 3, height: 3, data: vec![0.0; 27] }).unwrap_err().to_string();
+        let message = film.add_frame(&Image { width: 3, height: 3, data: vec![0.0; 27] }).unwrap_err().to_string();
         assert!(message.contains("4x3") && message.contains("3x3"), "{message}");
         assert!(film.finish().is_err(), "a film of two frames has none");
     }

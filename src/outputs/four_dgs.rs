@@ -12,10 +12,10 @@ use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::accuracy::{Accuracy, RenderedAttributes};
-use crate::fit::{LinearPiece, Misfit, Tolerance, straight};
-use crate::model::{AttributeValues, color};
-use crate::passes::tracks;
+use crate::files::accuracy::{CodingErrors, RenderedAttributes};
+use crate::fit::{FitError, LinearPiece, Tolerance, fit_lines};
+use crate::model::{AttributeValues, color_from_sh};
+use crate::passes::map_tracks;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
@@ -31,11 +31,11 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let tolerance = Tolerance::default();
     let starts: Vec<f64> = (0..=info.times.len()).map(|frame| frame as f64 / FRAME_RATE).collect();
-    let found = tracks(source, &starts[..info.times.len()], &progress, |track| {
-        let mut misfit = Misfit::default();
-        (straight(track, &tolerance, &mut misfit), misfit)
+    let found = map_tracks(source, &starts[..info.times.len()], &progress, |track| {
+        let mut misfit = FitError::default();
+        (fit_lines(track, &tolerance, &mut misfit), misfit)
     })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
+    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
     let mut set = GaussianSet {
         sh_degree: info.sh_degree as u8,
         sh_coefficients: (info.sh_degree + 1).pow(2) - 1,
@@ -101,7 +101,7 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
 /// Gaussian that each piece belongs to.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
-    let mut accuracy = Accuracy::new(&AttributeValues::from_planes(3, planes));
+    let mut accuracy = CodingErrors::new(&AttributeValues::from_planes(3, planes));
     for (k, id) in ids.enumerate() {
         let triple = |values: &[f32]| [0, 1, 2].map(|axis| f64::from(values[3 * k + axis]));
         let opacity = f64::from(set.colors[4 * k + 3]);
@@ -124,7 +124,7 @@ fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     set.scales.extend(piece.log_scale.map(|scale| to_f32(scale.exp())));
     let [w, x, y, z] = piece.rotation.map(to_f32);
     set.rotations.extend([x, y, z, w]);
-    set.colors.extend((0..3).map(|c| to_f32(color(piece.sh[c]).clamp(0.0, 1.0))));
+    set.colors.extend((0..3).map(|c| to_f32(color_from_sh(piece.sh[c]).clamp(0.0, 1.0))));
     set.colors.push(to_f32(piece.opacity));
     set.mu_t.push(to_f32(piece.at));
     set.sigma_t.push(f32::INFINITY);
@@ -143,7 +143,7 @@ fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::{Attributes, opacity};
     use crate::passes::gather_all;
 
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn a_reader_of_the_format_finds_every_visible_gaussian() {
-        let scene = Scene::new(400, 24);
+        let scene = DemoScene::new(400, 24);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.4dgs");
         let message = write_four_dgs(&scene, &path, &Events::IGNORED).unwrap();

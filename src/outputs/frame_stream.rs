@@ -35,7 +35,7 @@ impl<W: Write> StreamWriter<W> {
     /// # Errors
     /// Fails if `time` is not finite or not later than that of the frame before, if an attribute has another length
     /// than the header says, if there are more than 2³² − 1 frames, or if the stream cannot be written.
-    pub fn frame(&mut self, time: f64, state: &Gaussians) -> Result<()> {
+    pub fn write_frame(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         let mark = FrameMark::Frame { index: self.frames, time, bytes: self.header.frame_bytes() }.to_bytes();
         // A reader would reject the mark (the record before each frame) for the same reason.
         if let Err(illegal) = FrameMark::from_bytes(&mark, &self.header, self.frames, self.last_time) {

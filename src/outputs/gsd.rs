@@ -26,7 +26,7 @@ use serde_json::{Value, json};
 use crate::error::{Error, Result};
 use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::model::{Gaussians, opacity};
-use crate::passes::States;
+use crate::passes::FrameStates;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -49,10 +49,10 @@ pub fn write_gsd(source: &dyn FrameSource, path: &Path, held: usize, events: &Ev
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let scratch = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
     let mut blocks = BufWriter::new(scratch);
-    let mut states = States::open(source, &ReadPlan::every().holding(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
     let (mut frames, mut most, mut left_out) = (Vec::<Value>::new(), 0, 0);
     for frame in 0..info.times.len() {
-        let packed = PackedFrame::new(states.at(frame)?);
+        let packed = PackedFrame::new(states.read(frame)?);
         let block = lz4_flex::block::compress(&packed.textures);
         let length = u32::try_from(block.len())
             .map_err(|_| Error::usage(format!("frame {frame} has more than the 4 GiB that a .gsd can store")))?;
@@ -215,7 +215,7 @@ fn add_texture<const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::Attributes;
     use crate::passes::gather_all;
 
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn an_independent_reader_finds_every_visible_gaussian() {
-        let scene = Scene::new(300, 3);
+        let scene = DemoScene::new(300, 3);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.gsd");
         write_gsd(&scene, &path, 1, &Events::IGNORED).unwrap();
@@ -289,7 +289,7 @@ mod tests {
 
     #[test]
     fn bounds_are_in_centimeters_of_unreal_axes() {
-        let mut state = gather_all(&Scene::new(2, 1), 0, Attributes::all()).unwrap();
+        let mut state = gather_all(&DemoScene::new(2, 1), 0, Attributes::all()).unwrap();
         state.position.set_row(0, [1.0, 2.0, 3.0]);
         state.position.set_row(1, [-1.0, 5.0, 0.5]);
         state.opacity_logit.set_row(0, [3.0]);
@@ -308,7 +308,7 @@ mod tests {
 
     #[test]
     fn gaussians_with_nan_are_left_out_and_counted() {
-        let mut state = gather_all(&Scene::new(20, 1), 0, Attributes::all()).unwrap();
+        let mut state = gather_all(&DemoScene::new(20, 1), 0, Attributes::all()).unwrap();
         let seen = PackedFrame::new(&state).count;
         let row = (0..20).find(|&row| opacity(state.opacity_logit.row::<1>(row)[0]) > 0.1).unwrap();
         state.position.plane_mut(1)[row] = f32::NAN;

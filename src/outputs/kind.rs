@@ -105,7 +105,7 @@ impl OutputKind {
     }
 
     /// Returns whether this kind of output stores every frame, unlike a model from which frames are computed.
-    pub fn holds_frames(self) -> bool {
+    pub fn stores_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }
 

@@ -14,4 +14,4 @@ pub mod gsd;
 pub mod index_map;
 pub mod kind;
 pub mod rows;
-pub mod windows;
+pub mod time_windows;

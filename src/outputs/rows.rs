@@ -20,7 +20,7 @@ use crate::model::{self, Rows, Statistic};
 /// Statistics, scores and decisions of N Gaussians after the selection. Every slice has one value per Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics, one column each ([`Statistic::column`]). The peak contribution W, if measured, is the last column of
+    /// Statistics, one column each ([`Statistic::column_name`]). The peak contribution W, if measured, is the last column of
     /// the table.
     pub rows: &'a Rows,
     /// Static score S_static of each Gaussian, from its contribution and shape.
@@ -84,9 +84,9 @@ impl RowTable<'_> {
 
     /// Returns the columns of the table in order, each with its name.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
-        let column = |statistic: Statistic| match statistic.values() {
-            model::StatisticAccess::F64(values, _) => (statistic.column(), TableColumn::F64(values(self.rows))),
-            model::StatisticAccess::U32(values, _) => (statistic.column(), TableColumn::U32(values(self.rows))),
+        let column = |statistic: Statistic| match statistic.accessors() {
+            model::StatisticAccess::F64(values, _) => (statistic.column_name(), TableColumn::F64(values(self.rows))),
+            model::StatisticAccess::U32(values, _) => (statistic.column_name(), TableColumn::U32(values(self.rows))),
         };
         let mut columns: Vec<_> =
             Statistic::ALL.into_iter().filter(|&statistic| statistic != Statistic::W).map(column).collect();

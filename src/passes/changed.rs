@@ -8,14 +8,14 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Frame source that adds two changes to the Gaussians of another source: a parameter delta, which is constant in time,
 /// and a trajectory delta, which varies in time.
-pub struct WithDelta<'a> {
+pub struct SourceWithDeltas<'a> {
     source: Box<dyn FrameSource + 'a>,
     delta: &'a ParamDelta,
     trajectory: &'a TrajectoryDelta,
     info: SequenceInfo,
 }
 
-impl<'a> WithDelta<'a> {
+impl<'a> SourceWithDeltas<'a> {
     /// Wraps `source`: adds `delta` and `trajectory` to its Gaussians, and keeps SH coefficients up to `sh_degree`
     /// only. If both deltas are empty and `source` has no higher SH degree, its frames are returned unchanged.
     pub fn new(
@@ -23,11 +23,11 @@ impl<'a> WithDelta<'a> {
         delta: &'a ParamDelta,
         trajectory: &'a TrajectoryDelta,
         sh_degree: usize,
-    ) -> WithDelta<'a> {
+    ) -> SourceWithDeltas<'a> {
         let mut info = source.info().clone();
         info.sh_degree = info.sh_degree.min(sh_degree);
-        info.varying |= trajectory.columns();
-        WithDelta { source, delta, trajectory, info }
+        info.varying |= trajectory.attributes();
+        SourceWithDeltas { source, delta, trajectory, info }
     }
 
     fn is_unchanged(&self) -> bool {
@@ -50,7 +50,7 @@ impl<'a> WithDelta<'a> {
     }
 }
 
-impl FrameSource for WithDelta<'_> {
+impl FrameSource for SourceWithDeltas<'_> {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -110,7 +110,7 @@ impl BlockReader for ChangedReader<'_> {
         match self.trajectory.is_empty() {
             true => self.delta.add_to(out, want),
             // The trajectory delta has no coefficients of the dropped SH degrees.
-            false => self.trajectory.at(frame, self.frames).and(self.delta.clone()).add_to(out, want),
+            false => self.trajectory.at_frame(frame, self.frames).plus(self.delta.clone()).add_to(out, want),
         }
         Ok(())
     }
@@ -123,12 +123,12 @@ impl BlockReader for ChangedReader<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::NO_SH_LIMIT;
 
     #[test]
     fn each_gaussian_gets_its_own_delta_in_every_column() {
-        let plain = Scene::new(40, 3);
+        let plain = DemoScene::new(40, 3);
         let mut by = Gaussians::zeros(40, 0);
         by.log_scale = Default::default();
         for i in 0..40 {
@@ -138,7 +138,7 @@ mod tests {
         }
         let delta = ParamDelta(by);
         let no_trajectory = TrajectoryDelta::default();
-        let changed = WithDelta::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, NO_SH_LIMIT);
+        let changed = SourceWithDeltas::new(Box::new(DemoScene::new(40, 3)), &delta, &no_trajectory, NO_SH_LIMIT);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
@@ -147,7 +147,7 @@ mod tests {
             };
             let (mut expected, got) = (read(&plain), read(&changed));
             for (row, id) in ids.iter().enumerate() {
-                for column in delta.columns().iter() {
+                for column in delta.attributes().iter() {
                     let by = delta.0.column(column);
                     (0..by.width()).for_each(|c| expected.column_mut(column).plane_mut(c)[row] += by.plane(c)[id]);
                 }
@@ -156,7 +156,7 @@ mod tests {
         }
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
             // SH degree 1 is dropped here, and the change of its coefficients with it.
-            let fewer = WithDelta::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, 0);
+            let fewer = SourceWithDeltas::new(Box::new(DemoScene::new(40, 3)), &delta, &no_trajectory, 0);
             assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
             let mut expected = Gaussians::zeros(ids.len(), 1);
             changed.open(ids.clone()).unwrap().read(1, Attributes::all(), &mut expected).unwrap();
@@ -167,7 +167,7 @@ mod tests {
         }
         let none = ParamDelta::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
-        let unchanged = WithDelta::new(Box::new(Scene::new(40, 3)), &none, &no_trajectory, NO_SH_LIMIT);
+        let unchanged = SourceWithDeltas::new(Box::new(DemoScene::new(40, 3)), &none, &no_trajectory, NO_SH_LIMIT);
         unchanged.open(Ids::Range(0..40)).unwrap().read(1, Attributes::all(), &mut untouched).unwrap();
         let mut expected = untouched.clone();
         plain.open(Ids::Range(0..40)).unwrap().read(1, Attributes::all(), &mut expected).unwrap();
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn columns_of_a_trajectory_delta_vary_in_time() {
-        let plain = Scene::new(30, 5);
+        let plain = DemoScene::new(30, 5);
         let keyframe = |scale: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.log_scale = AttributeValues::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
@@ -184,7 +184,7 @@ mod tests {
         };
         let (delta, trajectory) = (keyframe(0.5), TrajectoryDelta(vec![keyframe(0.0), keyframe(1.0), keyframe(-1.0)]));
         assert!(!plain.info().varying.contains(Attributes::LOG_SCALE));
-        let changed = WithDelta::new(Box::new(Scene::new(30, 5)), &delta, &trajectory, NO_SH_LIMIT);
+        let changed = SourceWithDeltas::new(Box::new(DemoScene::new(30, 5)), &delta, &trajectory, NO_SH_LIMIT);
         assert_eq!(changed.info().varying, plain.info().varying | Attributes::LOG_SCALE);
         let ids = [4, 29, 0];
         let mut reader = changed.open(Ids::List(&ids)).unwrap();

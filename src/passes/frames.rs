@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::BLOCK;
+use super::GAUSSIANS_PER_BLOCK;
 use super::parts::BlockSlices;
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
@@ -30,10 +30,10 @@ impl<'a> FrameReaders<'a> {
         wanted: &ReadPlan,
     ) -> Result<FrameReaders<'a>> {
         let count = ids.len();
-        let readers = (0..count.div_ceil(BLOCK))
+        let readers = (0..count.div_ceil(GAUSSIANS_PER_BLOCK))
             .into_par_iter()
             .map(|block| {
-                let rows = block * BLOCK..count.min((block + 1) * BLOCK);
+                let rows = block * GAUSSIANS_PER_BLOCK..count.min((block + 1) * GAUSSIANS_PER_BLOCK);
                 let ids = match &ids {
                     Ids::Range(range) => Ids::Range(range.start + rows.start..range.start + rows.end),
                     Ids::List(list) => Ids::List(&list[rows]),
@@ -47,7 +47,7 @@ impl<'a> FrameReaders<'a> {
     }
 
     /// Returns a buffer with space for the attributes of all Gaussians of these readers at one frame.
-    pub fn state(&self) -> Gaussians {
+    pub fn state_buffer(&self) -> Gaussians {
         Gaussians::zeros(self.count, self.sh_degree())
     }
 

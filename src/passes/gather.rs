@@ -1,10 +1,10 @@
 //! Reads the attributes of many Gaussians at one frame, in blocks of Gaussians on all threads. For several frames, use
-//! readers that stay open ([`super::FrameReaders`], [`super::States`]): they decode each tile of a container
+//! readers that stay open ([`super::FrameReaders`], [`super::FrameStates`]): they decode each tile of a container
 //! (consecutive Gaussians × frames) only once.
 
 use rayon::prelude::*;
 
-use super::BLOCK;
+use super::GAUSSIANS_PER_BLOCK;
 use super::frames::open_all;
 use super::parts::BlockSlices;
 use crate::error::{Error, Result};
@@ -23,7 +23,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Attribu
     let mut all = Gaussians::zeros(0, sh_degree);
     let parts = BlockSlices::split(&mut all, want, ids.len());
     let wanted = ReadPlan::new([frame]);
-    ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
+    ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
         || Gaussians::zeros(0, sh_degree),
         |block, (ids, parts)| {
             let mut reader = source.open(Ids::List(ids))?;

@@ -8,18 +8,18 @@ use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Frame source whose frames are in memory with all attributes. Its frame 0 is the first frame in memory.
-pub struct HeldFrames {
+pub struct FramesInMemory {
     info: SequenceInfo,
     constant: Gaussians,
     frames: Vec<Gaussians>,
 }
 
-impl HeldFrames {
+impl FramesInMemory {
     /// Creates a source of `count` Gaussians without any frame. `varying` names the attributes that vary in time;
     /// `constant` holds the values of all others.
     pub fn new(count: usize, sh_degree: usize, varying: Attributes, constant: Gaussians) -> Self {
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
-        HeldFrames { info, constant, frames: Vec::new() }
+        FramesInMemory { info, constant, frames: Vec::new() }
     }
 
     /// Adds the frame at time `time`. `state` holds all Gaussians; only its time-varying attributes are used.
@@ -51,7 +51,7 @@ impl HeldFrames {
     }
 }
 
-impl FrameSource for HeldFrames {
+impl FrameSource for FramesInMemory {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -69,7 +69,7 @@ impl FrameSource for HeldFrames {
 }
 
 struct HeldReader<'a> {
-    held: &'a HeldFrames,
+    held: &'a FramesInMemory,
     len: usize,
     /// Ranges of consecutive ids which together are the Gaussians to read, in the requested order.
     runs: Vec<Range<usize>>,

@@ -11,17 +11,20 @@ mod some_frames;
 mod states;
 mod tracks;
 
-pub use changed::WithDelta;
+pub use changed::SourceWithDeltas;
 pub use frames::FrameReaders;
 pub use gather::{BlockwiseReader, gather, gather_all};
-pub use held::HeldFrames;
+pub use held::FramesInMemory;
 pub use parts::BlockSlices;
-pub use pictures::{Batch, RenderedSource, VIEWS_PER_THREAD, ViewStates, show};
-pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, pixel_stride, spread, spread_over};
+pub use pictures::{BatchLimits, RenderedSource, VIEWS_PER_THREAD, ViewStates, for_each_view_batch};
+pub use sample::{
+    VIEWS_PER_FRAME, ViewSampler, frames_to_cover, pixel_stride, scoring_views, select_evenly,
+    select_evenly_over_frames,
+};
 pub use some_frames::SomeFrames;
-pub use states::States;
-pub use tracks::{TRACK_BLOCK, tracks};
+pub use states::FrameStates;
+pub use tracks::{TRACKS_PER_BLOCK, map_tracks};
 
 /// Number of Gaussians per unit of parallel work: their attributes at one frame and the sums computed from them fit
 /// into the processor's caches. No result depends on this number.
-pub const BLOCK: usize = 1024;
+pub const GAUSSIANS_PER_BLOCK: usize = 1024;

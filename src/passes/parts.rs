@@ -1,7 +1,7 @@
 //! Division of the Gaussians' attributes at a frame into slices, one for each block of Gaussians, so that threads can
 //! write blocks in parallel.
 
-use super::BLOCK;
+use super::GAUSSIANS_PER_BLOCK;
 use crate::model::{Attributes, Gaussians};
 
 /// Place where one block of Gaussians is written: a mutable slice for every component of every attribute, in order.
@@ -9,13 +9,14 @@ pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
     /// Resizes the attributes `want` of `state` to `count` Gaussians and divides them into slices, one set for each
-    /// block of [`BLOCK`] Gaussians.
+    /// block of [`GAUSSIANS_PER_BLOCK`] Gaussians.
     pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
-        let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
+        let mut parts: Vec<BlockSlices<'a>> =
+            (0..count.div_ceil(GAUSSIANS_PER_BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
             column.resize(count);
             for plane in column.planes_mut().chunks_exact_mut(count.max(1)) {
-                plane.chunks_mut(BLOCK).zip(&mut parts).for_each(|(part, block)| block.0.push(part));
+                plane.chunks_mut(GAUSSIANS_PER_BLOCK).zip(&mut parts).for_each(|(part, block)| block.0.push(part));
             }
         }
         parts

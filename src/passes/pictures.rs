@@ -53,28 +53,28 @@ impl<'a> RenderedSource<'a> {
 
 /// Maximum size of a batch of views.
 #[derive(Debug, Clone, Copy)]
-pub struct Batch {
+pub struct BatchLimits {
     /// Maximum number of different frames. For each of them, the Gaussians of every rendered source are in memory.
     pub frames: usize,
     /// Maximum number of views in a batch.
-    pub pictures: usize,
+    pub views: usize,
     /// Maximum number of frames that a reader keeps in memory of those that it decodes together.
     pub held: usize,
 }
 
-impl Batch {
+impl BatchLimits {
     /// Returns the batch size for many views that take little memory each: views of several frames together, to keep
     /// all threads busy.
-    fn many_views(limits: &Limits) -> Batch {
+    fn many_views(limits: &Limits) -> BatchLimits {
         let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
-        Batch { frames: limits.frames_together, pictures, held: limits.frames_held }
+        BatchLimits { frames: limits.frames_together, views: pictures, held: limits.max_kept_frames }
     }
 
     /// Returns the batch size for views whose renders stay in memory until the batch ends: one frame, one view per
     /// thread.
-    pub fn one_frame(limits: &Limits) -> Batch {
-        let pictures = rayon::current_num_threads().min(limits.pictures_together);
-        Batch { frames: 1, pictures, held: limits.frames_held }
+    pub fn one_frame(limits: &Limits) -> BatchLimits {
+        let pictures = rayon::current_num_threads().min(limits.views_together);
+        BatchLimits { frames: 1, views: pictures, held: limits.max_kept_frames }
     }
 
     /// Returns how many of the views at the start of `pictures` form a batch.
@@ -85,7 +85,7 @@ impl Batch {
             last = Some(picture.frame);
             frames <= self.frames.max(1)
         };
-        pictures.iter().take(self.pictures.max(1)).take_while(fits).count()
+        pictures.iter().take(self.views.max(1)).take_while(fits).count()
     }
 }
 
@@ -157,14 +157,14 @@ struct StateSlot<const S: usize> {
 ///
 /// # Errors
 /// Fails if a frame cannot be read or if `visit` fails.
-pub fn show<const S: usize>(
+pub fn for_each_view_batch<const S: usize>(
     subjects: [RenderedSource<'_>; S],
     cameras: &[Camera],
     pictures: &[FrameView],
-    max_batch: Batch,
+    max_batch: BatchLimits,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).holding(max_batch.held);
+    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).keeping_at_most(max_batch.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);
@@ -220,7 +220,7 @@ pub fn show<const S: usize>(
 /// Workers that accumulate results over views; at most one per thread works at a time.
 ///
 /// Memory per Gaussian: its reader; the attributes read, for each frame of a batch (at most 4 × threads views and
-/// [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::pictures_together`] workers.
+/// [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::views_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
     /// Workers that process no view at the moment.
@@ -237,7 +237,7 @@ impl<W: Send> Workers<W> {
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
-    pub(crate) fn show(
+    pub(crate) fn for_each_view(
         &mut self,
         subject: RenderedSource<'_>,
         cameras: &[Camera],
@@ -245,8 +245,8 @@ impl<W: Send> Workers<W> {
         new_worker: impl Fn() -> W + Sync,
         visit: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
     ) -> Result<()> {
-        let workers = rayon::current_num_threads().min(self.limits.pictures_together);
-        show([subject], cameras, pictures, Batch::many_views(&self.limits), |views| {
+        let workers = rayon::current_num_threads().min(self.limits.views_together);
+        for_each_view_batch([subject], cameras, pictures, BatchLimits::many_views(&self.limits), |views| {
             let next = AtomicUsize::new(0);
             (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
@@ -272,7 +272,7 @@ impl<W: Send> Workers<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::passes::gather_all;
 
     /// Returns the views 0 to `views` − 1 of every frame of `frames`.
@@ -283,16 +283,16 @@ mod tests {
 
     #[test]
     fn every_view_comes_once_with_its_state_for_any_batch_size() {
-        let scene = Scene::new(1500, 9);
+        let scene = DemoScene::new(1500, 9);
         let rig = scene.rig();
         let all = pictures(&[0, 2, 3, 7, 8], 3);
         let expected: Vec<Gaussians> =
             (0..9).map(|frame| gather_all(&scene, frame, Attributes::all()).unwrap()).collect();
         for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
             let mut seen = Vec::new();
-            let batch = Batch { frames, pictures: max_batch, held: 4 };
+            let batch = BatchLimits { frames, views: max_batch, held: 4 };
             let position = RenderedSource { source: &scene, ids: None, columns: Attributes::POSITION };
-            show([RenderedSource::all(&scene), position], &rig.cameras, &all, batch, |views| {
+            for_each_view_batch([RenderedSource::all(&scene), position], &rig.cameras, &all, batch, |views| {
                 assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
                 let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
                 assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
@@ -310,7 +310,7 @@ mod tests {
     }
 
     /// Scene whose Gaussians have features; a pixel's color is the direction of the ray through the pixel.
-    struct RayScene(Scene);
+    struct RayScene(DemoScene);
 
     impl FrameSource for RayScene {
         fn info(&self) -> &crate::model::SequenceInfo {
@@ -341,12 +341,12 @@ mod tests {
 
     #[test]
     fn features_are_decoded_along_the_ray_of_each_pixel() {
-        let scene = RayScene(Scene::new(200, 3));
+        let scene = RayScene(DemoScene::new(200, 3));
         let rig = scene.0.rig();
         let some: Vec<u32> = (0..200).collect();
-        let batch = Batch { frames: 2, pictures: 4, held: 4 };
+        let batch = BatchLimits { frames: 2, views: 4, held: 4 };
         let few = RenderedSource { source: &scene, ids: Some(Ids::List(&some)), columns: Attributes::all() };
-        show([RenderedSource::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
+        for_each_view_batch([RenderedSource::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
             for view in views {
                 let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
                 assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
@@ -368,7 +368,7 @@ mod tests {
 
     #[test]
     fn each_state_is_read_once_for_any_number_of_batches() {
-        let scene = Scene::new(300, 6);
+        let scene = DemoScene::new(300, 6);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.gseq");
         let none = Default::default();
@@ -377,9 +377,15 @@ mod tests {
         let rig = scene.rig();
         let reads = |views: u32| {
             let before = container.reads();
-            let batch = Batch { frames: 1, pictures: 2, held: usize::MAX };
-            show([RenderedSource::all(&container)], &rig.cameras, &pictures(&[1, 4], views), batch, |_| Ok(()))
-                .unwrap();
+            let batch = BatchLimits { frames: 1, views: 2, held: usize::MAX };
+            for_each_view_batch(
+                [RenderedSource::all(&container)],
+                &rig.cameras,
+                &pictures(&[1, 4], views),
+                batch,
+                |_| Ok(()),
+            )
+            .unwrap();
             container.reads() - before
         };
         assert_eq!(reads(5), reads(1));

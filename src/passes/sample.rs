@@ -21,14 +21,14 @@ pub fn pixel_stride(pixels: u64, wanted: f64) -> NonZeroU32 {
 
 /// Selection of every n-th frame and of every m-th view in it, for frames that arrive one by one.
 #[derive(Debug, Clone)]
-pub struct Sampler {
+pub struct ViewSampler {
     frame_stride: usize,
     view_stride: usize,
     /// Number of frames with views that have been passed so far.
     frames_with_views: usize,
 }
 
-impl Sampler {
+impl ViewSampler {
     /// Creates a selection with the strides `frame_stride` and `view_stride` of `scan`. Of the frames that have views,
     /// it takes the first and then every `frame_stride`-th. Of the views of such a frame, it takes every
     /// `view_stride`-th. The first view taken moves on from frame to frame, so that all views are used in turn.
@@ -37,12 +37,16 @@ impl Sampler {
     }
 
     fn with_strides(frame_stride: usize, view_stride: usize) -> Self {
-        Sampler { frame_stride, view_stride, frames_with_views: 0 }
+        ViewSampler { frame_stride, view_stride, frames_with_views: 0 }
     }
 
     /// Returns the selected views of the next frame. `frame` is its number; `views` lists its views as (view number,
     /// camera index).
-    pub fn next<'a>(&mut self, frame: usize, views: &'a [(u32, u32)]) -> impl Iterator<Item = FrameView> + use<'a> {
+    pub fn views_of_next_frame<'a>(
+        &mut self,
+        frame: usize,
+        views: &'a [(u32, u32)],
+    ) -> impl Iterator<Item = FrameView> + use<'a> {
         let first_view = self.frames_with_views / self.frame_stride;
         let is_taken = self.frames_with_views.is_multiple_of(self.frame_stride);
         self.frames_with_views += usize::from(!views.is_empty());
@@ -56,31 +60,31 @@ impl Sampler {
         let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
             let taken: Vec<(u32, u32)> =
-                self.next(frame, views).map(|picture| (picture.view, picture.camera)).collect();
-            left.push(1, &taken);
+                self.views_of_next_frame(frame, views).map(|picture| (picture.view, picture.camera)).collect();
+            left.push_frames(1, &taken);
         }
         left
     }
 }
 
 /// Returns the views of `schedule` that the scoring pass described by `scan` renders. The strides of `scan` select them
-/// (see [`Sampler`]). If these are more than the maximum `look_pictures`, as many as the maximum are kept, spread over
-/// at least `frames` frames if possible (see [`spread_over`]).
-pub fn looked_at(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
-    let left = Sampler::new(scan).thin(schedule);
-    if scan.look_pictures == 0 || left.pairs() <= scan.look_pictures {
+/// (see [`ViewSampler`]). If these are more than the maximum `look_pictures`, as many as the maximum are kept, spread over
+/// at least `frames` frames if possible (see [`select_evenly_over_frames`]).
+pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
+    let left = ViewSampler::new(scan).thin(schedule);
+    if scan.look_pictures == 0 || left.pair_count() <= scan.look_pictures {
         let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<FrameView> {
             views.iter().map(|&(view, camera)| FrameView { frame, view, camera }).collect()
         };
         return left.iter().enumerate().flat_map(of_frame).collect();
     }
-    spread_over(&left, scan.look_pictures, frames)
+    select_evenly_over_frames(&left, scan.look_pictures, frames)
 }
 
 /// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians that are ever alive are alive
 /// in one of them, provided that each is alive without a gap. `life` holds for each Gaussian the number of frames in
 /// which it is alive, out of `frames` frames.
-pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
+pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
     if lives.is_empty() {
         return 0;
@@ -90,19 +94,19 @@ pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
     frames.div_ceil(shortest as usize)
 }
 
-/// Selects at most `pictures` views as [`spread`] does. Takes them from at least `frames` frames if there are that many
+/// Selects at most `pictures` views as [`select_evenly`] does. Takes them from at least `frames` frames if there are that many
 /// views, but with at most [`VIEWS_PER_FRAME`] views of each frame.
-pub fn spread_over(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
-    spread(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
+pub fn select_evenly_over_frames(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
+    select_evenly(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }
 
 /// Selects at most `pictures` views, spread evenly over all frames and view numbers. Uses no more frames than are
 /// needed with `views` views of each (see [`VIEWS_PER_FRAME`]). Selects all views if `schedule` has no more than
 /// `pictures`.
-pub fn spread(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
+pub fn select_evenly(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
-    let pictures = pictures.min(schedule.pairs());
-    let of_frame = schedule.pairs().div_ceil(seen.max(1)).clamp(1, views.max(1));
+    let pictures = pictures.min(schedule.pair_count());
+    let of_frame = schedule.pair_count().div_ceil(seen.max(1)).clamp(1, views.max(1));
     let count = seen.min(pictures.div_ceil(of_frame));
     let mut selected = Vec::with_capacity(pictures);
     let mut frames = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty()).enumerate();
@@ -133,7 +137,7 @@ mod tests {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, view)).collect();
         let mut schedule = ViewSchedule::new(vec![camera; views as usize]);
-        schedule.push(frames, &of_frame);
+        schedule.push_frames(frames, &of_frame);
         schedule
     }
 
@@ -152,7 +156,7 @@ mod tests {
             (1, 400, 96, 3, (1, 96)),
             (7, 5, usize::MAX, 3, (7, 35)),
         ] {
-            let selected = spread(&schedule(frame_count, views), pictures, at_once);
+            let selected = select_evenly(&schedule(frame_count, views), pictures, at_once);
             assert_eq!(frames(&selected), expected.0, "{frame_count} frames of {views} views");
             assert_eq!(selected.len(), expected.1, "{frame_count} frames of {views} views");
             let order = |picture: &FrameView| (picture.frame, picture.view);
@@ -175,10 +179,10 @@ mod tests {
     fn frames_lie_in_the_middle_of_equal_parts() {
         // Every third frame has no views.
         let mut gaps = ViewSchedule::default();
-        (0..50).for_each(|frame| gaps.push(1, if frame % 3 == 0 { &[] } else { &[(0, 0), (1, 1)] }));
+        (0..50).for_each(|frame| gaps.push_frames(1, if frame % 3 == 0 { &[] } else { &[(0, 0), (1, 1)] }));
         let seen: Vec<usize> = (0..50).filter(|frame| frame % 3 > 0).collect();
         for count in [1, 2, 7, 16, 32, 33, 40] {
-            let selected: Vec<usize> = spread(&gaps, count, 1).iter().map(|picture| picture.frame).collect();
+            let selected: Vec<usize> = select_evenly(&gaps, count, 1).iter().map(|picture| picture.frame).collect();
             let parts = count.min(seen.len());
             let expected = (0..parts).map(|k| seen[(2 * k + 1) * seen.len() / (2 * parts)]);
             let mut frames = selected.clone();
@@ -193,11 +197,16 @@ mod tests {
         // Of the 300 Gaussians that are ever alive, three are alive for at most 5 frames and the others for at least
         // 12. One more is never alive.
         let life: Vec<u32> = [0, 1, 5, 5].into_iter().chain((0..297).map(|k| 12 + k)).collect();
-        assert_eq!((frames_to_see(&life, 300), frames_to_see(&[0, 0], 300), frames_to_see(&[300], 300)), (25, 0, 1));
-        let frame_count = |frames_at_least: usize| frames(&spread_over(&schedule(300, 18), 48, frames_at_least));
+        assert_eq!(
+            (frames_to_cover(&life, 300), frames_to_cover(&[0, 0], 300), frames_to_cover(&[300], 300)),
+            (25, 0, 1)
+        );
+        let frame_count =
+            |frames_at_least: usize| frames(&select_evenly_over_frames(&schedule(300, 18), 48, frames_at_least));
         assert_eq!([0, 1, 16, 17, 24, 25, 48, 300].map(frame_count), [16, 16, 16, 24, 24, 48, 48, 48]);
         // A Gaussian that is alive as long as 99% of the Gaussians are is alive in one of these frames.
-        let seen: Vec<usize> = spread_over(&schedule(300, 18), 48, 25).iter().map(|picture| picture.frame).collect();
+        let seen: Vec<usize> =
+            select_evenly_over_frames(&schedule(300, 18), 48, 25).iter().map(|picture| picture.frame).collect();
         assert!((0..=288).all(|birth| seen.iter().any(|frame| (birth..birth + 12).contains(frame))));
     }
 
@@ -207,7 +216,7 @@ mod tests {
             let view_stride = std::num::NonZeroU32::new(view_stride).unwrap();
             let scan =
                 recipe::ScanParams { look_pictures, view_stride, ..recipe::Recipe::preset("paper").unwrap().scan };
-            looked_at(&schedule(60, 12), &scan, 1)
+            scoring_views(&schedule(60, 12), &scan, 1)
         };
         assert_eq!(
             [(0, 1), (0, 4), (180, 4), (100, 1), (100, 4)].map(|(most, stride)| taken(most, stride).len()),
@@ -219,6 +228,6 @@ mod tests {
 
     #[test]
     fn empty_schedules_and_zero_views_select_nothing() {
-        assert!(spread(&schedule(3, 0), 96, 3).is_empty() && spread(&schedule(3, 2), 0, 3).is_empty());
+        assert!(select_evenly(&schedule(3, 0), 96, 3).is_empty() && select_evenly(&schedule(3, 2), 0, 3).is_empty());
     }
 }

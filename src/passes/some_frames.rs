@@ -25,7 +25,7 @@ impl<'a> SomeFrames<'a> {
         chosen.cameras.clone_from(&schedule.cameras);
         for (frame, views) in schedule.iter().enumerate() {
             if self.frames.binary_search(&frame).is_ok() {
-                chosen.push(1, views);
+                chosen.push_frames(1, views);
             }
         }
         chosen

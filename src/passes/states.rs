@@ -9,7 +9,7 @@ use crate::source::{BlockReader, FrameSource, ReadPlan};
 /// read only once.
 ///
 /// Memory: the attributes at one frame, and the reader (see [`open_all`]).
-pub struct States<'a> {
+pub struct FrameStates<'a> {
     reader: Box<dyn BlockReader + 'a>,
     varying: Attributes,
     /// Attributes that the next read must fill; those that do not vary in time are removed after the first read.
@@ -17,14 +17,14 @@ pub struct States<'a> {
     current: Gaussians,
 }
 
-impl<'a> States<'a> {
+impl<'a> FrameStates<'a> {
     /// Opens a reader of `source` for the frames that `wanted` names.
     ///
     /// # Errors
     /// Fails if the source cannot be opened.
-    pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<States<'a>> {
+    pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<FrameStates<'a>> {
         let info = source.info();
-        Ok(States {
+        Ok(FrameStates {
             reader: open_all(source, Attributes::all(), wanted)?,
             varying: info.varying,
             unread: Attributes::all(),
@@ -33,7 +33,7 @@ impl<'a> States<'a> {
     }
 
     /// Reads and returns the Gaussians at frame `frame`.
-    pub fn at(&mut self, frame: usize) -> Result<&Gaussians> {
+    pub fn read(&mut self, frame: usize) -> Result<&Gaussians> {
         self.reader.read(frame, self.unread, &mut self.current)?;
         self.unread = self.varying;
         Ok(&self.current)
@@ -56,17 +56,17 @@ mod tests {
     fn states_equal_single_reads_with_constant_tiles_read_once() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.gseq");
-        let scene = crate::diagnostics::demo_scene::Scene::new(1500, 40);
+        let scene = crate::diagnostics::demo_scene::DemoScene::new(1500, 40);
         write_container(&scene, &path, gseq::Compression::Zstd(1), Default::default(), |_| ()).unwrap();
         let container = Container::open(&path).unwrap();
         let constant = Attributes::all().difference(container.info().varying);
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
-        let mut states = States::open(&container, &ReadPlan::new(frames)).unwrap();
+        let mut states = FrameStates::open(&container, &ReadPlan::new(frames)).unwrap();
         assert!(states.current().is_empty());
         for frame in frames {
             let expected = gather_all(&scene, frame, Attributes::all()).unwrap();
-            assert!(*states.at(frame).unwrap() == expected && *states.current() == expected, "frame {frame}");
+            assert!(*states.read(frame).unwrap() == expected && *states.current() == expected, "frame {frame}");
         }
         // The file has two blocks of Gaussians. Each attribute that varies has one tile per block of Gaussians and
         // block of frames.

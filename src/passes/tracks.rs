@@ -12,13 +12,13 @@ use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
 
 /// Number of Gaussians whose attributes at all frames a thread holds in memory at once.
-pub const TRACK_BLOCK: usize = 64;
+pub const TRACKS_PER_BLOCK: usize = 64;
 
 /// Calls `make` with the trajectory of every Gaussian, which is its attributes at every frame, and returns the results
 /// in the order of the Gaussians. `times` holds the times of the frames, in any unit.
 ///
-/// Memory: the results; on every thread a reader and the attributes of [`TRACK_BLOCK`] Gaussians at all frames.
-pub fn tracks<R: Send>(
+/// Memory: the results; on every thread a reader and the attributes of [`TRACKS_PER_BLOCK`] Gaussians at all frames.
+pub fn map_tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
     progress: &Progress,
@@ -39,9 +39,9 @@ pub fn tracks<R: Send>(
         progress.advance((ids.len() * states.len()) as u64);
         Ok((0..ids.len()).map(|row| make(&FittedTrack::from_states(times, &states, row))).collect())
     };
-    let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACK_BLOCK))
+    let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKS_PER_BLOCK))
         .into_par_iter()
-        .map(|block| tracks_of_block(block * TRACK_BLOCK..info.count.min((block + 1) * TRACK_BLOCK)))
+        .map(|block| tracks_of_block(block * TRACKS_PER_BLOCK..info.count.min((block + 1) * TRACKS_PER_BLOCK)))
         .collect::<Result<_>>()?;
     Ok(blocks.into_iter().flatten().collect())
 }
@@ -49,17 +49,17 @@ pub fn tracks<R: Send>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::opacity;
     use crate::passes::gather_all;
 
     #[test]
     fn tracks_equal_the_frames_for_any_thread_count() {
-        let scene = Scene::new(3 * TRACK_BLOCK + 5, 7);
+        let scene = DemoScene::new(3 * TRACKS_PER_BLOCK + 5, 7);
         let progress = Progress::IGNORED;
         let all = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()
+            pool.install(|| map_tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()
         };
         let (one, three) = (all(1), all(3));
         assert_eq!(one.len(), scene.info().count);

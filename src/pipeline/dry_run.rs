@@ -13,12 +13,12 @@ use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::Forecast;
 use crate::journal::records::LeftOut;
-use crate::memory_plan::{Budget, Plan, Verbosity, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::MeasuredOnArrival;
-use crate::pipeline::stages::write::beside_names;
+use crate::pipeline::stages::write::companion_names;
 use crate::pipeline::throughput::forecast;
 use crate::scene::{InputOptions, open_scene};
 
@@ -69,7 +69,7 @@ pub struct DryRunReport {
 /// # Errors
 /// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
 /// arrived completely.
-pub fn foresee(request: &Request) -> Result<DryRunReport> {
+pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     if request.input.is_stream() {
         return Err(Error::usage(
             "--dry-run: the cost of a stream is known only after it has ended\n  give a file or folder; --explain says \
@@ -83,13 +83,18 @@ pub fn foresee(request: &Request) -> Result<DryRunReport> {
     run.check_target(&request.input.path)?;
     run.check(&scene)?;
     let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
-    let plan = Plan::fit(scene.workload(), Budget { tell: Verbosity::Nothing, ..input.memory }, &input.events, needs)?;
-    scene.follow(&plan);
+    let plan = MemoryPlan::fit_budget(
+        scene.workload(),
+        Budget { tell: Verbosity::Nothing, ..input.memory },
+        &input.events,
+        needs,
+    )?;
+    scene.apply_plan(&plan);
     let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
     let mut journal = Journal::default();
     run.stages.record_left_out(&scene.workload(), &scene.limits, &mut journal);
     let info = scene.source().info();
-    let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
+    let gaussians = request.target.map(|target| target.resolve_count(outlook.gaussians)).transpose()?;
     let output = request.output.to_string_lossy().into_owned();
     let output_kind = run.output.as_ref().map_or(outlook.own_output, |output| output.kind);
     Ok(DryRunReport {
@@ -104,7 +109,7 @@ pub fn foresee(request: &Request) -> Result<DryRunReport> {
         cameras: CameraSummary::from_scene(&scene),
         gaussians,
         size_by: size_by(request),
-        would_write: std::iter::once(output.clone()).chain(beside_names(&request.output, output_kind)).collect(),
+        would_write: std::iter::once(output.clone()).chain(companion_names(&request.output, output_kind)).collect(),
         output,
         output_kind,
         counts: run.counts_text(),

@@ -19,24 +19,24 @@ mod summary_text;
 pub(crate) mod throughput;
 pub mod time_estimate;
 
-pub use dry_run::foresee;
+pub use dry_run::dry_run;
 pub use open::open_to_measure;
 pub use plan::RunPlan;
 pub use record::{RecipeRecord, RunOptions};
-pub use request::{Goal, Only, Quality, Request, Target};
+pub use request::{Goal, PruneOrMerge, Quality, Request, Target};
 
 use crate::cache::Completion;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
-use crate::memory_plan::{Budget, Verbosity, Workload, seconds};
+use crate::memory_plan::{Budget, Verbosity, Workload, stage_seconds};
 use crate::model::NO_SH_LIMIT;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::{Recipe, ShDegreeRule};
 use crate::scene::{InputOptions, Scene};
 use planning::InputMeta;
 use stage::{Measured, Phase, RunState};
-use stages::measure::Measure;
+use stages::measure::MeasureStages;
 use summary::{InputSummary, Summary};
 
 /// Compresses the input of `request`, writes the result and returns the summary of the run.
@@ -74,7 +74,7 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
 ///
 /// # Errors
 /// Fails if the input cannot be opened. Apart from opening the input nothing is read.
-pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
+pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |input, work: &Workload| RunPlan::within_memory(request, input, work);
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
     let input = InputOptions { work: None, memory, ..request.input.clone() };
@@ -88,7 +88,7 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
 /// Fails if the budget is too small for the request, and where [`RunPlan::new`] fails.
 pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<()> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
-    scene.keep_to(request.input.memory, |work, limits| plan.estimates(work, limits))
+    scene.plan_memory(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
 /// Measures the statistics of a scene, scores its Gaussians and selects the survivors (Gaussians that are not removed)
@@ -97,7 +97,7 @@ pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<
 /// # Errors
 /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
 pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Result<Scored> {
-    Measure::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
+    MeasureStages::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
 /// Runs the stages of `plan`, one after the other. `arrived` holds statistics that were computed while a stream
@@ -111,9 +111,10 @@ fn run_stages(
 ) -> Result<(Summary, Vec<Option<u32>>)> {
     plan.check(scene)?;
     journal.notes.extend(scene.notes.iter().cloned());
-    journal.whole = scene.whole()?;
-    let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::kinds).unwrap_or_default());
-    let _numbered = scene.events.begin_run(&seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
+    journal.whole = scene.full_read()?;
+    let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default());
+    let _numbered =
+        scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
     let input = InputSummary::from_scene(scene)?.without_folders();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let sh_degree = match request.recipe.bands.bands {
@@ -132,7 +133,7 @@ fn run_stages(
     }
     let scored = run.scored()?;
     // An empty input may give an empty output; losing every Gaussian of a non-empty input is an error.
-    if run.result.is_empty() && scored.count() > 0 {
+    if run.result.is_empty() && scored.gaussian_count() > 0 {
         return Err(nothing_left(scene, &scored));
     }
     run.journal.notes.extend(run.result.proxies.notes.iter().cloned());
@@ -154,7 +155,7 @@ fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journ
 
 /// Returns the error for a result without any Gaussian, which no renderer could show.
 fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
-    let all = scored.count();
+    let all = scored.gaussian_count();
     let dropped = scored.selection.counts.forced_drop;
     let found = match dropped {
         0 => format!("none of {all}"),
@@ -175,7 +176,7 @@ pub(crate) mod tests {
 
     /// Writes a small dynamic demo scene with cameras and opens it.
     pub(crate) fn scene(folder: &std::path::Path) -> Scene {
-        let made = demo_scene::Scene::new(1500, 6);
+        let made = demo_scene::DemoScene::new(1500, 6);
         let path = folder.join("scene.gseq");
         write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
         let input = Box::new(Container::open(&path).unwrap());

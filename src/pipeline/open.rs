@@ -16,17 +16,17 @@ use glam::DVec3;
 use crate::error::Result;
 use crate::files::cameras;
 use crate::files::frame_stream::FrameStream;
-use crate::journal::{Clock, Journal};
-use crate::memory_plan::{Budget, Plan, Verbosity, Workload, size};
+use crate::journal::{Journal, Stopwatch};
+use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload, format_bytes};
 use crate::model::RobustBox;
 use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
-use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frame_block};
+use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
 use crate::models::trajectories::DEFAULT_OUTPUT;
-use crate::passes::{HeldFrames, Sampler};
+use crate::passes::{FramesInMemory, ViewSampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
-use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::stages::quality;
 use crate::pipeline::throughput::forecast;
 use crate::progress::Message;
@@ -34,7 +34,7 @@ use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
     FrameQuota, InputOptions, OpenedInput, Scene, from_input, is_linked, link_stream, load_cameras, open_scene,
-    open_stream, receiving,
+    open_stream, receiving_estimate,
 };
 use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
@@ -51,14 +51,14 @@ pub fn open_to_measure(
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
     journal: &mut Journal,
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
-    let start = Clock::start();
+    let start = Stopwatch::start();
     let mut scene = if options.is_stream() {
-        let normalized = cameras::Clock::Normalized;
+        let normalized = cameras::TimeConvention::Normalized;
         let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalized, None)?;
         let stream = open_stream(options)?;
         if !is_linked(stream.header(), options) {
             let found = receive_measured(stream, rig, options, plan, journal)?;
-            journal.opened("receive", start, found.0.source().info().count, Reads::default());
+            journal.record_opening("receive", start, found.0.source().info().count, Reads::default());
             return Ok(found);
         }
         from_input(link_stream(stream, options, rig)?, options)?
@@ -67,20 +67,21 @@ pub fn open_to_measure(
     };
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     scene.add_outside_views(stages.measure.scan.recipe.outside);
-    let plan =
-        Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
-    scene.follow(&plan);
+    let plan = MemoryPlan::fit_budget(scene.workload(), options.memory, &options.events, |work, limits| {
+        stages.estimates(work, limits)
+    })?;
+    scene.apply_plan(&plan);
     // Reads of the calibration of the time forecast are not part of the memory plan, so reads are counted before it.
     let reads = scene.source().reads();
     send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
-    journal.opened("read", start, scene.source().info().count, reads);
+    journal.record_opening("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
 /// Sends the plan of the run and the time forecast as messages, if the user asked for them.
 fn send_forecast(
     scene: &mut Scene,
-    plan: &Plan,
+    plan: &MemoryPlan,
     stages: &RunPlan,
     measured: MeasuredOnArrival,
     options: &InputOptions,
@@ -113,17 +114,17 @@ fn receive_measured(
     let has_cameras = loaded.is_some();
     let count = stream.header().count;
     let assumed_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
-    let block = frame_block(stream.header());
+    let block = frames_per_tile(stream.header());
     let header = *stream.header();
     let counting = |frames| Workload::from_stream_header(&header, block, &assumed_rig, frames);
     let work = counting(0);
     let mut stages = plan(InputMeta { gaussians: count, has_cameras, own_output: DEFAULT_OUTPUT }, &work)?;
-    let Measure { scan, visible, .. } = &stages.measure;
+    let MeasureStages { scan, visible, .. } = &stages.measure;
     let visible = visible.as_ref().filter(|visible| visible.can_render_on_arrival());
     let held = (block + PREFETCH_FRAMES) as u64;
     let fit = |tell: Verbosity, measuring: Option<bool>| {
-        Plan::fit(work, Budget { tell, ..options.memory }, &options.events, |work, limits| {
-            let mut all = vec![receiving(work, limits, held, measuring, 0)];
+        MemoryPlan::fit_budget(work, Budget { tell, ..options.memory }, &options.events, |work, limits| {
+            let mut all = vec![receiving_estimate(work, limits, held, measuring, 0)];
             all.extend(stages.estimates(work, limits));
             all
         })
@@ -132,22 +133,24 @@ fn receive_measured(
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
-        Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
+        MemoryPlan::closest(work, budget, |work, _| vec![receiving_estimate(work, &limits, held, measuring, frames)])
+            .peak_bytes()
     };
     let mut quota = FrameQuota::new(options.memory, |budget, frames| {
-        let later = Plan::closest(counting(frames), budget, |work, limits| stages.required_estimates(work, limits));
-        later.peak().max(receive(budget, None, frames))
+        let later =
+            MemoryPlan::closest(counting(frames), budget, |work, limits| stages.required_estimates(work, limits));
+        later.peak_bytes().max(receive(budget, None, frames))
     });
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
-    announce_limits(options, memory.peak(), quota.most, to_measure);
+    announce_limits(options, memory.peak_bytes(), quota.most, to_measure);
     // Without cameras the virtual rig is placed around the first frame; the plan of the scan follows from the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
         let _ = rig.set(loaded);
     }
     let mut measuring: Option<Measuring<'_>> = None;
-    let streamed = ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| {
+    let streamed = ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| {
         quota.admit(held.len())?;
         if quota.arrived() > to_measure {
             measuring = None;
@@ -157,7 +160,7 @@ fn receive_measured(
             Some(measuring) => measuring,
             none if measures => {
                 let rig: &Rig = rig.get_or_init(|| rig_around(held));
-                let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&scan.recipe, &rig.cameras));
+                let plan = plan_of_scan.get_or_init(|| ScanPlan::for_arriving_frames(&scan.recipe, &rig.cameras));
                 let seen = visible.map(|_| RunningContribution::new(count, scan.recipe.pixel_stride, memory.limits));
                 none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, seen))
             }
@@ -170,13 +173,13 @@ fn receive_measured(
     let opened = OpenedInput { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = from_input(opened, options)?;
     // The number of frames is known now.
-    let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
-    if !Plan::fits(scene.workload(), counted, |work, limits| stages.estimates(work, limits)) {
+    let (now, counted) = (scene.workload(), Budget { tell: Verbosity::Nothing, ..options.memory });
+    if !MemoryPlan::fits_budget(now, counted, |work, limits| stages.estimates(work, limits)) {
         stages.stages.remove_optional();
         quality::leave_out(&mut stages.stages);
     }
-    let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
-    scene.follow(&later);
+    let later = MemoryPlan::fit_budget(now, counted, &options.events, |work, limits| stages.estimates(work, limits))?;
+    scene.apply_plan(&later);
     if measures && measuring.is_none() && frames_arrived > 0 {
         let note = format!(
             "statistics were taken from the packed frames, not as they arrived: memory suffices \
@@ -189,7 +192,7 @@ fn receive_measured(
         None => None,
     };
     scene.add_outside_views(stages.measure.scan.recipe.outside);
-    let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
+    let measured = arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
 }
@@ -200,7 +203,7 @@ fn receive_measured(
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
-            format!("memory: at most {}; the number of frames is unknown until the stream ends", size(peak))
+            format!("memory: at most {}; the number of frames is unknown until the stream ends", format_bytes(peak))
         }
         Verbosity::Plan => {
             format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive")
@@ -212,13 +215,13 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
 
 /// Returns the statistics that were computed while the frames arrived. Returns `None`, and adds a note to the scene, if
 /// an assumption about the times of the stream proved wrong or Gaussians have to be dropped.
-fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Scene) -> Result<Option<Measured>> {
+fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
         None => {
             let found = measuring.finish(&complete);
             // The frames were measured with all Gaussians, before some of them proved to have NaN or infinity.
-            match measure.score.absent(&found.scanned.rows).is_empty() {
+            match measure.score.absent_ids(&found.scanned.rows).is_empty() {
                 true => Ok(found),
                 false => Err("Gaussians with NaN or infinity are dropped from all frames"),
             }
@@ -236,9 +239,9 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Sce
 }
 
 /// Returns a virtual rig (cameras placed by the program) around the first of the frames `held` in memory.
-fn rig_around(held: &HeldFrames) -> Rig {
+fn rig_around(held: &FramesInMemory) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
-    cameras::virtual_rig(bounds.middle, bounds.extent())
+    cameras::virtual_rig(bounds.median, bounds.extent())
 }
 
 /// Running statistics of the frames of a stream received so far.
@@ -249,7 +252,7 @@ struct Measuring<'a> {
     /// Views of the frames received so far, under the assumption that views have exactly the times of frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
-    seen: Option<(Sampler, RunningContribution)>,
+    seen: Option<(ViewSampler, RunningContribution)>,
 }
 
 impl<'a> Measuring<'a> {
@@ -267,19 +270,20 @@ impl<'a> Measuring<'a> {
             assumed: AssumedTimes::new(rig, split),
             schedule: ViewSchedule::new(rig.cameras.clone()),
             scan: RunningScan::new(count, plan),
-            seen: seen.map(|seen| (Sampler::new(scan), seen)),
+            seen: seen.map(|seen| (ViewSampler::new(scan), seen)),
         }
     }
 
-    fn add(&mut self, held: &HeldFrames) -> Result<()> {
+    fn add(&mut self, held: &FramesInMemory) -> Result<()> {
         let new: Vec<Vec<(u32, u32)>> = held.info().times.iter().map(|&time| self.assumed.at(time)).collect();
-        new.iter().for_each(|views| self.schedule.push(1, views));
+        new.iter().for_each(|views| self.schedule.push_frames(1, views));
         let cameras: Vec<Vec<&Camera>> =
             new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
         self.scan.add(held, &cameras)?;
         if let Some((sampler, seen)) = &mut self.seen {
             let new = new.iter().enumerate();
-            let pictures: Vec<FrameView> = new.flat_map(|(frame, views)| sampler.next(frame, views)).collect();
+            let pictures: Vec<FrameView> =
+                new.flat_map(|(frame, views)| sampler.views_of_next_frame(frame, views)).collect();
             seen.add(held, self.cameras, &pictures, || ())?;
         }
         Ok(())
@@ -287,14 +291,14 @@ impl<'a> Measuring<'a> {
 
     /// Returns a description of the assumption about the stream that proved wrong, if any.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
-        if !complete.finishes(self.plan) {
+        if !complete.can_finish(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }
         (self.schedule != scene.schedule).then_some("the cameras' times are not exactly those of the frames")
     }
 
     fn finish(self, complete: &ScanPlan) -> Measured {
-        Measured { scanned: self.scan.finish(complete), seen: self.seen.map(|(_, seen)| seen.finish()) }
+        Measured { scanned: self.scan.finish(complete), visible_contribution: self.seen.map(|(_, seen)| seen.finish()) }
     }
 }
 

@@ -5,18 +5,18 @@ use std::path::Path;
 
 use super::ids::parse_ids;
 use super::planning::{InputMeta, MemoryFallback, Planning};
-use super::request::{Goal, Only, Quality, Request, decibels};
+use super::request::{Goal, PruneOrMerge, Quality, Request, decibels};
 use super::search::SearchStage;
 use super::stage::{CountPlan, EstimateInput, MeasuredOnArrival, Phase, Stage, StageList};
 use super::stages::STAGES;
-use super::stages::measure::Measure;
+use super::stages::measure::MeasureStages;
 use super::stages::write::WriteStage;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::memory_plan::{Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
-use crate::pruning::visible::Visible;
+use crate::pruning::visible::VisibilityStage;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
@@ -25,7 +25,7 @@ pub struct RunPlan {
     /// Stages in the order in which they run, and the omitted stages.
     pub(super) stages: StageList,
     /// Stages that compute statistics. A stream is measured by them while it arrives.
-    pub measure: Measure,
+    pub measure: MeasureStages,
     /// Stage that writes the result; `None` if the run only measures and scores.
     pub output: Option<WriteStage>,
     /// Search that repeats the stages of [`Phase::Reduce`] with different numbers of Gaussians until a requested
@@ -50,7 +50,7 @@ impl RunPlan {
     }
 
     /// Returns the plan of a run that only measures and scores, with the stages `measure`.
-    pub fn to_measure(measure: Measure, input: InputMeta) -> RunPlan {
+    pub fn measure_only(measure: MeasureStages, input: InputMeta) -> RunPlan {
         let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
         plan.stages.add(Phase::Rank, measure);
         plan
@@ -65,8 +65,9 @@ impl RunPlan {
     /// # Errors
     /// Fails where [`RunPlan::new`] fails.
     pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
-        let fits =
-            |plan: &RunPlan| Plan::fits(*work, request.input.memory, |work, limits| plan.estimates(work, limits));
+        let fits = |plan: &RunPlan| {
+            MemoryPlan::fits_budget(*work, request.input.memory, |work, limits| plan.estimates(work, limits))
+        };
         let plan = RunPlan::refining_within_memory(request, input, work, fits)?;
         let with_quality = RunPlan::with_fallback(request, input, plan.fallback, true)?;
         Ok(if fits(&with_quality) { with_quality } else { plan })
@@ -80,7 +81,8 @@ impl RunPlan {
         fits: impl Fn(&RunPlan) -> bool,
     ) -> Result<RunPlan> {
         let with = |fallback| RunPlan::with_fallback(request, input, fallback, false);
-        let least = |plan: &RunPlan| Plan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak();
+        let least =
+            |plan: &RunPlan| MemoryPlan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak_bytes();
         let full_plan = with(MemoryFallback::Nothing)?;
         if full_plan.refine.is_none() || fits(&full_plan) {
             return Ok(full_plan);
@@ -99,7 +101,7 @@ impl RunPlan {
         Ok(if fits(&unrefined) { unrefined } else { full_plan })
     }
 
-    fn empty(measure: Measure, gaussians: usize) -> RunPlan {
+    fn empty(measure: MeasureStages, gaussians: usize) -> RunPlan {
         RunPlan {
             stages: StageList::default(),
             measure,
@@ -120,14 +122,14 @@ impl RunPlan {
         measures_quality: bool,
     ) -> Result<RunPlan> {
         let Request { recipe, only, .. } = request;
-        let target = request.target.map(|target| target.count(input.gaussians)).transpose()?;
+        let target = request.target.map(|target| target.resolve_count(input.gaussians)).transpose()?;
         recipe.validate().map_err(Error::usage)?;
         let output = checked_output(request, input.own_output)?;
         let ids = |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, input.gaussians));
         let user =
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
-        let prunes = *only != Only::Merge;
-        let renders_views = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
+        let prunes = *only != PruneOrMerge::Merge;
+        let renders_views = VisibilityStage::from_recipe(&recipe.scan, input.has_cameras).is_some();
         let mut planning = Planning {
             request,
             input,
@@ -141,7 +143,7 @@ impl RunPlan {
             measures_quality,
             fallback,
         };
-        let refine = RefineStage::from_recipe(recipe, planning.part(), planning.prunes_by_views());
+        let refine = RefineStage::from_recipe(recipe, planning.target_fraction(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
             MemoryFallback::ConstantInTime { .. } => Some(refine.with_constant_deltas()),
@@ -150,15 +152,16 @@ impl RunPlan {
         });
         // For the same number of Gaussians, refinement keeps more quality than merging. Prune steps of refinement rank
         // anew, so the order does not matter.
-        let prunes_alone = *only == Only::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
+        let prunes_alone =
+            *only == PruneOrMerge::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
         planning.merges = !prunes_alone && !recipe.merge.passes.is_empty();
 
-        let mut plan = RunPlan::empty(Measure::from_planning(&planning), input.gaussians);
+        let mut plan = RunPlan::empty(MeasureStages::from_planning(&planning), input.gaussians);
         plan.search = SearchStage::from_planning(&planning);
         plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
         plan.stages.counts = CountPlan {
-            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::starts_at),
+            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::start_fraction),
             searches: plan.search.is_some(),
         };
         (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);
@@ -242,7 +245,7 @@ impl RunPlan {
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
-        let left_out = self.stages.left_out();
+        let left_out = self.stages.omitted_stages_text();
         let lines = parameters.chain(search).chain(left_out).map(|line| format!("\n  {line}"));
         self.counts_text() + &lines.collect::<String>()
     }
@@ -274,7 +277,7 @@ impl RunPlan {
 /// Fails if neither the name of the output nor an option tells its kind, or if options exclude each other.
 fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
-    if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
+    if goal.is_some() && (request.only == PruneOrMerge::Merge || request.target.is_some()) {
         return Err(Error::usage(
             "a quality or a size on disk is reached by pruning: it cannot be combined with --merge-only or a \
              target count or ratio",
@@ -336,16 +339,19 @@ mod tests {
     #[test]
     fn plan_fits_every_budget_down_to_the_smallest() {
         for preset in ["default", "strong"] {
-            let least = Plan::closest(work(200_000), 1, all_estimates(preset)).peak();
+            let least = MemoryPlan::closest(work(200_000), 1, all_estimates(preset)).peak_bytes();
             let mut before = 0;
             for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
-                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, all_estimates(preset)).unwrap();
-                assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
-                before = plan.peak();
+                let plan =
+                    MemoryPlan::fit_budget(work(200_000), budget(bytes), &Events::IGNORED, all_estimates(preset))
+                        .unwrap();
+                assert!((before..=bytes).contains(&plan.peak_bytes()), "{bytes}: {}", plan.text());
+                before = plan.peak_bytes();
             }
-            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, all_estimates(preset))
-                .unwrap_err()
-                .to_string();
+            let message =
+                MemoryPlan::fit_budget(work(200_000), budget(least - 1), &Events::IGNORED, all_estimates(preset))
+                    .unwrap_err()
+                    .to_string();
             assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
         }
     }
@@ -376,7 +382,7 @@ mod tests {
             | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
             MemoryFallback::Nothing => 0,
         };
-        let full_bytes = Plan::closest(work, 1, all_estimates("default")).peak();
+        let full_bytes = MemoryPlan::closest(work, 1, all_estimates("default")).peak_bytes();
         assert_eq!(within(full_bytes).0, MemoryFallback::Nothing);
         let (spared, degree, named, none) = within(full_bytes - 1);
         assert_eq!(
@@ -404,12 +410,12 @@ mod tests {
 
     #[test]
     fn memory_is_linear_in_gaussians_and_constant_in_frames() {
-        let least = |work: Workload| Plan::closest(work, 1, all_estimates("default"));
-        let peaks = [100_000, 1_000_000, 1_900_000].map(|count| least(work(count)).peak());
+        let least = |work: Workload| MemoryPlan::closest(work, 1, all_estimates("default"));
+        let peaks = [100_000, 1_000_000, 1_900_000].map(|count| least(work(count)).peak_bytes());
         let (first, second) = (peaks[1] - peaks[0], peaks[2] - peaks[1]);
         assert!(first.abs_diff(second) <= first / 1000, "not linear: {peaks:?}");
         let (few, longer) = (least(work(100_000)), least(Workload { frames: 6000, ..work(100_000) }));
-        assert!(longer.peak() as f64 / few.peak() as f64 <= 1.05, "{} {}", longer.text(), few.text());
+        assert!(longer.peak_bytes() as f64 / few.peak_bytes() as f64 <= 1.05, "{} {}", longer.text(), few.text());
     }
 
     #[test]
@@ -432,7 +438,10 @@ mod tests {
             let target = ratio.map(Target::Ratio);
             let request = Request { target, goal, ..request(recipe) };
             let plan = RunPlan::new(&request, INPUT).unwrap();
-            let after = [plan.stages.counts.after_ranking(100, 1000), plan.stages.counts.before_refinement(100, 1000)];
+            let after = [
+                plan.stages.counts.count_after_ranking(100, 1000),
+                plan.stages.counts.count_before_refinement(100, 1000),
+            ];
             (after, plan.text())
         };
         let default = || Recipe::preset("default").unwrap();
@@ -443,12 +452,12 @@ mod tests {
             "{text}"
         );
         assert!(text.contains("\n  refine: ") && text.contains("\n  left out: merging"), "{text}");
-        let (unrefined, text) = counts(default().unrefined(), Some(0.1), None);
+        let (unrefined, text) = counts(default().without_refinement(), Some(0.1), None);
         assert_eq!(unrefined, [100, 100]);
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
         // A search ranks only once, down to the smallest number of Gaussians that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
         assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
-        assert_eq!(counts(default().unrefined(), None, psnr()).0, [20, 100]);
+        assert_eq!(counts(default().without_refinement(), None, psnr()).0, [20, 100]);
     }
 }

@@ -57,7 +57,7 @@ pub struct Planning<'a> {
 
 impl Planning<'_> {
     /// Returns the requested number of Gaussians as a fraction of the input's, if a target was requested.
-    pub fn part(&self) -> Option<f64> {
+    pub fn target_fraction(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 

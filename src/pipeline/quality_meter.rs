@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result};
 use crate::metrics::{decibels, psnr};
 use crate::model::{Camera, FrameView};
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::refinement::targets::{Targets, mean_square};
 use crate::render::render;
 use crate::scene::Scene;
@@ -63,28 +63,34 @@ impl<'a> QualityMeter<'a> {
         let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
         let pictures: Vec<FrameView> = places.iter().map(|&k| self.pictures[k].0).collect();
         let mut found = Vec::with_capacity(pictures.len());
-        show([RenderedSource::all(source)], self.cameras, &pictures, Batch::one_frame(&self.scene.limits), |views| {
-            let first = found.len();
-            let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
-                match &self.comparison {
-                    QualityReference::Photographs(photographs) => {
-                        let picture = view.render(0, background);
-                        Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
+        for_each_view_batch(
+            [RenderedSource::all(source)],
+            self.cameras,
+            &pictures,
+            BatchLimits::one_frame(&self.scene.limits),
+            |views| {
+                let first = found.len();
+                let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
+                    match &self.comparison {
+                        QualityReference::Photographs(photographs) => {
+                            let picture = view.render(0, background);
+                            Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
+                        }
+                        QualityReference::Original(targets, numbers) => {
+                            // Must be rendered in the same way as the targets.
+                            let picture = render(view.states[0], view.camera, background);
+                            Ok(decibels(mean_square(
+                                &picture,
+                                &targets.values(numbers[places[first + place]], targets.stride())?,
+                            )))
+                        }
                     }
-                    QualityReference::Original(targets, numbers) => {
-                        // Must be rendered in the same way as the targets.
-                        let picture = render(view.states[0], view.camera, background);
-                        Ok(decibels(mean_square(
-                            &picture,
-                            &targets.values(numbers[places[first + place]], targets.stride())?,
-                        )))
-                    }
-                }
-            };
-            let of_batch: Vec<f64> = views.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
-            found.extend(of_batch);
-            Ok(())
-        })?;
+                };
+                let of_batch: Vec<f64> = views.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
+                found.extend(of_batch);
+                Ok(())
+            },
+        )?;
         Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 

@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::request::{Goal, Only, Quality, Request, Target, decibels};
+use super::request::{Goal, PruneOrMerge, Quality, Request, Target, decibels};
 use crate::TOOL;
-use crate::files::cameras::Times;
-use crate::files::names::from_folder;
-use crate::model::{Split, ranges};
-use crate::models::{Link, ZeroRotation};
+use crate::files::cameras::TimesSource;
+use crate::files::names::relative_to_folder;
+use crate::model::{Split, format_ranges};
+use crate::models::{LinkMode, ZeroRotation};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 
@@ -30,7 +30,7 @@ pub struct Provenance {
 #[serde(deny_unknown_fields, default)]
 pub struct RunOptions {
     /// Whether the run prunes, merges or does both.
-    pub mode: Only,
+    pub mode: PruneOrMerge,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
     /// Exact number of Gaussians in the output, as a fraction of those in the input.
@@ -78,7 +78,7 @@ pub struct RunOptions {
     pub times: Option<String>,
     /// Whether Gaussians were linked between frames; `None` if the program decided this.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub link: Option<Link>,
+    pub link: Option<LinkMode>,
 }
 
 /// Tables of a recipe file other than the parameters of the method.
@@ -125,8 +125,8 @@ impl RunOptions {
     fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> RunOptions {
         self.cameras = self.cameras.as_deref().map(&path);
         self.ground_truth = self.ground_truth.as_deref().map(&path);
-        self.times = self.times.as_deref().map(|times| match Times::named(times) {
-            Times::Table(table) => path(&table).to_string_lossy().into_owned(),
+        self.times = self.times.as_deref().map(|times| match TimesSource::parse(times) {
+            TimesSource::Table(table) => path(&table).to_string_lossy().into_owned(),
             _ => times.to_owned(),
         });
         self
@@ -151,7 +151,7 @@ impl RecipeRecord {
                 (run.max_loss, run.ground_truth) = (Some(*most), Some(photographs.clone()));
             }
         }
-        let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids).join(","));
+        let ids = |ids: &[u32]| (!ids.is_empty()).then(|| format_ranges(ids).join(","));
         let input = &request.input;
         let run = RunOptions {
             mode: request.only,
@@ -171,7 +171,7 @@ impl RecipeRecord {
             frames: input.frames,
             size: input.size,
             times: input.times.name(),
-            link: (input.link != Link::Auto).then_some(input.link),
+            link: (input.link != LinkMode::Auto).then_some(input.link),
             ..run
         };
         let tool = TOOL.to_owned();
@@ -192,7 +192,7 @@ impl RecipeRecord {
     /// it cannot be.
     fn seen_from(&self, folder: &Path) -> RecipeRecord {
         RecipeRecord {
-            run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))),
+            run: self.run.clone().map(|run| run.with_paths(|path| relative_to_folder(path, folder))),
             ..self.clone()
         }
     }
@@ -220,12 +220,12 @@ mod tests {
             cameras: Some("data, \"odd\" name".into()),
             split: Some(Split::Test),
             frames: Some(12),
-            link: Link::Always,
+            link: LinkMode::Always,
             size: Some((320, 200)),
             ..InputOptions::default()
         };
         let mut request = Request::new(input, "out".into(), Recipe::preset("paper").unwrap());
-        (request.only, request.target) = (Only::Prune, Some(Target::Ratio(0.3)));
+        (request.only, request.target) = (PruneOrMerge::Prune, Some(Target::Ratio(0.3)));
         (request.keep_box, request.kind) = (Some([-1.0, 0.0, 0.5, 1.0, 2.0, 1e9]), Some(OutputKind::PlySequence));
         let user = UserOverrides { keep: vec![1, 2, 3, 9], drop: Vec::new(), keep_box: request.keep_box };
         let record = RecipeRecord::new(&request, &user, "00ff".to_owned());
@@ -274,7 +274,7 @@ mod tests {
     #[test]
     fn formatted_ranges_parse_back_into_the_same_ids() {
         for ids in [&[][..], &[7], &[0, 1, 2], &[1, 3, 4, 5, 9, 11, 12]] {
-            assert_eq!(parse_ids(&ranges(ids).join(","), 20).unwrap(), ids);
+            assert_eq!(parse_ids(&format_ranges(ids).join(","), 20).unwrap(), ids);
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::scene::InputOptions;
 /// Whether a run prunes, merges or does both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Only {
+pub enum PruneOrMerge {
     /// Prunes Gaussians, then merges the survivors.
     #[default]
     Both,
@@ -84,7 +84,7 @@ pub struct Request {
     /// `None`: derived from the quality of the result.
     pub archive_psnr: Option<f64>,
     /// Whether the run prunes, merges or does both.
-    pub only: Only,
+    pub only: PruneOrMerge,
     /// Exact number or fraction of Gaussians in the output, if requested.
     pub target: Option<Target>,
     /// Goal (quality or size on disk) by which the number of Gaussians is found, if requested; then `target` is `None`.
@@ -110,7 +110,7 @@ impl Request {
             recipe,
             made_for: None,
             archive_psnr: None,
-            only: Only::Both,
+            only: PruneOrMerge::Both,
             target: None,
             goal: None,
             keep_ids: None,
@@ -127,7 +127,7 @@ impl Target {
     /// # Errors
     /// Fails if the fraction is not above 0 and at most 1, or if the number is not from 1 to `count`. For an input
     /// without Gaussians the number is always 0.
-    pub fn count(self, count: usize) -> Result<usize> {
+    pub fn resolve_count(self, count: usize) -> Result<usize> {
         let wanted = match self {
             Target::Count(wanted) => wanted,
             Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),

@@ -23,18 +23,18 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN};
 use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
-use crate::refinement::prune_steps::PruneSteps;
+use crate::refinement::prune_steps::PrunedModels;
 use crate::refinement::targets::{Targets, ViewSplit};
 use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{ViewSet, pictures};
+use crate::scene::pictures::{ViewSet, select_views};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
@@ -115,20 +115,20 @@ impl SearchStage {
     /// time and reads are their sums, times the usual number of sizes.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
-        let whole = work.state(Attributes::all());
-        let (reader, held) = (work.input.reader, work.held(limits, Attributes::all()));
+        let whole = work.state_bytes(Attributes::all());
+        let (reader, held) = (work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let frames = work.frames.min(128);
         let measured = ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_reads(frames, limits),
-            seconds: work.reading(work.count(), frames as f64)
-                + work.render_seconds(self.pictures as f64, work.count(), RENDER),
+            reads: work.scattered_full_reads(frames, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), frames as f64)
+                + work.render_seconds(self.pictures as f64, work.gaussian_count(), RENDER_COST),
             per_gaussian: [
                 scored_memory(limits),
                 vec![("states", whole), ("readers", reader), ("held", held), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)],
             ]
             .concat(),
-            fixed: vec![work.arriving()],
+            fixed: vec![work.filling_blocks()],
         };
         let (seconds, reads) = repeated.iter().fold((0.0, 0.0), |(s, r), stage| (s + stage.seconds, r + stage.reads));
         let largest = repeated.iter().chain([&measured]).max_by_key(|stage| stage.bytes(work));
@@ -155,14 +155,14 @@ impl SearchStage {
         let (request, stages, template) = (run.request, run.stages, &run.template);
         let found = run.journal.run_cached_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
-            let (pixels, count) = (scene.workload().pixels, scored.count());
+            let (pixels, count) = (scene.workload().pixels, scored.gaussian_count());
             let stride = self.refine.as_ref().map_or(NonZeroU32::MIN, |refine| refine.stride(pixels, count));
             let targets = Targets::new(scene, self.pictures, stride, photographs.is_none())?;
             let parts = targets.split();
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
             (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));
-            let steps = |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
+            let steps = |stage| PrunedModels::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
             trial.prune_steps = self.refine.as_ref().map(steps);
             let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {
@@ -232,7 +232,7 @@ impl SearchStage {
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
         };
         let mut files = Vec::new();
-        if let Some(folder) = folder.filter(|_| scene.work.keeps()) {
+        if let Some(folder) = folder.filter(|_| scene.work.is_enabled()) {
             stamps(folder, &mut files)?;
         }
         let refine = self.refine.as_ref().map(RefineStage::key);
@@ -257,7 +257,7 @@ impl SearchStage {
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<FrameView>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
-        let views = pictures(&scene.rig, times, ViewSet::HeldOut)?;
+        let views = select_views(&scene.rig, times, ViewSet::HeldOut)?;
         let found = Photographs::find(photographs, &scene.rig, times, views)?;
         if found.0.len() < HELD_EVERY {
             let (folder, found) = (photographs.shown(), found.0.len());

@@ -10,19 +10,19 @@ use serde::{Deserialize, Serialize};
 
 use super::request::Request;
 use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary, Summary};
-use crate::archive::Encoded;
+use crate::archive::EncodedArchive;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::records::QualitySummary;
-use crate::journal::records::Saved;
+use crate::journal::records::SavedCost;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::outputs::bounds::Bounds;
+use crate::outputs::bounds::ErrorBounds;
 use crate::pruning::Ranking;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::Scored;
-use crate::refinement::prune_steps::PruneSteps;
+use crate::refinement::prune_steps::PrunedModels;
 use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
@@ -108,7 +108,7 @@ pub struct MeasuredOnArrival {
     /// Whether all frames were scanned for the statistics of every Gaussian, except its visible contribution.
     pub scanned: bool,
     /// Whether the visible contribution of every Gaussian was measured on views.
-    pub seen: bool,
+    pub visible_contribution: bool,
 }
 
 /// Statistics of all Gaussians before scoring.
@@ -116,13 +116,13 @@ pub struct Measured {
     /// Statistics of every Gaussian from the scan of all frames.
     pub scanned: ScanResult,
     /// Visible contribution of every Gaussian to renders, if views were rendered.
-    pub seen: Option<VisibleContribution>,
+    pub visible_contribution: Option<VisibleContribution>,
 }
 
 impl Measured {
     /// Returns the kinds of statistics that were computed.
-    pub fn kinds(&self) -> MeasuredOnArrival {
-        MeasuredOnArrival { scanned: true, seen: self.seen.is_some() }
+    pub fn measured_statistics(&self) -> MeasuredOnArrival {
+        MeasuredOnArrival { scanned: true, visible_contribution: self.visible_contribution.is_some() }
     }
 }
 
@@ -140,16 +140,16 @@ pub struct CountPlan {
 impl CountPlan {
     /// Returns the number of Gaussians with which refinement begins, of `all`, if the output is to have `wanted`
     /// Gaussians.
-    pub fn before_refinement(&self, wanted: usize, all: usize) -> usize {
+    pub fn count_before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
     /// Returns the number of Gaussians, of `all`, that ranking leaves if the output is to have `wanted` Gaussians. A
     /// search for a quality ranks only once, down to the number that its smallest model needs.
-    pub fn after_ranking(&self, wanted: usize, all: usize) -> usize {
+    pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
-        self.before_refinement(if self.searches { smallest } else { wanted }, all)
+        self.count_before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
     /// Returns as text for display how many of `all` Gaussians ranking and refinement leave. `target` is the number of
@@ -160,7 +160,7 @@ impl CountPlan {
         let alone = if merges { "ranking and merging leave" } else { "ranking leaves" };
         match (target, self.refinement_starts_at) {
             (Some(wanted), Some(_)) => {
-                let ranked = self.before_refinement(wanted, all);
+                let ranked = self.count_before_refinement(wanted, all);
                 let removed = ranked - wanted;
                 format!("counts: ranking leaves {}, refinement removes {removed} of them; {wanted} stay", share(ranked))
             }
@@ -168,7 +168,7 @@ impl CountPlan {
             (None, Some(_)) => format!(
                 "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
                  during the run",
-                share(self.before_refinement(0, all))
+                share(self.count_before_refinement(0, all))
             ),
             (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
@@ -253,7 +253,7 @@ impl StageList {
     }
 
     /// Returns the omitted stages for display, one line each.
-    pub fn left_out(&self) -> impl Iterator<Item = String> {
+    pub fn omitted_stages_text(&self) -> impl Iterator<Item = String> {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
@@ -264,7 +264,7 @@ impl StageList {
                 None => journal.leave_out(*what, why),
                 Some(ResourceEstimate { seconds, reads, .. }) => {
                     let seconds = seconds / work.threads as f64;
-                    journal.spare(*what, why, Saved::Stage { seconds, reads });
+                    journal.record_saving(*what, why, SavedCost::Stage { seconds, reads });
                 }
             }
         }
@@ -273,11 +273,11 @@ impl StageList {
 
 /// Content of an archive (compact file of the result, with quantized values).
 #[derive(Debug, Serialize, Deserialize)]
-pub enum Archived {
+pub enum PreparedArchive {
     /// Encoded model or point cloud, ready to be written.
-    Content(Encoded),
+    Content(EncodedArchive),
     /// Error bounds of the values, within which the frames are written later.
-    Frames(Bounds),
+    Frames(ErrorBounds),
 }
 
 /// Number of Gaussians with which an output of one SH degree fits the requested size on disk.
@@ -312,23 +312,23 @@ pub struct RunState<'a> {
     /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
     /// Numbers of Gaussians with which the output fits the requested size on disk, in order of decreasing SH degree.
-    pub fits: Vec<ByteLimitFit>,
+    pub counts_within_bytes: Vec<ByteLimitFit>,
     /// Model without Gaussians from which results of this run are made; holds the settings that they share, such as SH
     /// degree and merge parameters.
     pub template: CompressedModel,
     /// Compressed model as the stages so far have made it.
     pub result: CompressedModel,
     /// Number of Gaussians of [`result`](RunState::result) that refinement is to leave.
-    pub wanted: usize,
+    pub refine_to: usize,
     /// States of refinement after prune steps (removals of the lowest-ranked Gaussians), from which a smaller model
     /// continues; only in a search for a quality.
-    pub prune_steps: Option<PruneSteps<'a>>,
+    pub prune_steps: Option<PrunedModels<'a>>,
     /// Counts of the merge stage, if Gaussians were merged.
     pub merge: Option<MergeSummary>,
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
     /// Content of the archive, if the output is an archive.
-    pub archived: Option<Archived>,
+    pub archived: Option<PreparedArchive>,
     /// Quality and size of the archive, if the output is an archive.
     pub archive: Option<ArchiveSummary>,
     /// Quality of the result, if it was measured.
@@ -357,10 +357,10 @@ impl<'a> RunState<'a> {
             scored: None,
             ranking: None,
             target: None,
-            fits: Vec::new(),
+            counts_within_bytes: Vec::new(),
             result: template.clone(),
             template,
-            wanted: 0,
+            refine_to: 0,
             prune_steps: None,
             merge: None,
             goal: None,

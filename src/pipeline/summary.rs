@@ -14,12 +14,12 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, QualitySummary, RefinedSummary, StageRecord,
+    FieldSummary, FlagSummary, Forecast, LeftOut, QualitySummary, RefinedSummary, ShDegreeSummary, StageRecord,
     TermSummary, number, sizes,
 };
 use crate::merging::PassCounts;
-use crate::models::{InputModel, Size};
-use crate::pruning::Counts;
+use crate::models::{InputModel, ModelSize};
+use crate::pruning::SelectionCounts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 
@@ -90,7 +90,7 @@ pub struct InputSummary {
     /// Number of bytes of all files that a renderer opens; for a stream, of the bytes that arrived.
     pub bytes: u64,
     /// Number of bytes of each part of the input.
-    pub size: Size,
+    pub size: ModelSize,
 }
 
 impl InputSummary {
@@ -146,7 +146,7 @@ impl CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),
             cameras: scene.rig.cameras.len(),
-            pairs: scene.schedule.pairs(),
+            pairs: scene.schedule.pair_count(),
         }
     }
 }
@@ -179,7 +179,7 @@ impl MergeSummary {
 
 /// Amount of detail in the text of a summary.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Detail {
+pub enum SummaryDetail {
     /// Number of Gaussians, size, quality, time, output and a few notes.
     Most,
     /// In addition every stage, omitted stages with reasons, and all notes.
@@ -208,9 +208,9 @@ pub struct Summary {
     /// Number of bytes of all output files that a renderer opens.
     pub output_bytes: u64,
     /// Number of bytes of each part of the output.
-    pub output_size: Size,
+    pub output_size: ModelSize,
     /// Numbers of Gaussians kept and removed by scoring and selection (stages 1 and 2 of the paper).
-    pub selection: Counts,
+    pub selection: SelectionCounts,
     /// Maximum number of full reads of the input (every frame once) in the memory plan; `None` if there was no plan.
     pub planned_reads: Option<f64>,
     /// Forecast of time and memory that was made before the run, if there was one.
@@ -229,7 +229,7 @@ pub struct Summary {
     /// Measured effect of writing the deformation field in half precision; `None` if it was not requested.
     pub field: Option<FieldSummary>,
     /// Measured effect of dropping SH degrees; `None` if it was not requested or is impossible.
-    pub bands: Option<BandsSummary>,
+    pub bands: Option<ShDegreeSummary>,
     /// PSNR before and after refinement; `None` if nothing was refined.
     pub refined: Option<RefinedSummary>,
     /// Quality of the result on test views, or on validation or training views if there are none, and render times.

@@ -5,13 +5,13 @@ use std::path::Path;
 
 use bytesize::ByteSize;
 
-use super::summary::{Detail, Summary};
+use super::summary::{Summary, SummaryDetail};
 use crate::error::ShowPath;
 use crate::journal::records::{QualitySummary, ViewKind};
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
-use crate::models::Size;
+use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
-use crate::progress::duration;
+use crate::progress::format_duration;
 
 /// Maximum number of notes that are shown unless all details are asked for.
 const NOTES: usize = 2;
@@ -20,14 +20,14 @@ const NOTES: usize = 2;
 const TITLE_WIDTH: usize = 52;
 
 impl Summary {
-    /// Returns the summary as text for people: the table of the result, and with [`Detail::All`] the stages before it
+    /// Returns the summary as text for people: the table of the result, and with [`SummaryDetail::All`] the stages before it
     /// and all notes.
-    pub fn text(&self, detail: Detail) -> String {
+    pub fn text(&self, detail: SummaryDetail) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
         let _ = match detail {
-            Detail::All => self.write_stages(&mut out),
-            Detail::Most => Ok(()),
+            SummaryDetail::All => self.write_stages(&mut out),
+            SummaryDetail::Most => Ok(()),
         };
         let _ = self.write_table(&mut out);
         let _ = self.write_notes(&mut out, detail);
@@ -88,7 +88,7 @@ impl Summary {
         let from = Path::new(&self.input.path).shown().to_string();
         let to = Path::new(&self.output).shown().to_string();
         let title = if to.is_empty() { from } else { format!("{from} → {to}") };
-        writeln!(out, "{title:<TITLE_WIDTH$}  {}{memory}\n", duration(seconds))?;
+        writeln!(out, "{title:<TITLE_WIDTH$}  {}{memory}\n", format_duration(seconds))?;
         writeln!(out, "{:<14}{:>12}{:>12}", "", "before", "after")?;
         let (all, kept) = (self.input.gaussians as u64, self.gaussians as u64);
         row(out, "Gaussians", &grouped(all), &grouped(kept), &times(all, kept, "fewer"))?;
@@ -125,7 +125,7 @@ impl Summary {
     /// Writes how the bytes of the input and of the result divide into parts, if the result has several parts. Marks
     /// the part that takes most bytes of the result.
     fn write_size_parts(&self, out: &mut String) -> std::fmt::Result {
-        let named = |size: &Size| {
+        let named = |size: &ModelSize| {
             [
                 ("  Gaussians", size.cloud),
                 ("  deformation", size.field),
@@ -166,11 +166,11 @@ impl Summary {
         format!("{} PSNR{ssim} vs. original ({views})", decibels_text(psnr, 2))
     }
 
-    /// Writes the notes: with [`Detail::Most`] only the first [`NOTES`] of them.
-    fn write_notes(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
+    /// Writes the notes: with [`SummaryDetail::Most`] only the first [`NOTES`] of them.
+    fn write_notes(&self, out: &mut String, detail: SummaryDetail) -> std::fmt::Result {
         let shown = match detail {
-            Detail::All => self.notes.len(),
-            Detail::Most => self.notes.len().min(NOTES),
+            SummaryDetail::All => self.notes.len(),
+            SummaryDetail::Most => self.notes.len().min(NOTES),
         };
         for note in &self.notes[..shown] {
             writeln!(out, "note: {note}")?;
@@ -199,7 +199,7 @@ impl Summary {
 
     /// Returns the wall-clock seconds of all stages that this run computed, and the largest resident memory in bytes.
     fn taken(&self) -> (f64, Option<u64>) {
-        let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
+        let seconds = self.stages.iter().filter(|stage| !stage.from_cache).map(|stage| stage.seconds).sum();
         (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
     }
 }

@@ -10,11 +10,11 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::journal::Clock;
+use crate::journal::Stopwatch;
 use crate::journal::records::Forecast;
-use crate::memory_plan::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
+use crate::memory_plan::{CONTRIBUTION_COST, MemoryPlan, REMOVAL_COST, RENDER_COST, Throughput, Workload};
 use crate::model::{Attributes, Camera, Gaussians};
-use crate::passes::{BLOCK, gather_all};
+use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::time_estimate::core_seconds;
@@ -43,7 +43,7 @@ const MIN_RUN_SECONDS: f64 = 2.0;
 /// Fails if frames cannot be read.
 pub(super) fn forecast(
     scene: &mut Scene,
-    plan: &Plan,
+    plan: &MemoryPlan,
     stages: &RunPlan,
     measured: MeasuredOnArrival,
 ) -> Result<Forecast> {
@@ -54,7 +54,7 @@ pub(super) fn forecast(
     let work = scene.workload();
     let shortest = stages.shortest_estimates(&work, &scene.limits, measured, found.hardly_seen);
     let estimates = stages.remaining_estimates(&work, &scene.limits, measured);
-    Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak()))
+    Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak_bytes()))
 }
 
 /// Result of a calibration of time estimates.
@@ -83,11 +83,18 @@ impl Calibration {
         let budget = (MAX_TIME_FRACTION * expected).min(MAX_SECONDS) * work.threads as f64;
         let mut spent = MeasuredTime::default();
         let states = measure_states(scene, &work, budget, &mut spent)?;
-        let machine = Throughput { states, look: states, remove: states, render: states, processors: None };
-        let work = Workload { pace: machine, ..work };
+        let machine = Throughput {
+            states,
+            contribution_time: states,
+            removal_time: states,
+            render_time: states,
+            processors: None,
+        };
+        let work = Workload { throughput: machine, ..work };
         let views_per_way = VIEWS_PER_THREAD as f64 * work.threads as f64;
-        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.render_seconds(views_per_way, work.count(), way));
-        let needed_seconds = work.reading(work.count(), work.input.frame_block.max(1) as f64)
+        let pictures = [CONTRIBUTION_COST, REMOVAL_COST, RENDER_COST]
+            .map(|way| work.render_seconds(views_per_way, work.gaussian_count(), way));
+        let needed_seconds = work.reading_seconds(work.gaussian_count(), work.input.frame_block.max(1) as f64)
             + pictures.iter().sum::<f64>()
             + pictures[2];
         let mut found = Calibration { pace: machine, hardly_seen: 0.0 };
@@ -136,9 +143,11 @@ impl Calibration {
         });
         let rendered =
             spent.time(|| on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
-        for (measured, expected, pace) in
-            [(looked, look, &mut pace.look), (removed, remove, &mut pace.remove), (rendered, render, &mut pace.render)]
-        {
+        for (measured, expected, pace) in [
+            (looked, look, &mut pace.contribution_time),
+            (removed, remove, &mut pace.removal_time),
+            (rendered, render, &mut pace.render_time),
+        ] {
             *pace *= measured.unwrap_or(expected) / expected;
         }
         let mut sum = RemovalError::new(state.len(), 0.0);
@@ -151,11 +160,11 @@ impl Calibration {
 }
 
 /// Returns which fraction of the Gaussians can be removed, beginning with the smallest removal errors, before the PSNR
-/// of renders falls below [`MAX_USEFUL_PSNR`]. `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of
+/// of renders falls below [`MAX_USEFUL_PSNR`]. `errors` are in units of [`RemovalError::SUM_UNIT`]; `values` is the number of
 /// color values that were rendered.
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
-    let most = values * 10f64.powf(-MAX_USEFUL_PSNR / 10.0) / RemovalError::UNIT;
+    let most = values * 10f64.powf(-MAX_USEFUL_PSNR / 10.0) / RemovalError::SUM_UNIT;
     let mut sum = 0.0;
     let few = errors.iter().take_while(|&&error| {
         sum += error as f64;
@@ -170,15 +179,15 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
 fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
     let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
-    let block_seconds = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
-    let all = source.info().count.div_ceil(BLOCK);
+    let block_seconds = work.reading_seconds(GAUSSIANS_PER_BLOCK.min(source.info().count) as f64, frames as f64);
+    let all = source.info().count.div_ceil(GAUSSIANS_PER_BLOCK);
     let blocks = ((0.3 * budget / block_seconds) as usize).clamp(1, 4 * work.threads as usize).min(all);
     // Most stages read every attribute but SH. Readers are opened before the time is taken, because stages open them
     // once for many frames.
     let columns = Attributes::all().difference(Attributes::SH);
     let open = |k: usize| -> Result<_> {
-        let start = k * all / blocks * BLOCK;
-        let mut reader = source.open(Ids::Range(start..source.info().count.min(start + BLOCK)))?;
+        let start = k * all / blocks * GAUSSIANS_PER_BLOCK;
+        let mut reader = source.open(Ids::Range(start..source.info().count.min(start + GAUSSIANS_PER_BLOCK)))?;
         reader.expect(&ReadPlan::new(0..frames));
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
         reader.read(0, columns, &mut state)?;
@@ -206,7 +215,7 @@ struct MeasuredTime {
 impl MeasuredTime {
     /// Runs `work` and returns its processor time in seconds; `None` if the system does not report it.
     fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
-        let clock = Clock::start();
+        let clock = Stopwatch::start();
         work();
         let (processors, wall) = (clock.processor_seconds()?, clock.seconds());
         self.processors += processors;
@@ -231,17 +240,20 @@ mod tests {
         let scene = scene(folder.path());
         let before = scene.workload();
         let found = Calibration::measure(&scene, 1e3).unwrap();
-        assert!(found.pace.states > 0.0 && found.pace.look > 0.0 && found.pace.remove > 0.0, "{found:?}");
-        assert_ne!(found.pace.look, found.pace.states, "pictures were made");
+        assert!(
+            found.pace.states > 0.0 && found.pace.contribution_time > 0.0 && found.pace.removal_time > 0.0,
+            "{found:?}"
+        );
+        assert_ne!(found.pace.contribution_time, found.pace.states, "pictures were made");
         let short = Calibration::measure(&scene, 1e-6).unwrap();
-        assert_eq!((short.pace.look, short.hardly_seen), (short.pace.states, 0.0));
+        assert_eq!((short.pace.contribution_time, short.hardly_seen), (short.pace.states, 0.0));
         assert_eq!(scene.workload(), before);
     }
 
     #[test]
     fn hardly_seen_counts_smallest_errors_within_60_db() {
         // At 60 dB, 1000 color values allow a squared error of 0.001 in total.
-        let units = |error: f64| (error / RemovalError::UNIT) as u64;
+        let units = |error: f64| (error / RemovalError::SUM_UNIT) as u64;
         let errors = vec![0, units(0.05), units(0.0004), units(0.0005), 0, units(0.0002), units(0.1), 0];
         assert_eq!(hardly_seen(errors, 1000.0), 5.0 / 8.0);
         assert_eq!(hardly_seen(Vec::new(), 1000.0), 0.0);

@@ -2,9 +2,9 @@
 
 use std::fmt::Write as _;
 
-use crate::journal::records::{Forecast, Range, StageForecast};
-use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, size};
-use crate::progress::duration;
+use crate::journal::records::{EstimateRange, Forecast, StageForecast};
+use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, format_bytes};
+use crate::progress::format_duration;
 
 /// Lowest and highest ratio of measured to estimated core-seconds of runs after a calibration, found on three trained
 /// models at several sizes (`scripts/estimate.py`) and slightly widened.
@@ -31,19 +31,24 @@ impl Forecast {
         memory_bytes: u64,
     ) -> Forecast {
         let likely = core_seconds(needs);
-        let measured = work.pace.processors;
+        let measured = work.throughput.processors;
         let error_range = match (searches, measured) {
             (true, _) => ERROR_RANGE_SEARCH,
             (_, Some(_)) => ERROR_RANGE,
             (_, None) => ERROR_RANGE_UNCALIBRATED,
         };
-        let core = Range { least: error_range[0] * least, likely, most: error_range[1] * likely + FIXED_SECONDS };
+        let core =
+            EstimateRange { least: error_range[0] * least, likely, most: error_range[1] * likely + FIXED_SECONDS };
         let threads = work.threads as f64;
         let processors = measured.unwrap_or(threads).min(threads);
         let usual = (0.9 * processors).max(1f64.min(processors));
         let fewest = (MIN_UTILIZATION * processors).max(1f64.min(processors));
         Forecast {
-            seconds: Range { least: core.least / threads, likely: core.likely / usual, most: core.most / fewest },
+            seconds: EstimateRange {
+                least: core.least / threads,
+                likely: core.likely / usual,
+                most: core.most / fewest,
+            },
             core_seconds: core,
             threads: work.threads,
             measured: measured.is_some(),
@@ -77,7 +82,7 @@ impl Forecast {
             let named = stages.iter().map(|stage| format!("{} {:.1}", stage.name, stage.core_seconds));
             let _ = writeln!(out, "core-seconds: {}", named.collect::<Vec<_>>().join(" + "));
         }
-        let _ = writeln!(out, "memory: at most {}", size(self.memory_bytes));
+        let _ = writeln!(out, "memory: at most {}", format_bytes(self.memory_bytes));
         out
     }
 }
@@ -103,8 +108,8 @@ fn two_digits(value: f64) -> String {
 fn approximate_time(seconds: f64) -> String {
     match seconds {
         ..60.0 => format!("{} s", two_digits(seconds)),
-        ..600.0 => duration((seconds / 10.0).round() * 10.0),
-        _ => duration((seconds / 60.0).round() * 60.0),
+        ..600.0 => format_duration((seconds / 10.0).round() * 10.0),
+        _ => format_duration((seconds / 60.0).round() * 60.0),
     }
 }
 
@@ -122,7 +127,7 @@ mod tests {
     fn range_contains_expected_value_and_widens_if_uncertain() {
         let unmeasured = work(1000);
         let measured = crate::memory_plan::Workload {
-            pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
+            throughput: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
             ..unmeasured
         };
         let forecast = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);

@@ -9,13 +9,13 @@ use std::ops::Range;
 use serde::Serialize;
 
 use crate::error::Result;
-use crate::files::accuracy::{Accuracy, RenderedAttributes};
+use crate::files::accuracy::{CodingErrors, RenderedAttributes};
 use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
 
 /// Quantization steps of the values on the player page. Each stored value differs from the original by at most half a
 /// step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Steps {
+pub struct PlayerSteps {
     /// Step of positions, scene units.
     pub position: f64,
     /// Step of components of unit quaternions.
@@ -38,15 +38,15 @@ const SH_LIMIT: f64 = 32767.0;
 /// Largest absolute position, in quantization steps.
 const POSITION_LIMIT: f64 = (1 << 30) as f64;
 
-impl Steps {
+impl PlayerSteps {
     /// Returns the quantization steps for a scene of the extent `extent` (scene units). The steps are powers of two, so
     /// that grid points are exact in any precision.
     ///
     /// Only the position step depends on the extent. The others were chosen by renders: with them, two trained models
     /// (`deform2`, `room2_big`) reach over 50 dB PSNR against unquantized renders.
-    pub fn from_extent(extent: f64) -> Steps {
+    pub fn from_extent(extent: f64) -> PlayerSteps {
         let position = extent.log2().floor() as i32 - POSITION_BITS;
-        Steps {
+        PlayerSteps {
             position: f64::from(position.clamp(-100, 100)).exp2(),
             rotation: 1.0 / 2048.0,
             log_scale: 1.0 / 128.0,
@@ -58,14 +58,14 @@ impl Steps {
 
 /// Returns the indices of the scalar components of the attribute `column` among all components of a Gaussian, in the
 /// order position, rotation, log scale, opacity, SH.
-pub fn components(column: Attributes, sh_degree: usize) -> Range<usize> {
+pub fn component_range(column: Attributes, sh_degree: usize) -> Range<usize> {
     let width = |column: Attributes| column.width(sh_degree);
     let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
     before..before + width(column)
 }
 
 /// Returns the number of scalar components of all attributes of a Gaussian.
-pub fn width(sh_degree: usize) -> usize {
+pub fn component_count(sh_degree: usize) -> usize {
     11 + 3 * sh_coefficients(sh_degree)
 }
 
@@ -77,10 +77,10 @@ pub fn width(sh_degree: usize) -> usize {
 ///
 /// # Panics
 /// Panics if `points` has fewer than `width` × N values.
-pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points: &mut [i32]) -> usize {
+pub fn quantize_into(state: &Gaussians, which: Attributes, steps: &PlayerSteps, points: &mut [i32]) -> usize {
     let (count, degree) = (state.len(), state.sh_degree());
     let of = |column: Attributes| {
-        let range = components(column, degree);
+        let range = component_range(column, degree);
         range.start * count..range.end * count
     };
     let plain = |column: &AttributeValues, points: &mut [i32], point: &dyn Fn(f32) -> i32| {
@@ -122,10 +122,10 @@ pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points:
 ///
 /// # Errors
 /// Fails if a visible Gaussian moved further than [`accuracy`](crate::files::accuracy) allows.
-pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
+pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &PlayerSteps, points: &[i32]) -> Result<()> {
     let count = state.len();
-    let mut accuracy = Accuracy::new(&state.position);
-    let opacities = components(Attributes::OPACITY, sh_degree).start * count;
+    let mut accuracy = CodingErrors::new(&state.position);
+    let opacities = component_range(Attributes::OPACITY, sh_degree).start * count;
     for row in (0..count).filter(|row| points[opacities + row] > 0) {
         let wanted = RenderedAttributes { color: [0.0; 3], ..RenderedAttributes::from_state(state, row) };
         let position = [0, 1, 2].map(|axis| f64::from(points[axis * count + row]) * steps.position);
@@ -166,7 +166,7 @@ mod tests {
     use crate::model::AttributeValues;
 
     /// Returns the quantization step of the scalar component with the index `component`.
-    fn step_of(component: usize, steps: &Steps) -> f64 {
+    fn step_of(component: usize, steps: &PlayerSteps) -> f64 {
         match component {
             0..3 => steps.position,
             3..7 => steps.rotation,
@@ -195,15 +195,15 @@ mod tests {
             sh in prop::collection::vec(-3f32..3.0, 24), extent in 0.01f64..1e4,
         ) {
             let state = gaussians([position, rotation.clone(), log_scale, logit, sh]);
-            let steps = Steps::from_extent(extent);
+            let steps = PlayerSteps::from_extent(extent);
             prop_assert!(steps.position <= extent / 16384.0 && steps.position > extent / 32768.0);
-            let mut points = vec![0; 2 * width(1)];
-            prop_assert_eq!(write_points(&state, Attributes::all(), &steps, &mut points), 0);
+            let mut points = vec![0; 2 * component_count(1)];
+            prop_assert_eq!(quantize_into(&state, Attributes::all(), &steps, &mut points), 0);
             for i in 0..2 {
                 let q: [f64; 4] = std::array::from_fn(|c| f64::from(rotation[2 * c + i]));
                 let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
                 let side = if q[0] < 0.0 { -1.0 } else { 1.0 };
-                for component in 0..width(1) {
+                for component in 0..component_count(1) {
                     let value = match component {
                         0..3 => state.position.plane(component)[i].into(),
                         3..7 => side * q[component - 3] / length,
@@ -221,22 +221,22 @@ mod tests {
 
     #[test]
     fn quaternions_keep_their_sign_and_odd_gaussians_are_invisible() {
-        let steps = Steps::from_extent(1.0);
+        let steps = PlayerSteps::from_extent(1.0);
         let mut state = Gaussians::zeros(4, 0);
-        let mut points = vec![0; 4 * width(0)];
+        let mut points = vec![0; 4 * component_count(0)];
         (0..4).for_each(|i| state.rotation.set_row(i, [-0.1, 0.995, 0.0, 0.0]));
-        write_points(&state, Attributes::all(), &steps, &mut points);
+        quantize_into(&state, Attributes::all(), &steps, &mut points);
         assert!(points[3 * 4] > 0 && points[4 * 4] < 0, "{points:?}");
         // With the other sign the next rotation would be a jump.
         state.rotation.set_row(0, [-0.1, -0.995, 0.0, 0.0]);
         state.rotation.set_row(1, [0.0; 4]);
-        write_points(&state, Attributes::ROTATION, &steps, &mut points);
+        quantize_into(&state, Attributes::ROTATION, &steps, &mut points);
         assert!(points[3 * 4] < 0 && points[4 * 4] < 0);
         assert_eq!([points[13], points[17]], [2048, 0]);
         state.position.set_row(1, [f32::NAN, 0.0, 0.0]);
         state.position.set_row(2, [1e30, 0.0, 0.0]);
         state.log_scale.set_row(3, [0.0, f32::NAN, 0.0]);
-        assert_eq!(write_points(&state, Attributes::all(), &steps, &mut points), 3);
+        assert_eq!(quantize_into(&state, Attributes::all(), &steps, &mut points), 3);
         assert_eq!(points[40..44], [512, 0, 0, 0]);
     }
 }

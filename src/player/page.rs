@@ -19,11 +19,11 @@ use super::track::PageSequence;
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
-use crate::files::page_policy::{digest_of, policy};
+use crate::files::page_policy::{policy_digest, policy_meta_element};
 use crate::model::{Rig, Split};
 
 /// File name of the player page in an output folder.
-pub const INDEX: &str = "index.html";
+pub const INDEX_FILE: &str = "index.html";
 /// Maximum number of cameras on the player page; of more cameras an even selection is taken.
 const CAMERAS: usize = 400;
 
@@ -72,7 +72,8 @@ pub struct PageScene {
     /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
     /// Center of the scene, in scene units.
-    pub middle: [f64; 3],
+    #[serde(rename = "middle")]
+    pub center: [f64; 3],
     /// Longest side of the scene without its floaters, in scene units.
     pub extent: f64,
     /// Mean upward direction of the cameras.
@@ -132,14 +133,14 @@ pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
 }
 
 /// Returns the mean upward direction of the cameras of `rig` as a unit vector; z if the directions cancel.
-pub fn upwards(rig: &Rig) -> DVec3 {
+pub fn mean_up(rig: &Rig) -> DVec3 {
     let sum: DVec3 = rig.cameras.iter().map(|camera| -camera.rotation.row(1)).sum();
     let is_known = sum.is_finite() && sum.length() > 1e-3 * rig.cameras.len() as f64;
     if is_known { sum.normalize() } else { DVec3::Z }
 }
 
 /// Chunks (encoded groups of frames) as scripts in scratch files, until the page is written.
-pub struct Chunks {
+pub struct ChunkFiles {
     folder: ScratchFolder,
     /// For each chunk: its start as a fraction of the frames shown, index of its model, its index in the model, bytes
     /// of its script.
@@ -148,13 +149,13 @@ pub struct Chunks {
     digests: Vec<String>,
 }
 
-impl Chunks {
+impl ChunkFiles {
     /// Creates an empty collection of chunks, with a temporary folder in `scratch`.
     ///
     /// # Errors
     /// Fails if the folder cannot be created.
-    pub fn new(scratch: &Path) -> Result<Chunks> {
-        Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
+    pub fn new(scratch: &Path) -> Result<ChunkFiles> {
+        Ok(ChunkFiles { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
     /// Adds the encoded chunk `bytes` as chunk `chunk` of model `model`. `since` is the index of its first frame as a
@@ -162,12 +163,12 @@ impl Chunks {
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
-    pub fn add(&mut self, model: usize, chunk: usize, since: f64, bytes: &[u8]) -> Result<()> {
+    pub fn add_chunk(&mut self, model: usize, chunk: usize, since: f64, bytes: &[u8]) -> Result<()> {
         let path = self.path(model, chunk);
         let script = format!("splatsieve.chunk({model},{chunk},\"{}\");\n", STANDARD.encode(bytes));
         fs::write(&path, &script).map_err(Error::io("write", &path))?;
         self.made.push((since, model, chunk, script.len() as u64));
-        self.digests.push(digest_of(&script));
+        self.digests.push(policy_digest(&script));
         Ok(())
     }
 
@@ -218,9 +219,9 @@ impl Chunks {
         }
         // The policy allows scripts that the page itself adds: files from a disk have no origin that it could name.
         let page = head(stage, &["'strict-dynamic'".to_owned()]) + "</body>\n</html>\n";
-        let path = folder.join(INDEX);
+        let path = folder.join(INDEX_FILE);
         fs::write(&path, &page).map_err(Error::io("write", &path))?;
-        let names = stage.files.iter().cloned().chain([INDEX.to_owned()]).collect();
+        let names = stage.files.iter().cloned().chain([INDEX_FILE.to_owned()]).collect();
         Ok((names, self.bytes() + page.len() as u64))
     }
 }
@@ -241,10 +242,10 @@ fn head(stage: &PageScene, chunks: &[String]) -> String {
     page = page.replace("<!--poster-->", &stage.poster.as_ref().map_or(String::new(), image));
     // Names may contain any text, so they are inserted after all replacements.
     let begin = format!("splatsieve.begin({});", inline(&json));
-    let own = [between(&page, "<script>", "</script>"), &begin].map(digest_of);
+    let own = [between(&page, "<script>", "</script>"), &begin].map(policy_digest);
     let scripts: Vec<String> = own.into_iter().chain(chunks.iter().cloned()).collect();
-    let policy = policy(&[
-        ("style-src", &[digest_of(between(&page, "<style>", "</style>"))]),
+    let policy = policy_meta_element(&[
+        ("style-src", &[policy_digest(between(&page, "<style>", "</style>"))]),
         ("img-src", &["data:".to_owned()]),
         ("worker-src", &["blob:".to_owned()]),
         ("script-src", &scripts),
@@ -266,14 +267,14 @@ fn inline(json: &serde_json::Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::player::lattice::Steps;
+    use crate::player::lattice::PlayerSteps;
 
     fn stage(name: &str) -> PageScene {
         let track = PageSequence {
             count: 0,
             sh_degree: 0,
             times: vec![0.0],
-            steps: Steps::from_extent(1.0),
+            steps: PlayerSteps::from_extent(1.0),
             varying: Vec::new(),
             groups: vec![1],
             unseen: 0,
@@ -283,7 +284,7 @@ mod tests {
             models: vec![PageModel { role: "original", name: name.to_owned(), bytes: 0, frames: 1, degree: 0, track }],
             cameras: Vec::new(),
             background: [0.0; 3],
-            middle: [0.0; 3],
+            center: [0.0; 3],
             extent: 1.0,
             up: [0.0, 0.0, 1.0],
             files: Vec::new(),
@@ -304,9 +305,9 @@ mod tests {
     #[test]
     fn chunks_are_in_the_order_of_time() {
         let scratch = tempfile::tempdir().unwrap();
-        let mut chunks = Chunks::new(scratch.path()).unwrap();
+        let mut chunks = ChunkFiles::new(scratch.path()).unwrap();
         for (model, chunk, since) in [(0, 0, 0.0), (0, 1, 0.0), (0, 2, 0.5), (1, 0, 0.0), (1, 1, 0.0), (1, 2, 0.4)] {
-            chunks.add(model, chunk, since, &[7; 10]).unwrap();
+            chunks.add_chunk(model, chunk, since, &[7; 10]).unwrap();
         }
         assert_eq!(chunks.ordered(), [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (0, 2)]);
         let page = scratch.path().join("page.html");

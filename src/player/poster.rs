@@ -10,7 +10,7 @@ use crate::files::image::write::jpeg_bytes;
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPart, SHARED_VIEW_BYTES_PER_GAUSSIAN};
 use crate::model::{Camera, FrameView, Rig};
-use crate::passes::{Batch, RenderedSource, show};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch};
 use crate::render;
 use crate::source::FrameSource;
 
@@ -24,7 +24,12 @@ const QUALITY: u8 = 80;
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits: &Limits) -> Result<Option<String>> {
+pub fn render_poster(
+    source: &dyn FrameSource,
+    rig: &Rig,
+    background: [f32; 3],
+    limits: &Limits,
+) -> Result<Option<String>> {
     let Some(shot) = rig.shots.first() else { return Ok(None) };
     let times = &source.info().times;
     let away = |frame: &usize| shot.time.map_or(0.0, |time| (times[*frame] - time).abs());
@@ -32,19 +37,25 @@ pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits:
     let camera = smaller(&rig.cameras[shot.camera as usize]);
     let picture = FrameView { frame, view: shot.view, camera: 0 };
     let mut uri = None;
-    show([RenderedSource::all(source)], &[camera], &[picture], Batch::one_frame(limits), |views| {
-        for view in views {
-            let bytes = jpeg_bytes(&view.render(0, background), QUALITY)
-                .map_err(|error: io::Error| Error::internal(format!("the poster cannot be written: {error}")))?;
-            uri = Some(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)));
-        }
-        Ok(())
-    })?;
+    for_each_view_batch(
+        [RenderedSource::all(source)],
+        &[camera],
+        &[picture],
+        BatchLimits::one_frame(limits),
+        |views| {
+            for view in views {
+                let bytes = jpeg_bytes(&view.render(0, background), QUALITY)
+                    .map_err(|error: io::Error| Error::internal(format!("the poster cannot be written: {error}")))?;
+                uri = Some(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)));
+            }
+            Ok(())
+        },
+    )?;
     Ok(uri)
 }
 
 /// Returns the memory for rendering a poster: bytes per Gaussian, and bytes of the render itself.
-pub fn memory() -> [MemoryPart; 2] {
+pub fn poster_memory() -> [MemoryPart; 2] {
     // Three channels of f32, their bytes, and the JPEG.
     [("poster", SHARED_VIEW_BYTES_PER_GAUSSIAN), ("poster", render::STRIP_BYTES as u64 + 16 * MAX_PIXELS as u64)]
 }
@@ -73,17 +84,17 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
 
     #[test]
     fn a_poster_is_a_jpeg_of_few_pixels() {
-        let scene = Scene::new(400, 3);
+        let scene = DemoScene::new(400, 3);
         let mut rig = scene.rig();
-        let uri = poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().unwrap();
+        let uri = render_poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().unwrap();
         let bytes = STANDARD.decode(uri.strip_prefix("data:image/jpeg;base64,").unwrap()).unwrap();
         assert_eq!(bytes[..2], [0xff, 0xd8]);
         rig.shots.clear();
-        assert!(poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().is_none());
+        assert!(render_poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().is_none());
     }
 
     #[test]

@@ -19,10 +19,10 @@ use flate2::write::ZlibEncoder;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::lattice::{Steps, check_positions, components, width, write_points};
+use super::lattice::{PlayerSteps, check_positions, component_count, component_range, quantize_into};
 use crate::error::{Error, Result};
 use crate::model::{Attributes, Gaussians};
-use crate::passes::States;
+use crate::passes::FrameStates;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -47,7 +47,7 @@ pub struct PageSequence {
     /// Time stamps of the encoded frames.
     pub times: Vec<f64>,
     /// Quantization steps of the values.
-    pub steps: Steps,
+    pub steps: PlayerSteps,
     /// Ranges of scalar components that vary with time, in order: index of the first component, and number of
     /// components.
     pub varying: Vec<[usize; 2]>,
@@ -62,7 +62,7 @@ pub struct PageSequence {
 impl PageSequence {
     /// Plans the encoding of the frames `frames` of `source`: divides them into groups, with SH coefficients up to
     /// `sh_degree` and the quantization steps `steps`.
-    pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> PageSequence {
+    pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: PlayerSteps) -> PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
         let of_frame = info.varying.width(sh_degree).max(1) * info.count.max(1);
@@ -75,14 +75,18 @@ impl PageSequence {
             sh_degree,
             times: frames.iter().map(|&frame| info.times[frame]).collect(),
             steps,
-            varying: varying.iter().map(|column| components(column, sh_degree)).map(|c| [c.start, c.len()]).collect(),
+            varying: varying
+                .iter()
+                .map(|column| component_range(column, sh_degree))
+                .map(|c| [c.start, c.len()])
+                .collect(),
             groups: (0..=groups).map(|k| 1 + k * frames.len().saturating_sub(1) / groups.max(1)).collect(),
             unseen: 0,
         }
     }
 
     /// Returns the number of chunks: one for the first frame, and one per group.
-    pub fn chunks(&self) -> usize {
+    pub fn chunk_count(&self) -> usize {
         self.groups.len()
     }
 }
@@ -108,19 +112,19 @@ pub fn encode(
 ) -> Result<()> {
     let Some(&first) = frames.first() else { return Ok(()) };
     let progress = events.task("view", "frames", frames.len() as u64);
-    let mut states = States::open(source, &ReadPlan::new(frames.iter().copied()).holding(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::new(frames.iter().copied()).keeping_at_most(held))?;
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
-    let mut points = vec![0; width(degree) * count];
-    let mut read = |frame: usize, which: Attributes, points: &mut [i32], states: &mut States| -> Result<()> {
-        let state = states.at(frame)?;
+    let mut points = vec![0; component_count(degree) * count];
+    let mut read = |frame: usize, which: Attributes, points: &mut [i32], states: &mut FrameStates| -> Result<()> {
+        let state = states.read(frame)?;
         let mut unseen = 0;
         if degree < state.sh_degree() {
             shown.clone_from(state);
             shown.truncate_sh(degree);
-            unseen += write_points(&shown, which, &track.steps, points);
+            unseen += quantize_into(&shown, which, &track.steps, points);
         } else {
-            unseen += write_points(state, which, &track.steps, points);
+            unseen += quantize_into(state, which, &track.steps, points);
         }
         if which == Attributes::all() {
             check_positions(state, degree, &track.steps, points)?;
@@ -213,7 +217,7 @@ mod tests {
     /// Decodes every frame of the chunks, `[frames][width][N]`, one value at a time, by the description at the top of
     /// this file; shares no code with the encoder.
     fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
-        let (count, width) = (track.count, width(track.sh_degree));
+        let (count, width) = (track.count, component_count(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {
             let mut bytes = Vec::new();
             ZlibDecoder::new(&chunks[k][..]).read_to_end(&mut bytes).unwrap();
@@ -255,7 +259,7 @@ mod tests {
     }
 
     fn encoded(source: &dyn FrameSource, frames: &[usize], degree: usize) -> (PageSequence, Vec<Vec<u8>>) {
-        let mut track = PageSequence::plan(source, frames, degree, Steps::from_extent(2.0));
+        let mut track = PageSequence::plan(source, frames, degree, PlayerSteps::from_extent(2.0));
         let mut chunks = Vec::new();
         let sink = |place: usize, bytes| {
             assert_eq!(place, chunks.len());
@@ -263,16 +267,16 @@ mod tests {
             Ok(())
         };
         encode(source, frames, &mut track, 2, &Events::IGNORED, sink).unwrap();
-        assert_eq!(chunks.len(), track.chunks());
+        assert_eq!(chunks.len(), track.chunk_count());
         (track, chunks)
     }
 
     #[test]
     fn what_is_unpacked_is_within_half_a_step_of_every_value() {
-        let scene = demo_scene::Scene::new(700, 47);
+        let scene = demo_scene::DemoScene::new(700, 47);
         let frames = [0, 1, 2, 5, 9, 12, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 46];
         let (track, chunks) = encoded(&scene, &frames, 3);
-        assert!(track.chunks() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
+        assert!(track.chunk_count() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
         let found = unpacked(&track, &chunks);
         assert_eq!(found.len(), frames.len());
         let steps = track.steps;
@@ -301,9 +305,9 @@ mod tests {
 
     #[test]
     fn one_frame_is_one_chunk_and_fewer_bands_are_fewer_components() {
-        let scene = demo_scene::Scene::new(300, 5);
+        let scene = demo_scene::DemoScene::new(300, 5);
         let (track, chunks) = encoded(&scene, &[3], 0);
-        assert_eq!((track.chunks(), track.sh_degree, track.varying.len()), (1, 0, 0));
+        assert_eq!((track.chunk_count(), track.sh_degree, track.varying.len()), (1, 0, 0));
         let found = unpacked(&track, &chunks);
         assert_eq!((found.len(), found[0].len()), (1, 14));
         assert!(encoded(&scene, &[3], 3).1[0].len() >= chunks[0].len());
@@ -311,7 +315,7 @@ mod tests {
 
     #[test]
     fn the_bytes_do_not_depend_on_the_threads() {
-        let scene = demo_scene::Scene::new(900, 12);
+        let scene = demo_scene::DemoScene::new(900, 12);
         let frames: Vec<usize> = (0..12).collect();
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -322,7 +326,7 @@ mod tests {
 
     #[test]
     fn a_gaussian_takes_few_bytes_per_frame() {
-        let scene = demo_scene::Scene::new(2000, 48);
+        let scene = demo_scene::DemoScene::new(2000, 48);
         let frames: Vec<usize> = (0..48).collect();
         let bytes: usize = encoded(&scene, &frames, 3).1.iter().map(Vec::len).sum();
         let of_each = bytes as f64 / (2000.0 * 48.0);

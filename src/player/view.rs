@@ -5,19 +5,19 @@ use std::path::{Path, PathBuf};
 
 use crate::TOOL;
 use crate::error::{Error, Result};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::limits::Limits;
-use crate::memory_plan::{Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
-use crate::player::lattice::{Steps, width};
-use crate::player::page::{Chunks, INDEX, PageModel, PageScene, cameras, upwards};
-use crate::player::poster::{self, poster};
+use crate::player::lattice::{PlayerSteps, component_count};
+use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up};
+use crate::player::poster::{self, render_poster};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::progress::Events;
 use crate::scene::open_compressed;
-use crate::scene::pictures::background;
-use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
+use crate::scene::pictures::render_background;
+use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
 
 /// Name of the stage, for progress and the memory plan.
 const NAME: &str = "view";
@@ -35,7 +35,7 @@ pub struct ViewOptions {
     pub original_frames: Option<usize>,
     /// Maximum SH degree of an original beside a compressed model; `None`: its own.
     pub original_degree: Option<usize>,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
     /// Maximum number of bytes of encoded frames in one HTML file; with more bytes a folder is written.
     pub page_limit: u64,
@@ -47,7 +47,7 @@ pub struct ViewOptions {
 
 /// Result of the command `view`.
 #[derive(Debug)]
-pub struct Viewed {
+pub struct ViewReport {
     /// Path of the page to open in a browser.
     pub page: PathBuf,
     /// Size of all written files in bytes.
@@ -68,7 +68,7 @@ pub fn check(options: &ViewOptions) -> Result<()> {
     let mut inputs = vec![options.original.path.as_path()];
     inputs.extend(options.original.cameras.as_deref());
     inputs.extend(options.compressed.as_deref());
-    let kind = if is_page(&options.output) { Kind::File } else { Kind::Folder };
+    let kind = if is_page(&options.output) { TargetKind::File } else { TargetKind::Folder };
     check_target(&options.output, kind, &inputs, options.overwrite)
 }
 
@@ -84,7 +84,7 @@ fn is_page(output: &Path) -> bool {
 ///
 /// # Errors
 /// Fails if the inputs, the cameras or the output are invalid. Nothing is written then.
-pub fn view(options: &ViewOptions) -> Result<Viewed> {
+pub fn view(options: &ViewOptions) -> Result<ViewReport> {
     check(options)?;
     let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
     if scene.source().info().times.is_empty() {
@@ -92,18 +92,20 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     }
     let compressed =
         options.compressed.as_deref().map(|path| open_compressed(path, &scene, &options.original)).transpose()?;
-    let background = background(options.background, &scene)?;
+    let background = render_background(options.background, &scene)?;
     let limits = {
         let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);
         let work = scene.workload();
         let work = Workload { gaussians: work.gaussians.max(most), ..work };
-        Plan::fit(work, options.original.memory, &options.original.events, |work, limits| vec![need(work, limits)])?
-            .limits
+        MemoryPlan::fit_budget(work, options.original.memory, &options.original.events, |work, limits| {
+            vec![need(work, limits)]
+        })?
+        .limits
     };
     scene.limits = limits;
-    let bounds = first_box(scene.source())?;
-    let (middle, extent) = bounds.map_or(Default::default(), |found| (found.middle, found.extent()));
-    let steps = Steps::from_extent(if extent > 0.0 { extent } else { 1.0 });
+    let bounds = first_frame_box(scene.source())?;
+    let (middle, extent) = bounds.map_or(Default::default(), |found| (found.median, found.extent()));
+    let steps = PlayerSteps::from_extent(if extent > 0.0 { extent } else { 1.0 });
 
     let all = options.max_frames.max(1);
     let (frames, degree) = match compressed {
@@ -111,7 +113,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
         None => (all, NO_SH_LIMIT),
     };
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
-    let (mut chunks, mut notes) = (Chunks::new(&scratch)?, std::mem::take(&mut scene.notes));
+    let (mut chunks, mut notes) = (ChunkFiles::new(&scratch)?, std::mem::take(&mut scene.notes));
     let asked = ModelView { role: "original", path: &scene.path, frames, degree };
     let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
@@ -128,21 +130,21 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
         models,
         cameras: cameras(&scene.rig),
         background,
-        middle: middle.to_array(),
+        center: middle.to_array(),
         extent: if extent > 0.0 { extent } else { 1.0 },
-        up: upwards(&scene.rig).to_array(),
+        up: mean_up(&scene.rig).to_array(),
         files: Vec::new(),
-        poster: poster(scene.source(), &scene.rig, background, &limits)?,
+        poster: render_poster(scene.source(), &scene.rig, background, &limits)?,
     };
     if is_page(&options.output) && chunks.bytes() <= options.page_limit {
         let staged = StagedFile::new(&options.output, options.overwrite)?;
         let bytes = chunks.write_page(&stage, staged.path())?;
         staged.commit()?;
-        return Ok(Viewed { page: options.output.clone(), bytes, files: 1, frames, notes });
+        return Ok(ViewReport { page: options.output.clone(), bytes, files: 1, frames, notes });
     }
     let folder = if is_page(&options.output) { options.output.with_extension("") } else { options.output.clone() };
     if is_page(&options.output) {
-        check_target(&folder, Kind::Folder, &[&options.original.path], options.overwrite)?;
+        check_target(&folder, TargetKind::Folder, &[&options.original.path], options.overwrite)?;
         let (bytes, most) = (chunks.bytes(), options.page_limit);
         notes.push(format!(
             "{bytes} bytes of frames are more than the limit of one page ({most}, --page-limit); a folder was written instead"
@@ -150,11 +152,11 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     }
     let staged = StagedFolder::new(&folder, options.overwrite)?;
     let (names, bytes) = chunks.write_folder(&mut stage, staged.path())?;
-    let marker = staged.path().join(MARKER);
-    let summary = serde_json::json!({ "tool": TOOL, "page": INDEX, "frames": frames });
+    let marker = staged.path().join(SUMMARY_FILE);
+    let summary = serde_json::json!({ "tool": TOOL, "page": INDEX_FILE, "frames": frames });
     fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
-    Ok(Viewed { page: folder.join(INDEX), bytes, files: names.len(), frames, notes })
+    Ok(ViewReport { page: folder.join(INDEX_FILE), bytes, files: names.len(), frames, notes })
 }
 
 /// Settings for one model of the page: its role, path, maximum number of frames and maximum SH degree.
@@ -170,9 +172,9 @@ fn show(
     model: &dyn InputModel,
     place: usize,
     asked: &ModelView<'_>,
-    steps: Steps,
+    steps: PlayerSteps,
     limits: &Limits,
-    chunks: &mut Chunks,
+    chunks: &mut ChunkFiles,
     events: &Events,
 ) -> Result<PageModel> {
     let source = model.source();
@@ -180,15 +182,15 @@ fn show(
     let frames = evenly(times.len(), asked.frames);
     let mut track = PageSequence::plan(source, &frames, asked.degree, steps);
     let groups = track.groups.clone();
-    encode(source, &frames, &mut track, limits.frames_held, events, |chunk, bytes| {
+    encode(source, &frames, &mut track, limits.max_kept_frames, events, |chunk, bytes| {
         let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
-        chunks.add(place, chunk, since, &bytes)
+        chunks.add_chunk(place, chunk, since, &bytes)
     })?;
     let name = asked.path.file_name().unwrap_or(asked.path.as_os_str()).to_string_lossy().into_owned();
     Ok(PageModel {
         role: asked.role,
         name,
-        bytes: model.size()?.whole(),
+        bytes: model.size()?.total(),
         frames: times.len(),
         degree: *sh_degree,
         track,
@@ -204,22 +206,22 @@ fn evenly(frames: usize, count: usize) -> Vec<usize> {
 
 /// Returns the resource estimate (memory, time, reads) of encoding the frames for the page.
 fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
-    let [per_gaussian, render] = poster::memory();
-    let points = 4 * width(work.sh_degree) as u64;
+    let [per_gaussian, render] = poster::poster_memory();
+    let points = 4 * component_count(work.sh_degree) as u64;
     let of_all = points / 4 * work.gaussians * work.frames.max(1);
     ResourceEstimate {
         stage: NAME,
         reads: 1.0,
-        seconds: work.reading(work.count(), work.frames as f64),
+        seconds: work.reading_seconds(work.gaussian_count(), work.frames as f64),
         per_gaussian: vec![
-            ("states", 2 * work.state(Attributes::all())),
+            ("states", 2 * work.state_bytes(Attributes::all())),
             ("readers", work.input.reader),
-            ("held", work.held(limits, Attributes::all())),
+            ("held", work.kept_frames_bytes(limits, Attributes::all())),
             ("points", 3 * points),
             per_gaussian,
         ],
         // The group, eight of its components as differences and as bytes, and the compressed chunk.
-        fixed: vec![work.arriving(), render, ("group", 10 * of_all.min(GROUP_VALUES as u64))],
+        fixed: vec![work.filling_blocks(), render, ("group", 10 * of_all.min(GROUP_VALUES as u64))],
     }
 }
 

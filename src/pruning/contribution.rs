@@ -34,7 +34,7 @@ impl VisibleContribution {
     /// `pixel_stride`-th pixel in each direction was sampled.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
-        let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+        let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();
         VisibleContribution { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
     }
 }
@@ -91,7 +91,7 @@ impl RunningContribution {
     ) -> Result<()> {
         let (count, pixel_stride) = (self.count, self.pixel_stride);
         self.pictures += pictures.len();
-        self.workers.show(
+        self.workers.for_each_view(
             RenderedSource { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
             cameras,
             pictures,
@@ -119,9 +119,9 @@ impl RunningContribution {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::{Flags, Gaussians, Rig, Rows, SequenceInfo, Split, ViewSchedule};
-    use crate::passes::looked_at;
+    use crate::passes::scoring_views;
     use crate::pruning::{Overrides, select};
     use crate::recipe::{self, Recipe};
     use crate::render;
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn contributions_equal_a_plain_loop_on_any_thread_count() {
-        let scene = Scene::new(2500, 7);
+        let scene = DemoScene::new(2500, 7);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         for (pixel, view, frame) in [(1, 1, 1), (3, 2, 2)] {
             let scan = strides(pixel, view, frame);
@@ -160,10 +160,10 @@ mod tests {
                     pictures += 1;
                 }
             }
-            let sample = looked_at(&schedule, &scan, 1);
+            let sample = scoring_views(&schedule, &scan, 1);
             let frames = sample.chunk_by(|a, b| a.frame == b.frame).count();
             assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
-            let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
+            let one = Limits { max_kept_frames: 1, frames_together: 1, views_together: 1, ..Limits::NONE };
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
                 let look = || {
                     visible_contribution(
@@ -177,7 +177,7 @@ mod tests {
                 };
                 let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
-                    let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
+                    let expected = plain.in_pixels(i) * f64::from(pixel * pixel) / pictures as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
                     assert_eq!(seen.peak[i], f64::from(plain.max[i]), "W of {i} on {threads} threads");
                 }
@@ -187,11 +187,11 @@ mod tests {
 
     #[test]
     fn a_sampled_pixel_counts_for_all_it_skips() {
-        let scene = Scene::new(1200, 3);
+        let scene = DemoScene::new(1200, 3);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
-            let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
+            let sample = (&schedule.cameras[..], &scoring_views(&schedule, &scan, 1)[..]);
             let found =
                 visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE, &Events::IGNORED).unwrap();
             VisibleContribution::new(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
@@ -207,10 +207,10 @@ mod tests {
         // The first frame has no view among the training views.
         let mut schedule = ViewSchedule::new((0..3).map(|_| camera.clone()).collect());
         for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
-            schedule.push(count, &seen);
+            schedule.push_frames(count, &seen);
         }
         let taken = |view, frame| -> Vec<(usize, u32)> {
-            let sample = looked_at(&schedule, &strides(1, view, frame), 1);
+            let sample = scoring_views(&schedule, &strides(1, view, frame), 1);
             sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
         };
         assert_eq!(taken(3, 1), [(1, 0), (2, 1), (4, 2), (5, 0)]);
@@ -267,7 +267,7 @@ mod tests {
         };
         let schedule = rig.schedule(&info.times, None).unwrap();
         let recipe = Recipe::preset("default").unwrap();
-        let sample = looked_at(&schedule, &recipe.scan, 1);
+        let sample = scoring_views(&schedule, &recipe.scan, 1);
         let seen = visible_contribution(
             &Static(state, info),
             (&schedule.cameras, &sample),
@@ -300,11 +300,11 @@ mod tests {
 
     #[test]
     fn without_views_or_gaussians_results_are_zero() {
-        let scene = Scene::new(300, 2);
+        let scene = DemoScene::new(300, 2);
         let mut schedule = ViewSchedule::default();
-        schedule.push(2, &[]);
+        schedule.push_frames(2, &[]);
         let look = |source: &dyn FrameSource, schedule: &ViewSchedule| {
-            let sample = looked_at(schedule, &strides(1, 1, 1), 1);
+            let sample = scoring_views(schedule, &strides(1, 1, 1), 1);
             let sample = (&schedule.cameras[..], &sample[..]);
             let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE, &Events::IGNORED).unwrap();
             VisibleContribution::new(&found, sample.1.len(), NonZeroU32::MIN)

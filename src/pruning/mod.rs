@@ -16,7 +16,7 @@ pub use ranking::Ranking;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::recipe::{LowPriority, SelectParams};
+use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
 /// Ids of Gaussians that the user keeps or drops whatever their scores, in any order.
@@ -37,18 +37,18 @@ pub struct Selection {
     /// that stay.
     pub ranking: Ranking,
     /// Numbers of Gaussians kept and pruned by each stage.
-    pub counts: Counts,
+    pub counts: SelectionCounts,
 }
 
 /// Numbers of Gaussians at each stage of selection. Without the user's overrides, total = candidates + outside, and
 /// kept = candidates − pruned by stage 2 + rescued. "Outside" are the Gaussians that stage 1 does not make candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct Counts {
+pub struct SelectionCounts {
     /// Number N of all Gaussians.
     pub total: usize,
     /// Number of candidates: the top fraction by score S, which stage 1 takes.
     pub candidates: usize,
-    /// Number of Gaussians outside the candidates that stage 2 keeps nevertheless; 0 under [`LowPriority::Drop`].
+    /// Number of Gaussians outside the candidates that stage 2 keeps nevertheless; 0 under [`LowScorePolicy::Drop`].
     pub rescued: usize,
     /// Number of Gaussians outside the candidates that are pruned.
     pub pruned_by_stage_1: usize,
@@ -73,7 +73,7 @@ pub const WORKING_BYTES_PER_GAUSSIAN: usize =
 ///
 /// Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; ties by hashed
 /// id). Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D, where norm is the normalized score
-/// and τ a threshold of the recipe. It applies to the candidates, or under [`LowPriority::Rescue`] to all Gaussians. If
+/// and τ a threshold of the recipe. It applies to the candidates, or under [`LowScorePolicy::Rescue`] to all Gaussians. If
 /// both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
 /// them, and stage 2 prunes none.
 ///
@@ -86,8 +86,8 @@ pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> 
     let passes = passes(scores, recipe);
     let ordered = ranking::orders(scores, recipe, candidates, &passes);
 
-    let rescue = recipe.low_priority == LowPriority::Rescue;
-    let mut counts = Counts { total: n, candidates, ..Counts::default() };
+    let rescue = recipe.low_priority == LowScorePolicy::Rescue;
+    let mut counts = SelectionCounts { total: n, candidates, ..SelectionCounts::default() };
     let mut keep: Vec<bool> = (0..n)
         .map(|i| {
             let candidate = (ordered.by_score[i] as usize) < candidates;

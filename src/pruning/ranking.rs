@@ -5,7 +5,7 @@ use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
 use crate::model::hash_id;
-use crate::recipe::{LowPriority, SelectParams};
+use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
 /// Ids of the Gaussians in the order in which they are kept, best first.
@@ -26,7 +26,7 @@ impl Ranking {
     }
 
     /// Returns the first `m` ids of the ranking, or all if there are fewer, sorted by id.
-    pub fn take(&self, m: usize) -> Vec<u32> {
+    pub fn best_ids(&self, m: usize) -> Vec<u32> {
         let mut ids = self.order[..m.min(self.order.len())].to_vec();
         ids.sort_unstable();
         ids
@@ -40,7 +40,7 @@ pub(super) struct Orders {
     /// Position of every Gaussian by the descending maximum of norm(S_static)/τ_S and norm(S_dynamic)/τ_D (normalized
     /// scores divided by the thresholds of stage 2), ties by score S.
     by_rule: Vec<u32>,
-    /// Number of first Gaussians in `by_score` that stage 1 keeps; `None` under [`LowPriority::Rescue`], where stage 1
+    /// Number of first Gaussians in `by_score` that stage 1 keeps; `None` under [`LowScorePolicy::Rescue`], where stage 1
     /// excludes none.
     stage_1: Option<usize>,
     /// Number of Gaussians that pass stage 2, the thresholds of the static and dynamic score.
@@ -73,7 +73,7 @@ pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, 
     Orders {
         by_rule: positions(&by_rule),
         by_score,
-        stage_1: (recipe.low_priority == LowPriority::Drop).then_some(candidates),
+        stage_1: (recipe.low_priority == LowScorePolicy::Drop).then_some(candidates),
         stage_2: passes.iter().filter(|&&passes| passes).count(),
     }
 }

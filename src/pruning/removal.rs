@@ -38,7 +38,7 @@ pub fn removal_error(
     advance: impl Fn() + Sync,
 ) -> Result<RemovalError> {
     let mut workers = Workers::new(limits);
-    workers.show(
+    workers.for_each_view(
         RenderedSource { source, ids: Some(Ids::List(ids)), columns: Attributes::all() },
         cameras,
         pictures,
@@ -56,13 +56,13 @@ pub fn removal_error(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::Split;
-    use crate::passes::{VIEWS_PER_FRAME, gather, spread};
+    use crate::passes::{VIEWS_PER_FRAME, gather, select_evenly};
 
     #[test]
     fn errors_equal_a_plain_loop_on_any_thread_count() {
-        let scene = Scene::new(2500, 4);
+        let scene = DemoScene::new(2500, 4);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let ids: Vec<u32> = (0..2500).filter(|id| id % 3 != 1).collect();
         let background = [0.1, 0.2, 0.3];
@@ -74,9 +74,9 @@ mod tests {
             }
         }
         assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
-        let sample = spread(&schedule, usize::MAX, VIEWS_PER_FRAME);
-        assert_eq!(sample.len(), schedule.pairs());
-        let two = Limits { frames_held: 2, frames_together: 2, pictures_together: 2, ..Limits::NONE };
+        let sample = select_evenly(&schedule, usize::MAX, VIEWS_PER_FRAME);
+        assert_eq!(sample.len(), schedule.pair_count());
+        let two = Limits { max_kept_frames: 2, frames_together: 2, views_together: 2, ..Limits::NONE };
         for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let found = pool

@@ -6,16 +6,16 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::compressed_model::Reference;
+use crate::compressed_model::ReferenceFrame;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
-use crate::journal::records::{FlagSummary, Saved, TermSummary};
+use crate::journal::records::{FlagSummary, SavedCost, TermSummary};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
 use crate::model::{Attributes, Flags, Gaussians, Rows};
 use crate::models::trajectories::state_bytes;
-use crate::passes::{frames_to_see, gather};
+use crate::passes::{frames_to_cover, gather};
 use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
@@ -24,19 +24,19 @@ use crate::scene::Scene;
 use crate::statistics::aside::StatisticsRows;
 use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
-use crate::statistics::{fill_anisotropy, snap, ulp};
+use crate::statistics::{fill_anisotropy, snap_noise_to_zero, ulp};
 
 /// Name of the stage in messages and in the cache.
 pub(crate) const NAME: &str = "score";
 
 /// Bytes of memory per Gaussian while scoring, for its statistics, its scores and the selection.
-pub const SCORED_BYTES: u64 =
+pub const SCORING_BYTES_PER_GAUSSIAN: u64 =
     (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// Returns the bytes of memory per Gaussian that stay in use after scoring: those of the selection, and of the
 /// statistics unless these are in a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
-    let rows = if limits.rows_aside { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
+    let rows = if limits.statistics_on_disk { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
@@ -67,8 +67,9 @@ pub struct Scored {
     /// Number of frames of the scene.
     frames: usize,
     /// Number of frames that must be rendered so that Gaussians with short life spans are seen too; see
-    /// [`frames_to_see`].
-    pub frames_to_see: usize,
+    /// [`frames_to_cover`].
+    #[serde(rename = "frames_to_see")]
+    pub frames_to_cover: usize,
     /// Normalization of every term of the scores: percentiles and weight.
     pub terms: Vec<Term>,
     /// Numbers of Gaussians with unusual values, such as NaN.
@@ -82,7 +83,7 @@ pub struct Scored {
     pub absent: Vec<u32>,
     /// Reference frame (in which most Gaussians are alive and at which they are compared with one another), and scene
     /// extent.
-    pub reference: Reference,
+    pub reference: ReferenceFrame,
     /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
     /// coordinate.
     pub position_ulp: f64,
@@ -103,23 +104,23 @@ pub struct UserOverrides {
 impl ScoreStage {
     /// Estimates the memory and time that this stage needs for the input `work`: statistics, scores, a selection, and
     /// the states at one frame.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         ResourceEstimate {
             stage: NAME,
-            reads: work.reads(1, limits),
-            seconds: 2e-6 * work.count(),
+            reads: work.full_reads(1, limits),
+            seconds: 2e-6 * work.gaussian_count(),
             per_gaussian: vec![
-                ("rows", SCORED_BYTES),
+                ("rows", SCORING_BYTES_PER_GAUSSIAN),
                 ("sorting", pruning::WORKING_BYTES_PER_GAUSSIAN as u64),
-                ("states", work.state(Attributes::POSITION | Attributes::LOG_SCALE)),
+                ("states", work.state_bytes(Attributes::POSITION | Attributes::LOG_SCALE)),
             ],
-            fixed: vec![work.arriving()],
+            fixed: vec![work.filling_blocks()],
         }
     }
 
     /// Returns the increasing ids of the Gaussians that are dropped because a value is not finite; none if the recipe
     /// does not drop them.
-    pub fn absent(&self, rows: &Rows) -> Vec<u32> {
+    pub fn absent_ids(&self, rows: &Rows) -> Vec<u32> {
         if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
@@ -147,10 +148,10 @@ impl ScoreStage {
             }
         }
         let reference_frame = first_of_largest(&scanned.alive_per_frame);
-        journal.stage(NAME, info.count, source, |journal| {
+        journal.run_stage(NAME, info.count, source, |journal| {
             let progress = scene.events.task(NAME, "Gaussians", info.count as u64);
             if self.snap_noise {
-                snap(&mut rows, scanned.largest_coordinate);
+                snap_noise_to_zero(&mut rows, scanned.largest_coordinate);
             }
             let all: Vec<u32> = (0..info.count as u32).collect();
             let state = match info.times.is_empty() {
@@ -167,7 +168,7 @@ impl ScoreStage {
                     .extend(all.iter().copied().filter(|&id| is_inside(&corners, state.position.row(id as usize))));
             }
             let mut drop = self.user.drop.clone();
-            let absent = self.absent(&rows);
+            let absent = self.absent_ids(&rows);
             match self.non_finite {
                 NonFinite::Error => refuse_non_finite(scene, &rows)?,
                 NonFinite::Drop => drop.extend(&absent),
@@ -180,15 +181,15 @@ impl ScoreStage {
             let scores = score(&rows, info.times.len(), &self.score);
             let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop };
             let selection = select(&scores, &self.select, &overrides)?;
-            let reference = Reference { frame: reference_frame, extent };
+            let reference = ReferenceFrame { frame: reference_frame, extent };
             let position_ulp = ulp(scanned.largest_coordinate);
             let median_life = median_life(&rows.life);
             let scored = Scored {
                 frames: info.times.len(),
-                frames_to_see: frames_to_see(&rows.life, info.times.len()),
+                frames_to_cover: frames_to_cover(&rows.life, info.times.len()),
                 terms: scores.terms,
                 flags: flags(&rows),
-                statistics: match scene.limits.rows_aside {
+                statistics: match scene.limits.statistics_on_disk {
                     true => StatisticsRows::aside(rows, &scene.scratch)?,
                     false => StatisticsRows::Memory(rows),
                 },
@@ -254,7 +255,7 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
              give the cameras of this scene",
             scene.rig.origin,
             scene.path.shown(),
-            scene.schedule.pairs()
+            scene.schedule.pair_count()
         )));
     }
     Ok(())
@@ -267,7 +268,7 @@ impl Scored {
     /// Fails if the scratch file cannot be written.
     pub(crate) fn within(self, limits: &Limits, folder: &Path) -> Result<Scored> {
         Ok(match self.statistics {
-            StatisticsRows::Memory(rows) if limits.rows_aside => {
+            StatisticsRows::Memory(rows) if limits.statistics_on_disk => {
                 Scored { statistics: StatisticsRows::aside(rows, folder)?, ..self }
             }
             _ => self,
@@ -281,8 +282,8 @@ impl Scored {
 
     /// Returns the ids of all Gaussians except those dropped because a value is not finite ([`Scored::absent`]),
     /// increasing.
-    pub fn present(&self) -> Vec<u32> {
-        (0..self.count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
+    pub fn present_ids(&self) -> Vec<u32> {
+        (0..self.gaussian_count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
     }
 
     /// Returns the statistics of every Gaussian, read back from the scratch file if they are there.
@@ -303,12 +304,12 @@ impl Scored {
     }
 
     /// Returns the ranking of the Gaussians, best first.
-    pub fn ranked(&self) -> Ranking {
+    pub fn ranking(&self) -> Ranking {
         self.selection.ranking.clone()
     }
 
     /// Returns the number of all Gaussians of the scene.
-    pub fn count(&self) -> usize {
+    pub fn gaussian_count(&self) -> usize {
         self.statistics.len()
     }
 
@@ -327,7 +328,7 @@ impl Scored {
             name: term.of.name().to_owned(),
             p1: term.norm.p1,
             p99: term.norm.p99,
-            active: term.norm.is_active(),
+            active: term.norm.has_spread(),
         };
         self.terms.iter().map(summarize).collect()
     }
@@ -352,16 +353,16 @@ impl Scored {
                 let why = format!("{} is the same in every frame", column.name());
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
-                journal.spare(saved_reads(column), why, Saved::Values { bytes });
+                journal.record_saving(saved_reads(column), why, SavedCost::Values { bytes });
             }
         }
         if info.sh_degree == 0 {
             journal.leave_out("SH coefficients above degree 0", "SH degree 0");
         }
         let was_measured = |term: &&Term| !(is_partial && term.of.describes_motion());
-        for term in self.terms.iter().filter(was_measured).filter(|term| !term.norm.is_active()) {
+        for term in self.terms.iter().filter(was_measured).filter(|term| !term.norm.has_spread()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
-            journal.leave_out(format!("grading by {}", term.of.property()), why);
+            journal.leave_out(format!("grading by {}", term.of.measured_property()), why);
         }
         for (count, what) in [
             (self.flags.non_finite, "with NaN or infinity"),

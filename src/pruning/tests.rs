@@ -20,7 +20,7 @@ fn scores(parts: &[(f64, f64)]) -> Scores {
     }
 }
 
-fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> SelectParams {
+fn rule(low_priority: LowScorePolicy, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> SelectParams {
     let paper = Recipe::preset("paper").unwrap().select;
     SelectParams { keep_fraction, tau_static, tau_dynamic, low_priority, ..paper }
 }
@@ -43,7 +43,7 @@ fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
         .map(|i| {
             let passes =
                 !graded || scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic;
-            passes && (recipe.low_priority == LowPriority::Rescue || candidates.contains(&i))
+            passes && (recipe.low_priority == LowScorePolicy::Rescue || candidates.contains(&i))
         })
         .collect()
 }
@@ -59,7 +59,7 @@ fn sign_of_zero_changes_no_ranking() {
     let parts = |zero: f64| -> Vec<(f64, f64)> {
         (0..60).map(|i| if i % 3 == 0 { (zero, zero) } else { ([0.0, 0.5][i % 2], 0.0) }).collect()
     };
-    for low_priority in [LowPriority::Drop, LowPriority::Rescue] {
+    for low_priority in [LowScorePolicy::Drop, LowScorePolicy::Rescue] {
         let recipe = rule(low_priority, 0.8, 0.05, 0.05);
         let [plus, minus] = [0.0, -0.0].map(|zero| without_overrides(&scores(&parts(zero)), &recipe));
         assert_eq!((plus.keep, plus.ranking.order()), (minus.keep, minus.ranking.order()));
@@ -70,7 +70,7 @@ fn any_rule() -> impl Strategy<Value = SelectParams> {
     let tau = || prop_oneof![Just(0.0), Just(0.05), Just(0.5), Just(1.25)];
     let fraction = prop_oneof![Just(0.0), Just(1.0), 0.0..=1.0f64];
     (any::<bool>(), fraction, tau(), tau()).prop_map(|(rescue, fraction, tau_static, tau_dynamic)| {
-        rule(if rescue { LowPriority::Rescue } else { LowPriority::Drop }, fraction, tau_static, tau_dynamic)
+        rule(if rescue { LowScorePolicy::Rescue } else { LowScorePolicy::Drop }, fraction, tau_static, tau_dynamic)
     })
 }
 
@@ -87,8 +87,8 @@ proptest! {
         let selection = without_overrides(&scores, &recipe);
         prop_assert_eq!(&selection.keep, &kept_by_definition(&scores, &recipe));
         let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
-        prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
-        prop_assert_eq!(selection.ranking.take(usize::MAX), (0..parts.len() as u32).collect::<Vec<_>>());
+        prop_assert_eq!(selection.ranking.best_ids(selection.counts.kept), kept);
+        prop_assert_eq!(selection.ranking.best_ids(usize::MAX), (0..parts.len() as u32).collect::<Vec<_>>());
         let counts = selection.counts;
         prop_assert_eq!(counts.kept, counts.candidates - counts.pruned_by_stage_2 + counts.rescued);
         prop_assert_eq!(counts.total, counts.kept + counts.pruned_by_stage_1 + counts.pruned_by_stage_2);
@@ -108,10 +108,10 @@ proptest! {
             let expected = match decisions[i] { 0 => true, 1 => false, _ => natural };
             prop_assert_eq!(selection.keep[i], expected, "Gaussian {}", i);
         }
-        prop_assert_eq!(selection.ranking.take(overrides.keep_ids.len()), overrides.keep_ids.clone());
+        prop_assert_eq!(selection.ranking.best_ids(overrides.keep_ids.len()), overrides.keep_ids.clone());
         prop_assert_eq!(selection.ranking.order().len(), parts.len() - overrides.drop_ids.len());
         let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
-        prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
+        prop_assert_eq!(selection.ranking.best_ids(selection.counts.kept), kept);
     }
 }
 
@@ -120,8 +120,8 @@ fn kept_set_leads_the_ranking_if_the_best_fail_stage_2() {
     let parts: Vec<(f64, f64)> = (0..100).map(|i| (if i == 0 { 0.0 } else { 1.0 }, 0.0)).collect();
     let mut scores = scores(&parts);
     scores.score = (0..100).map(|i| -f64::from(i)).collect();
-    let selection = without_overrides(&scores, &rule(LowPriority::Drop, 0.02, 0.5, 0.5));
-    assert_eq!((selection.counts.kept, selection.ranking.take(1)), (1, vec![1]));
+    let selection = without_overrides(&scores, &rule(LowScorePolicy::Drop, 0.02, 0.5, 0.5));
+    assert_eq!((selection.counts.kept, selection.ranking.best_ids(1)), (1, vec![1]));
 }
 
 #[test]
@@ -147,7 +147,7 @@ fn presets_follow_their_low_priority() {
 #[test]
 fn identical_gaussians_are_pruned_by_hashed_id() {
     let scores = scores(&vec![(0.5, 0.5); 1001]);
-    let selection = without_overrides(&scores, &rule(LowPriority::Drop, 0.3, 0.05, 0.05));
+    let selection = without_overrides(&scores, &rule(LowScorePolicy::Drop, 0.3, 0.05, 0.05));
     assert_eq!(selection.counts.kept, 300);
     let mut by_hash: Vec<u32> = (0..1001).collect();
     by_hash.sort_by_key(|&id| hash_id(id.into()));
@@ -159,15 +159,15 @@ fn identical_gaussians_are_pruned_by_hashed_id() {
 #[test]
 fn without_candidates_the_ranking_still_follows_the_score() {
     let parts: Vec<(f64, f64)> = (0..50).map(|i| (f64::from(i), 0.0)).collect();
-    let selection = without_overrides(&scores(&parts), &rule(LowPriority::Drop, 0.0, 0.05, 0.05));
+    let selection = without_overrides(&scores(&parts), &rule(LowScorePolicy::Drop, 0.0, 0.05, 0.05));
     assert_eq!(selection.counts.kept, 0);
-    assert_eq!(selection.ranking.take(3), [47, 48, 49]);
+    assert_eq!(selection.ranking.best_ids(3), [47, 48, 49]);
 }
 
 #[test]
 fn errors_name_conflicting_and_unknown_ids() {
     let scores = scores(&[(0.0, 0.0); 4]);
-    let recipe = rule(LowPriority::Rescue, 0.5, 0.05, 0.05);
+    let recipe = rule(LowScorePolicy::Rescue, 0.5, 0.05, 0.05);
     for (overrides, id) in [
         (Overrides { keep_ids: vec![1, 2], drop_ids: vec![2] }, "2"),
         (Overrides { keep_ids: vec![7], drop_ids: vec![] }, "7"),
@@ -188,7 +188,7 @@ fn selection_ignores_thread_count() {
     let parts: Vec<(f64, f64)> =
         (0..20_000u64).map(|i| ((hash_id(i) % 50) as f64 / 50.0, (hash_id(i + 7) % 9) as f64 / 9.0)).collect();
     let scores = scores(&parts);
-    let recipe = rule(LowPriority::Drop, 0.6, 0.3, 0.5);
+    let recipe = rule(LowScorePolicy::Drop, 0.6, 0.3, 0.5);
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| without_overrides(&scores, &recipe))

@@ -5,9 +5,9 @@ use std::ops::Range;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
-use crate::memory_plan::{LOOK, ResourceEstimate, Workload};
+use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rows, Statistic};
-use crate::passes::{frames_to_see, looked_at};
+use crate::passes::{frames_to_cover, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
@@ -19,27 +19,28 @@ pub(crate) const NAME: &str = "visible";
 /// Stage that renders views to measure the contribution C of every Gaussian (mean Σ alpha · transmittance) and its peak
 /// W (maximum in one pixel).
 #[derive(Debug, Clone)]
-pub struct Visible {
+pub struct VisibilityStage {
     /// Parameters of the scan. Used are the strides of pixels, views and frames, and the maximum number of views.
     pub recipe: recipe::ScanParams,
 }
 
-impl Visible {
+impl VisibilityStage {
     /// Returns the stage, or `None` if `recipe` does not measure C by renders. `has_cameras`: whether the scene has
     /// cameras of its own, rather than a virtual rig.
-    pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<Visible> {
+    pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<VisibilityStage> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,
             Coverage::Visible => true,
             Coverage::Projected => false,
         };
-        looks.then(|| Visible { recipe: recipe.clone() })
+        looks.then(|| VisibilityStage { recipe: recipe.clone() })
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan,
     /// contribution C and peak W of every Gaussian, and the views being rendered.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let (mut per_gaussian, mut fixed) = work.looking(limits, Attributes::all().difference(Attributes::SH), 12);
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        let (mut per_gaussian, mut fixed) =
+            work.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let strided = work.pictures as f64 / every;
         let max_views = match self.recipe.look_pictures {
@@ -50,14 +51,14 @@ impl Visible {
         let frames = if strided > max_views { frames.min(max_views as u64) } else { frames };
         let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
         per_gaussian.insert(0, ("rows", rows as u64));
-        fixed.push(Workload::listed(strided.min(max_views)));
+        fixed.push(Workload::view_list(strided.min(max_views)));
         if every > 1.0 {
             // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
-        let seconds =
-            work.reading(work.count(), frames as f64) + work.render_seconds(strided.min(max_views), work.count(), LOOK);
-        ResourceEstimate { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
+        let seconds = work.reading_seconds(work.gaussian_count(), frames as f64)
+            + work.render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
+        ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
     /// Returns whether the views of a frame can be chosen as soon as the frame has been read. If the number of views is
@@ -74,16 +75,16 @@ impl Visible {
     pub fn run(&self, scene: &Scene, life: &[u32], journal: &mut Journal) -> Result<VisibleContribution> {
         let source = scene.source();
         let count = source.info().count;
-        let frames = frames_to_see(life, source.info().times.len());
-        let pictures = looked_at(&scene.schedule, &self.recipe, frames);
+        let frames = frames_to_cover(life, source.info().times.len());
+        let pictures = scoring_views(&scene.schedule, &self.recipe, frames);
         let stride = self.recipe.pixel_stride;
         let cameras = &scene.schedule.cameras[..];
         let look = |range: Range<usize>| {
             visible_contribution(source, (cameras, &pictures[range]), stride, scene.limits, &scene.events)
         };
-        let seen: Result<VisibleContribution> = journal.stage(NAME, count, source, |_| {
+        let seen: Result<VisibleContribution> = journal.run_stage(NAME, count, source, |_| {
             let key = scene.work.key(&(&pictures, stride));
-            let found = scene.work.divided(NAME, key, pictures.len(), look, |parts| {
+            let found = scene.work.compute_in_shards(NAME, key, pictures.len(), look, |parts| {
                 let mut sum = Contribution::new(count);
                 for fraction in parts {
                     sum.merge(&fraction?);
@@ -139,8 +140,9 @@ mod tests {
     #[test]
     fn virtual_rigs_are_used_only_on_request() {
         let mut recipe = Recipe::preset("default").unwrap().scan;
-        let looks =
-            |recipe: &recipe::ScanParams| [true, false].map(|cameras| Visible::from_recipe(recipe, cameras).is_some());
+        let looks = |recipe: &recipe::ScanParams| {
+            [true, false].map(|cameras| VisibilityStage::from_recipe(recipe, cameras).is_some())
+        };
         assert_eq!(looks(&recipe), [true, false]);
         recipe.coverage = Coverage::Visible;
         assert_eq!(looks(&recipe), [true, true]);

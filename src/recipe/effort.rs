@@ -64,7 +64,7 @@ impl Recipe {
     pub fn with_effort(&self, effort: Effort) -> Recipe {
         let Some(settings) = effort.settings() else { return self.clone() };
         let steps = settings.steps * f64::from(self.refine.refine_steps);
-        let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
+        let mut recipe = self.with_refinement_steps((steps.ceil() as u32).min(MOST_STEPS));
         // Effort `fast` never raises a value of the recipe, and effort `best` never lowers one.
         let less = settings.steps < 1.0;
         let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };

@@ -15,9 +15,9 @@ use crate::model::Attributes;
 pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
 pub use sections::{
-    Anisotropy, AttributeGroups, Coverage, FieldParams, LengthUnit, LowPriority, MergeParams, MergePass, MotionParams,
-    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanFrames, ScanParams, ScoreParams, SelectParams,
-    ShDegreeParams, ShDegreeRule, ShHigh, StaticTerm, Trajectory,
+    Anisotropy, AttributeGroups, Coverage, FieldParams, FieldPrecision, LengthUnit, LowScorePolicy, MergeParams,
+    MergePass, MotionParams, MotionSimilarity, NonFinite, ProxyHigherSh, ProxyOpacity, ProxyPosition, RefineParams,
+    ScanFrames, ScanParams, ScoreParams, SelectParams, ShDegreeParams, ShDegreeRule, StaticScoreTerm,
 };
 
 /// Text of the preset `paper`, with a comment on every parameter.
@@ -82,7 +82,7 @@ impl Recipe {
 
     /// Returns this recipe with the parameter `key` of the table `section` set from the text `value`: a TOML value, or
     /// a name without quotes.
-    pub fn with(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
+    pub fn with_parameter(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
         let number = value.parse::<f64>().map(toml::Value::Float);
         let whole = value.parse::<i64>().map(toml::Value::Integer);
         let truth = value.parse::<bool>().map(toml::Value::Boolean);
@@ -99,7 +99,7 @@ impl Recipe {
     }
 
     /// Returns this recipe with refinement turned off.
-    pub fn unrefined(&self) -> Recipe {
+    pub fn without_refinement(&self) -> Recipe {
         let mut recipe = self.clone();
         recipe.refine.refine = AttributeGroups(Attributes::empty());
         recipe
@@ -107,7 +107,7 @@ impl Recipe {
 
     /// Returns this recipe with `steps` optimization steps. The steps before each prune step (removal of the
     /// lowest-ranked Gaussians) change in proportion.
-    pub fn refining_by(&self, steps: u32) -> Recipe {
+    pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
         let before_cuts = u64::from(refine.refine_cut_steps) * u64::from(steps);

@@ -76,7 +76,7 @@ pub enum NonFinite {
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct ScoreParams {
-    pub static_term: StaticTerm,
+    pub static_term: StaticScoreTerm,
     pub w_static: f64,
     pub w_dynamic: f64,
     pub lambda: f64,
@@ -92,7 +92,7 @@ pub struct ScoreParams {
 /// First term of the static score S_static (importance of a Gaussian without regard to its motion).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum StaticTerm {
+pub enum StaticScoreTerm {
     /// Mean contribution C of the Gaussian per view.
     Mean,
     /// Peak contribution W: the largest alpha · transmittance in any pixel.
@@ -119,7 +119,7 @@ pub struct SelectParams {
     pub keep_fraction: f64,
     pub tau_static: f64,
     pub tau_dynamic: f64,
-    pub low_priority: LowPriority,
+    pub low_priority: LowScorePolicy,
     pub round_fraction: f64,
     pub round_pictures: usize,
     pub round_turns: usize,
@@ -130,7 +130,7 @@ pub struct SelectParams {
 /// Treatment of Gaussians that stage 1 of the paper (choice of candidates by score) does not keep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum LowPriority {
+pub enum LowScorePolicy {
     /// Gaussians that are not candidates are removed.
     Drop,
     /// Stage 2 decides on Gaussians that are not candidates in the same way as on candidates.
@@ -146,13 +146,13 @@ pub struct MergeParams {
     pub max_neighbors: usize,
     pub max_scale_ratio: f64,
     pub max_color_difference: f64,
-    pub trajectory: Trajectory,
+    pub trajectory: MotionSimilarity,
     pub motion_noise: f64,
     pub max_drift: f64,
     pub max_dead_time: f64,
-    pub placement: Placement,
+    pub placement: ProxyPosition,
     pub opacity: ProxyOpacity,
-    pub sh_high: ShHigh,
+    pub sh_high: ProxyHigherSh,
     pub passes: Vec<MergePass>,
 }
 
@@ -174,7 +174,7 @@ pub struct RefineParams {
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct FieldParams {
-    pub field: Precision,
+    pub field: FieldPrecision,
     pub field_margin: f64,
 }
 
@@ -227,7 +227,7 @@ impl From<ShDegreeRule> for String {
 /// Number format in which the deformation field (network or polynomial that moves the Gaussians) is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Precision {
+pub enum FieldPrecision {
     /// Unchanged from the input, byte for byte.
     #[default]
     Exact,
@@ -307,7 +307,7 @@ impl LengthUnit {
 /// the next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Trajectory {
+pub enum MotionSimilarity {
     /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
     Cosine,
     /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame;
@@ -318,7 +318,7 @@ pub enum Trajectory {
 /// Position of a proxy (Gaussian that replaces a merged cluster).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Placement {
+pub enum ProxyPosition {
     /// Weighted mean of the positions of the cluster's members.
     Mean,
     /// Position of the leader, the member to which the others were joined. Second moments are then taken about this
@@ -341,7 +341,7 @@ pub enum ProxyOpacity {
 /// Source of the SH coefficients above degree 0 of a proxy (Gaussian that replaces a merged cluster).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum ShHigh {
+pub enum ProxyHigherSh {
     /// Weighted average of the SH coefficients of the cluster's members.
     Average,
     /// SH coefficients of the cluster's member with the largest weight.

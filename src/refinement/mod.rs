@@ -28,7 +28,8 @@ use std::num::NonZeroU32;
 use crate::cache::CacheKey;
 use crate::limits::Limits;
 use crate::memory_plan::{
-    MemoryPart, REMOVE, RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors,
+    MemoryPart, REMOVAL_COST, RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload,
+    bytes_of_survivors,
 };
 use crate::model::{Attributes, NO_SH_LIMIT};
 use crate::pruning::score::scored_memory;
@@ -177,26 +178,26 @@ impl RefineStage {
 
     /// Returns the smallest fraction of all Gaussians with which refinement begins before it prunes further in prune
     /// steps; `None` if there are no prune steps.
-    pub fn starts_at(&self) -> Option<f64> {
+    pub fn start_fraction(&self) -> Option<f64> {
         self.cuts.then_some(MIN_START_FRACTION)
     }
 
     /// Returns how many of the `all` Gaussians of the model refinement begins with if it is to end with `wanted`.
-    pub fn first(&self, wanted: usize, all: usize) -> usize {
-        start_count(self.starts_at(), wanted, all)
+    pub fn initial_count(&self, wanted: usize, all: usize) -> usize {
+        start_count(self.start_fraction(), wanted, all)
     }
 
     /// Estimates the memory and time that this stage needs for the input `work`: frame states, the optimizer, and a
     /// view with its gradient.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
-        let read = [("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        let whole = work.state_bytes(Attributes::all());
+        let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         let left = [
             ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
-            ("mean", 2 * work.state(self.columns)),
+            ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
             ("result", work.input.reduced),
@@ -211,7 +212,7 @@ impl RefineStage {
         let (wanted, keyframe_count) = (self.target.unwrap_or(1.0).min(1.0), self.keyframes_for(work));
         // The last two terms hold a copy of the best time-varying delta so far.
         let keyframe_bytes = optimizer::bytes_per_gaussian(self.columns, 0) as u64
-            + work.state(self.columns.difference(Attributes::SH))
+            + work.state_bytes(self.columns.difference(Attributes::SH))
             + 12;
         let keyframe_steps =
             (keyframe_count > 0).then(|| phase(wanted, Some(("course", keyframe_count as u64 * keyframe_bytes))));
@@ -221,12 +222,13 @@ impl RefineStage {
         let [own, between] = targets::view_counts(self.pictures, work.pixels);
         let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
-        let prune_counts = prune_counts(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
+        let prune_counts =
+            prune_counts(self.initial_count((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
         let validation_renders = pictures / targets::validation_every(own + between) as f64 * 4.0;
         let on_grid = |stride: NonZeroU32| Workload { pixels: work.pixels / u64::from(stride.get()).pow(2), ..*work };
         let seconds = |(k, &size): (usize, &usize)| {
-            let (count, left) = (size as f64 / 1e6 * work.count(), (wanted * 1e6) as usize);
+            let (count, left) = (size as f64 / 1e6 * work.gaussian_count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {
                 true => (steps, validation_renders, 0.0),
                 false => (self.steps_before(size, left), RATE_VIEWS as f64, RANKING_VIEWS as f64),
@@ -235,22 +237,22 @@ impl RefineStage {
             // states.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
             let strided = on_grid(self.stride(work.pixels, count as usize));
-            work.reading(count, frames as f64 * found)
-                + work.render_seconds(renders, count, RENDER)
-                + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER)
-                + strided.render_seconds(ranked, count, REMOVE)
+            work.reading_seconds(count, frames as f64 * found)
+                + work.render_seconds(renders, count, RENDER_COST)
+                + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER_COST)
+                + strided.render_seconds(ranked, count, REMOVAL_COST)
         };
-        let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.count());
+        let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
         let stored = on_grid(self.stored_stride(work.pixels, first as usize));
         ResourceEstimate {
             stage: NAME,
-            reads: 2.0 * work.scattered_reads(frames, limits),
-            seconds: 2.0 * work.reading(work.count(), frames as f64)
-                + stored.render_seconds(pictures, work.count(), RENDER)
+            reads: 2.0 * work.scattered_full_reads(frames, limits),
+            seconds: 2.0 * work.reading_seconds(work.gaussian_count(), frames as f64)
+                + stored.render_seconds(pictures, work.gaussian_count(), RENDER_COST)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
-                work.arriving(),
+                work.filling_blocks(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
                 ("views", (work.threads + 4) * 12 * work.pixels),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),

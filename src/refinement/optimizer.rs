@@ -39,7 +39,7 @@ impl RateSchedule {
     }
 
     /// Returns a copy of this schedule with all rates multiplied by `part`.
-    pub fn times(self, part: f32) -> RateSchedule {
+    pub fn scaled_by(self, part: f32) -> RateSchedule {
         RateSchedule { factor: part * self.factor, ..self }
     }
 
@@ -85,7 +85,7 @@ impl Adam {
     }
 
     /// Returns the delta: present parameters minus start parameters.
-    pub fn change(&self) -> &ParamDelta {
+    pub fn delta(&self) -> &ParamDelta {
         &self.change
     }
 
@@ -95,7 +95,7 @@ impl Adam {
     }
 
     /// Returns the delta and resets it to 0. The caller has to add the delta to the start parameters.
-    pub fn take(&mut self) -> ParamDelta {
+    pub fn take_delta(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
@@ -104,8 +104,8 @@ impl Adam {
     /// Restarts the optimizer with the delta `change` and with running means of 0. Attributes that `change` does not
     /// have get a delta of 0.
     pub fn restart(&mut self, change: &ParamDelta) {
-        self.take();
-        for column in (self.columns & change.columns()).iter() {
+        self.take_delta();
+        for column in (self.columns & change.attributes()).iter() {
             self.change.0.column_mut(column).clone_from(change.0.column(column));
         }
         for means in &mut self.means {
@@ -193,11 +193,11 @@ mod tests {
         let mut descent = Adam::new(&start, Attributes::all(), 0, &[false, true, false]);
         for _ in 0..2000 {
             let mut now = start.clone();
-            descent.change().add_to(&mut now, Attributes::all());
+            descent.delta().add_to(&mut now, Attributes::all());
             descent.step(&slopes(&now, 0.25), 1.0, &RateSchedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();
-        descent.change().add_to(&mut end, Attributes::all());
+        descent.delta().add_to(&mut end, Attributes::all());
         for column in Attributes::all().iter() {
             for c in 0..end.column(column).width() {
                 let plane = end.column(column).plane(c);
@@ -224,7 +224,7 @@ mod tests {
             let size = (mean / (1.0 - 0.9f64.powi(t))) / (square / (1.0 - 0.999f64.powi(t))).sqrt();
             let rate = 0.05 * 0.25 * (f64::from(t) / 10.0).min(1.0) * 0.05f64.powf(k as f64 / steps as f64);
             value -= rate * size;
-            let got = f64::from(descent.change().0.opacity_logit.row::<1>(0)[0]);
+            let got = f64::from(descent.delta().0.opacity_logit.row::<1>(0)[0]);
             assert!((got - value).abs() < 1e-5, "step {k}: got {got}, expected {value}");
         }
     }
@@ -239,7 +239,7 @@ mod tests {
             }
             descent.step(&gradients, 1.0, &RateSchedule::new(10, 0.05, 1.0));
         }
-        let change = descent.change();
+        let change = descent.delta();
         assert!(Attributes::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));
     }
 }

@@ -12,7 +12,7 @@ use super::targets::Targets;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, SequenceInfo, StoredParams};
-use crate::passes::States;
+use crate::passes::FrameStates;
 use crate::refinement::optimizer::{Adam, RateSchedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
@@ -141,11 +141,11 @@ impl<'a> OptimizerState<'a> {
         if deformation.is_some() {
             optimizer.reevaluate_states()?;
         } else {
-            let wanted = ReadPlan::new(optimizer.frames.clone()).holding(scene.limits.frames_held);
-            let mut states = States::open(result, &wanted)?;
+            let wanted = ReadPlan::new(optimizer.frames.clone()).keeping_at_most(scene.limits.max_kept_frames);
+            let mut states = FrameStates::open(result, &wanted)?;
             let mut linearized = LinearizedFramesWriter::new(&scene.scratch, varying)?;
             for &frame in &optimizer.frames {
-                let state = states.at(frame)?.clone();
+                let state = states.read(frame)?.clone();
                 if let Some(LinearizedState { state: first, .. }) = linearized.first() {
                     for column in varying.iter() {
                         let (first, now) = (first.column(column), state.column(column));
@@ -193,12 +193,12 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the delta that varies with time, as its values at the keyframes.
     pub(super) fn course(&self) -> TrajectoryDelta {
-        TrajectoryDelta(self.course.iter().map(|knot| knot.change().clone()).collect())
+        TrajectoryDelta(self.course.iter().map(|knot| knot.delta().clone()).collect())
     }
 
     /// Returns the two keyframes around frame `frames[k]` with their interpolation weights.
     fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
-        TrajectoryDelta::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
+        TrajectoryDelta::keyframe_weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
     /// Returns for each Gaussian whether it is excluded from optimization.
@@ -209,7 +209,7 @@ impl<'a> OptimizerState<'a> {
     /// Returns the total delta of the stored parameters that is constant in time.
     pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
-        if self.descent.has_moved() { before.and(self.descent.change().clone()) } else { before }
+        if self.descent.has_moved() { before.plus(self.descent.delta().clone()) } else { before }
     }
 
     /// Evaluates the frame states anew from the stored parameters. Does nothing without a deformation field, because
@@ -248,7 +248,7 @@ impl<'a> OptimizerState<'a> {
     /// Fails if a scratch file cannot be written.
     pub(super) fn resume(&mut self, (reevaluated, descent, steps, course): KeptCheckpoint) -> Result<()> {
         if let Some((stored, before)) = reevaluated {
-            self.descent.take();
+            self.descent.take_delta();
             (self.stored, self.before) = (stored, before);
             self.reevaluate_states()?;
         }
@@ -265,7 +265,7 @@ impl<'a> OptimizerState<'a> {
     pub(super) fn positions(&self) -> AttributeValues {
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
         let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
-        self.descent.change().add_to(&mut moved, Attributes::POSITION);
+        self.descent.delta().add_to(&mut moved, Attributes::POSITION);
         moved.position
     }
 
@@ -275,7 +275,7 @@ impl<'a> OptimizerState<'a> {
     /// # Errors
     /// Fails if a scratch file cannot be written.
     pub(super) fn restart_from(&mut self, change: &ParamDelta) -> Result<()> {
-        self.descent.restart(&change.since(&self.before));
+        self.descent.restart(&change.minus(&self.before));
         self.reevaluate_states()
     }
 
@@ -285,11 +285,11 @@ impl<'a> OptimizerState<'a> {
         if !self.descent.has_moved() {
             return;
         }
-        let moved = self.descent.take();
+        let moved = self.descent.take_delta();
         if self.deformation.is_some() {
             moved.add_to(&mut self.stored.gaussians, Attributes::all());
         }
-        self.before = std::mem::take(&mut self.before).and(moved);
+        self.before = std::mem::take(&mut self.before).plus(moved);
     }
 
     /// Removes all Gaussians except those with the indices `places`. The others keep their present states.
@@ -318,14 +318,14 @@ impl<'a> OptimizerState<'a> {
     /// Computes the present state of frame `frames[k]`, deltas included, into `now`.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
-        let change = self.descent.change();
+        let change = self.descent.delta();
         match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
         }
         if !self.course.is_empty() {
             let deltas = self.keyframes_around(k).map(|(knot, weight)| {
-                let change = self.course[knot].change();
+                let change = self.course[knot].delta();
                 let mut change = now.present.as_ref().map_or_else(|| change.clone(), |present| change.pick(present));
                 change.scale(weight);
                 change

@@ -8,16 +8,16 @@ use crate::journal::Journal;
 
 /// Models that a search for a size has pruned and refined so far. A new size is pruned from the smallest model that has
 /// at least as many Gaussians.
-pub struct PruneSteps<'a> {
+pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
     /// Models made so far, from large to small.
     models: Vec<CompressedModel>,
 }
 
-impl<'a> PruneSteps<'a> {
+impl<'a> PrunedModels<'a> {
     /// Creates an empty list; `refinement` will make its models.
-    pub(crate) fn new(refinement: RefineRun<'a>) -> PruneSteps<'a> {
-        PruneSteps { refinement, models: Vec::new() }
+    pub(crate) fn new(refinement: RefineRun<'a>) -> PrunedModels<'a> {
+        PrunedModels { refinement, models: Vec::new() }
     }
 
     /// Returns a refined model of `size` Gaussians. Prunes it from the smallest earlier model with at least `size`

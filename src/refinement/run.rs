@@ -57,8 +57,8 @@ impl RefineStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let count = reduction.len();
-        let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
-        if count == 0 || scene.schedule.pairs() == 0 {
+        let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
+        if count == 0 || scene.schedule.pair_count() == 0 {
             journal.leave_out("refinement", "there are no Gaussians or no views");
             return Ok(reduction);
         }
@@ -68,7 +68,7 @@ impl RefineStage {
         }
         let key = scene.work.key(&(self.key(), &reduction, wanted, steps, &scored.protected));
         let run = |journal: &mut Journal| {
-            journal.stage(NAME, count, scene.source(), |journal| {
+            journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
                     Targets::new(scene, self.pictures, self.stored_stride(scene.workload().pixels, count), false)?;
                 scene.work.end_shard_before(NAME)?;
@@ -76,7 +76,7 @@ impl RefineStage {
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
             })
         };
-        journal.kept(&scene.work, NAME, key, run)
+        journal.cached(&scene.work, NAME, key, run)
     }
 
     /// Refines like [`RefineStage::run`], as part of the stage `stage`, and returns only the mean PSNR in dB of the
@@ -93,11 +93,11 @@ impl RefineStage {
         reduction: &CompressedModel,
         wanted: usize,
     ) -> Result<f64> {
-        let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
+        let steps = self.last_steps(wanted as f64 / scored.gaussian_count().max(1) as f64);
         let mut run = RefineRun::new(stage, self, scene, scored, targets, targets.split());
-        let key = run.key(reduction, wanted, wanted).and(&steps);
+        let key = run.key(reduction, wanted, wanted).extended_by(&steps);
         let all = || Ok(run.run_all(reduction, wanted, steps, &mut Journal::default())?.1);
-        scene.work.known(&format!("{stage}-size"), key, all)
+        scene.work.get_or_compute(&format!("{stage}-size"), key, all)
     }
 }
 
@@ -204,7 +204,7 @@ impl MeanDelta<ParamDelta> {
         let part = 1.0 / self.count as f32;
         self.delta.scale(1.0 - part);
         next.scale(part);
-        self.delta = std::mem::take(&mut self.delta).and(next);
+        self.delta = std::mem::take(&mut self.delta).plus(next);
     }
 }
 
@@ -250,7 +250,7 @@ impl<'a> RefineRun<'a> {
     /// Returns the cache key of pruning and refining `reduction` to `size` Gaussians if `wanted` are to remain in the
     /// end.
     fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
-        self.key.and(&(reduction, size, wanted, self.sampler.taken))
+        self.key.extended_by(&(reduction, size, wanted, self.sampler.taken))
     }
 
     fn timer(&self, key: CacheKey) -> CheckpointTimer {
@@ -266,7 +266,7 @@ impl<'a> RefineRun<'a> {
         steps: usize,
         journal: &mut Journal,
     ) -> Result<(CompressedModel, f64)> {
-        let mut timer = self.timer(self.key(reduction, wanted, wanted).and(&steps));
+        let mut timer = self.timer(self.key(reduction, wanted, wanted).extended_by(&steps));
         let result = self.scene.input.reduced(reduction)?;
         let mut optimizer = self.start_optimizer(reduction, &*result)?;
         let prune_counts = prune_counts(reduction.len(), wanted);
@@ -279,7 +279,7 @@ impl<'a> RefineRun<'a> {
             left = left.pick(&self.prune_step(&mut optimizer, &mut timer, steps, pair[1])?);
         }
         let BestState { delta, trajectory, best, .. } = self.final_steps(&mut optimizer, &mut timer, steps, journal)?;
-        (left.change, left.course) = (left.change.and(delta), left.course.and(trajectory));
+        (left.delta, left.trajectory_delta) = (left.delta.plus(delta), left.trajectory_delta.plus(trajectory));
         Ok((left, best.psnr))
     }
 
@@ -292,14 +292,14 @@ impl<'a> RefineRun<'a> {
         wanted: usize,
     ) -> Result<CompressedModel> {
         let key = self.key(reduction, size, wanted);
-        let (left, taken) = self.scene.work.known(&format!("{}-cut", self.stage), key, || {
+        let (left, taken) = self.scene.work.get_or_compute(&format!("{}-cut", self.stage), key, || {
             let mut timer = self.timer(key);
             let result = self.scene.input.reduced(reduction)?;
             let mut optimizer = self.start_optimizer(reduction, &*result)?;
             let steps = self.refine.steps_before(reduction.len(), wanted);
             self.set_total_steps(steps);
             let mut left = reduction.pick(&self.prune_step(&mut optimizer, &mut timer, steps, size)?);
-            left.change = left.change.and(optimizer.change());
+            left.delta = left.delta.plus(optimizer.change());
             Ok((left, self.sampler.taken))
         })?;
         self.sampler.skip_to(taken);
@@ -312,9 +312,9 @@ impl<'a> RefineRun<'a> {
         mut reduction: CompressedModel,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.count().max(1) as f64);
+        let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.gaussian_count().max(1) as f64);
         let (key, work) = (self.key(&reduction, reduction.len(), reduction.len()), &self.scene.work);
-        let (change, course, taken) = journal.kept(work, &format!("{}-best", self.stage), key, |journal| {
+        let (change, course, taken) = journal.cached(work, &format!("{}-best", self.stage), key, |journal| {
             self.set_total_steps(steps + self.steps_along_time(steps));
             let mut timer = self.timer(key);
             let result = self.scene.input.reduced(&reduction)?;
@@ -323,7 +323,8 @@ impl<'a> RefineRun<'a> {
             Ok((delta, trajectory, self.sampler.taken))
         })?;
         self.sampler.skip_to(taken);
-        (reduction.change, reduction.course) = (reduction.change.and(change), reduction.course.and(course));
+        (reduction.delta, reduction.trajectory_delta) =
+            (reduction.delta.plus(change), reduction.trajectory_delta.plus(course));
         Ok(reduction)
     }
 
@@ -355,7 +356,7 @@ impl<'a> RefineRun<'a> {
     /// Continues the present phase from its last checkpoint. Returns `None` if there is no checkpoint of this phase.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
         let kept: Option<ResumePoint<KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
-            self.scene.work.find(&self.checkpoint_name(), timer.key)?;
+            self.scene.work.load(&self.checkpoint_name(), timer.key)?;
         let Some(kept) = kept.filter(|kept| kept.phase == timer.phase) else { return Ok(None) };
         optimizer.resume(kept.checkpoint)?;
         self.sampler.skip_to(kept.taken);
@@ -371,13 +372,13 @@ impl<'a> RefineRun<'a> {
         (steps, schedule): (usize, RateSchedule),
         best_state: Option<BestState<&ParamDelta, &TrajectoryDelta>>,
     ) -> Result<()> {
-        if !self.scene.work.keeps() || timer.saved_at.elapsed() < timer.interval {
+        if !self.scene.work.is_enabled() || timer.saved_at.elapsed() < timer.interval {
             return Ok(());
         }
         let (phase, taken) = (timer.phase, self.sampler.taken);
         let kept = ResumePoint { phase, steps, taken, schedule, checkpoint: optimizer.checkpoint(), best_state };
         let start = Instant::now();
-        self.scene.work.keep(&self.checkpoint_name(), timer.key, &kept)?;
+        self.scene.work.store(&self.checkpoint_name(), timer.key, &kept)?;
         timer.saved_at = Instant::now();
         timer.interval =
             (CHECKPOINT_COST_FACTOR * (timer.saved_at - start)).clamp(CHECKPOINT_INTERVAL[0], CHECKPOINT_INTERVAL[1]);
@@ -394,7 +395,7 @@ impl<'a> RefineRun<'a> {
         size: usize,
     ) -> Result<Vec<u32>> {
         let (name, key, work) = (format!("{}-cut-{:02}", self.stage, timer.phase + 1), timer.key, &self.scene.work);
-        let kept: Option<(KeptCheckpoint, Vec<u32>, usize)> = work.find(&name, key)?;
+        let kept: Option<(KeptCheckpoint, Vec<u32>, usize)> = work.load(&name, key)?;
         let left = match kept {
             Some((checkpoint, left, taken)) => {
                 optimizer.resume(checkpoint)?;
@@ -418,7 +419,7 @@ impl<'a> RefineRun<'a> {
                 let views: Vec<usize> = (0..RANKING_VIEWS).map(|_| self.sampler.next()).collect();
                 let errors = optimizer.removal_error(&views, self.refine.contrast_floor as f32)?;
                 let left = survivors(&errors.sum, size, optimizer.fixed(), &optimizer.positions());
-                work.keep(&name, key, &(optimizer.checkpoint(), &left, self.sampler.taken))?;
+                work.store(&name, key, &(optimizer.checkpoint(), &left, self.sampler.taken))?;
                 left
             }
         };
@@ -479,7 +480,7 @@ impl<'a> RefineRun<'a> {
                     best_state.rate_factor *= RATE_REDUCTION;
                     optimizer.restart_from(&best_state.delta)?;
                     schedule = RateSchedule::new(steps - step, LAST_RATES[1], best_state.best.typical_error())
-                        .times(best_state.rate_factor);
+                        .scaled_by(best_state.rate_factor);
                 }
             }
             best_state.constant = best_state.best;

@@ -1,6 +1,6 @@
 //! Choice of the Gaussians that a prune step removes.
 
-use crate::merging::tree::{Nearest, Tree, TreePoint};
+use crate::merging::tree::{NearestPoints, Tree, TreePoint};
 use crate::model::AttributeValues;
 
 /// Number of candidates for removal, as a multiple of the number of Gaussians to remove.
@@ -21,7 +21,7 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
     let point = |index: u32| TreePoint { at: positions.row(index as usize), index };
     let mut points: Vec<TreePoint> = (0..errors.len() as u32).map(point).collect();
     points.retain(|point| point.at.iter().all(|x| x.is_finite()));
-    let (tree, mut nearest) = (Tree::new(&mut points), Nearest::default());
+    let (tree, mut nearest) = (Tree::new(&mut points), NearestPoints::default());
     let mut is_protected = vec![false; errors.len()];
     let mut is_removed = vec![false; errors.len()];
     let mut left = removed_count;
@@ -34,7 +34,7 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
         }
         is_removed[i as usize] = true;
         left -= 1;
-        nearest.start(i, positions.row(i as usize), 1, f64::INFINITY);
+        nearest.start_query(i, positions.row(i as usize), 1, f64::INFINITY);
         tree.search(&points, &mut nearest);
         if let Some(&(_, neighbor)) = nearest.sorted().first() {
             is_protected[neighbor as usize] = true;

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, FrameView, hash_id};
-use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
-use crate::scene::between::{SplitMix64, between};
-use crate::scene::outside::outside;
+use crate::scene::between::{SplitMix64, cameras_between};
+use crate::scene::outside::cameras_outside;
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
@@ -89,18 +89,24 @@ impl Targets {
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all(scene.source())];
             let mut next = some.start;
-            show(subject, &targets.cameras, &targets.pictures[some], Batch::one_frame(&scene.limits), |views| {
-                let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
-                    let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
-                    narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
-                };
-                let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
-                next += views.len();
-                made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
-            })
+            for_each_view_batch(
+                subject,
+                &targets.cameras,
+                &targets.pictures[some],
+                BatchLimits::one_frame(&scene.limits),
+                |views| {
+                    let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
+                        let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
+                        narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
+                    };
+                    let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
+                    next += views.len();
+                    made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
+                },
+            )
         };
         let key = scene.work.key(&(&targets.cameras, &targets.pictures, stride, has_test_views));
-        targets.values = scene.work.sharded_spill(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
+        targets.values = scene.work.spill_in_shards(NAME, key, targets.pictures.len(), &scene.scratch, make)?;
         Ok(targets)
     }
 
@@ -191,19 +197,20 @@ pub(super) fn validation_every(views: usize) -> usize {
 /// between, and views outside the rig if these count ([`Scene::outside`]).
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
-    let mut pictures = spread(&scene.schedule, scene_views, VIEWS_PER_FRAME);
-    let used = scene.schedule.used();
+    let mut pictures = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
+    let used = scene.schedule.used_cameras();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for picture in &mut pictures {
         picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
     }
     let (seen, mut random) = (pictures.len(), SplitMix64(2));
-    let rig = scene.used_cameras();
+    let rig = scene.rig_cameras();
     let more_views = if seen == 0 { 0 } else { between_views };
-    let outer = outside(&rig, (OUTSIDE_SHARE * scene.outside * more_views as f64) as usize, 1.0 + scene.outside);
-    let inner = between(&rig, more_views - outer.len());
+    let outer_views = (OUTSIDE_SHARE * scene.outside * more_views as f64) as usize;
+    let outer = cameras_outside(&rig, outer_views, 1.0 + scene.outside);
+    let inner = cameras_between(&rig, more_views - outer.len());
     for camera in outer.into_iter().chain(inner) {
-        let frame = pictures[random.below(seen)].frame;
+        let frame = pictures[random.next_below(seen)].frame;
         pictures.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);
     }

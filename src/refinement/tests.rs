@@ -15,7 +15,7 @@ use crate::journal::Journal;
 use crate::metrics::psnr;
 use crate::model::{Gaussians, Rig, SequenceInfo, Split};
 use crate::models::trajectories::write_sequence;
-use crate::models::{Link, OpenOptions};
+use crate::models::{LinkMode, OpenOptions};
 use crate::outputs::container::write_container;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
@@ -32,7 +32,7 @@ use crate::source::{BlockReader, FrameSource, Ids};
 fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
-    let reduction = CompressedModel::pruned(scored.ranked().take(count), &recipe.merge);
+    let reduction = CompressedModel::pruned(scored.ranking().best_ids(count), &recipe.merge);
     let mut journal = Journal::default();
     let refine = RefineStage { steps, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
     (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
@@ -51,7 +51,7 @@ fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
         };
         views.iter().map(view_psnr).sum()
     };
-    schedule.iter().enumerate().map(frame_psnr).sum::<f64>() / schedule.pairs() as f64
+    schedule.iter().enumerate().map(frame_psnr).sum::<f64>() / schedule.pair_count() as f64
 }
 
 #[test]
@@ -77,13 +77,13 @@ fn threads_and_limits_do_not_change_the_result() {
         pool.install(|| refined(scene, 200, 110, keep.clone())).0
     };
     let one = on(1, &scene);
-    assert!(!one.change.is_empty());
-    assert!(on(3, &scene).change == one.change, "threads change it");
-    scene.limits = Limits { frames_held: 1, pictures_together: 1, ..Limits::NONE };
-    assert!(on(2, &scene).change == one.change, "limits change it");
+    assert!(!one.delta.is_empty());
+    assert!(on(3, &scene).delta == one.delta, "threads change it");
+    scene.limits = Limits { max_kept_frames: 1, views_together: 1, ..Limits::NONE };
+    assert!(on(2, &scene).delta == one.delta, "limits change it");
     for (place, id) in one.kept.iter().enumerate().filter(|(_, id)| keep.contains(id)) {
         let moved = |column: Attributes| {
-            let delta = one.change.0.column(column);
+            let delta = one.delta.0.column(column);
             (0..delta.width()).any(|c| delta.plane(c)[place] != 0.0)
         };
         assert!(!Attributes::all().iter().any(moved), "Gaussian {id} is protected and moved");
@@ -96,7 +96,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     let folder = tempfile::tempdir().unwrap();
     let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let long = folder.path().join("long.gseq");
-    let demo = demo_scene::Scene::new(900, 16);
+    let demo = demo_scene::DemoScene::new(900, 16);
     write_container(&demo, &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let short = folder.path().join("scene.gseq");
     drop(scene(folder.path()));
@@ -115,8 +115,8 @@ fn interrupted_runs_resume_to_the_same_result() {
         let run = |scene: &Scene| -> Result<CompressedModel> {
             let recipe = Recipe::preset("default").unwrap();
             let scored = crate::pipeline::score_scene(scene, &recipe, &UserOverrides::default())?;
-            let count = scored.count();
-            let reduction = CompressedModel::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
+            let count = scored.gaussian_count();
+            let reduction = CompressedModel::pruned(scored.ranking().best_ids(2 * count / 5), &recipe.merge);
             let few = RefineStage {
                 steps,
                 cut_steps: 40,
@@ -155,14 +155,14 @@ fn interrupted_runs_resume_to_the_same_result() {
         }
         let found = found.expect("it ends");
         assert!(cuts > 1, "it was interrupted {cuts} times");
-        assert!(found.change == expected.change && !found.change.is_empty(), "{number}, interrupted {cuts} times");
-        assert!(found.course == expected.course, "{number}, interrupted {cuts} times: along time");
-        assert_eq!(expected.course.is_empty(), number < 2, "{number}");
+        assert!(found.delta == expected.delta && !found.delta.is_empty(), "{number}, interrupted {cuts} times");
+        assert!(found.trajectory_delta == expected.trajectory_delta, "{number}, interrupted {cuts} times: along time");
+        assert_eq!(expected.trajectory_delta.is_empty(), number < 2, "{number}");
     }
 }
 
 /// Demo scene in which each frame shows a third of the Gaussians; all others have the opacity logit of the third field.
-struct ShortLives(demo_scene::Scene, SequenceInfo, f32);
+struct ShortLives(demo_scene::DemoScene, SequenceInfo, f32);
 
 struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);
 
@@ -192,7 +192,7 @@ impl BlockReader for Reader<'_> {
 fn leaving_out_absent_gaussians_changes_no_result() {
     let folder = tempfile::tempdir().unwrap();
     let [away, unseen] = [-40.0, -25.0].map(|logit| {
-        let demo = demo_scene::Scene::new(900, 6);
+        let demo = demo_scene::DemoScene::new(900, 6);
         let (rig, info) = (demo.rig(), SequenceInfo { varying: Attributes::all(), ..demo.info().clone() });
         let path = folder.path().join("scene.gseq");
         let source = ShortLives(demo, info, logit);
@@ -201,11 +201,11 @@ fn leaving_out_absent_gaussians_changes_no_result() {
         let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-        let reduction = CompressedModel::pruned(scored.ranked().take(600), &recipe.merge);
+        let reduction = CompressedModel::pruned(scored.ranking().best_ids(600), &recipe.merge);
         let few = RefineStage { steps: 100, cut_steps: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
         few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
     });
-    assert!(!away.change.is_empty() && away.change == unseen.change);
+    assert!(!away.delta.is_empty() && away.delta == unseen.delta);
     assert_eq!(away.kept, unseen.kept);
 }
 
@@ -213,7 +213,7 @@ fn leaving_out_absent_gaussians_changes_no_result() {
 #[ignore = "needs time"]
 fn explicit_frames_improve_along_time_in_every_output() {
     let folder = tempfile::tempdir().unwrap();
-    let demo = demo_scene::Scene::new(900, 16);
+    let demo = demo_scene::DemoScene::new(900, 16);
     let [packed, files] = ["scene.gseq", "frames"].map(|name| folder.path().join(name));
     write_container(&demo, &packed, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     std::fs::create_dir(&files).unwrap();
@@ -222,7 +222,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
         (0..16).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
     };
     for (name, path, link) in
-        [("packed", &packed, Link::Never), ("files", &files, Link::Never), ("linked", &files, Link::Apart)]
+        [("packed", &packed, LinkMode::Never), ("files", &files, LinkMode::Never), ("linked", &files, LinkMode::Apart)]
     {
         let input = crate::models::open(path, &OpenOptions { link, ..OpenOptions::default() }).unwrap();
         let scene = Scene::new(path.clone(), input, demo.rig(), Some(Split::Train)).unwrap();
@@ -249,10 +249,10 @@ fn explicit_frames_improve_along_time_in_every_output() {
             };
             few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
         });
-        assert_eq!((constant.course.0.len(), varying.course.0.len()), (0, 4));
-        assert!(varying.change == constant.change, "{name}");
+        assert_eq!((constant.trajectory_delta.0.len(), varying.trajectory_delta.0.len()), (0, 4));
+        assert!(varying.delta == constant.delta, "{name}");
         // Some tracks (Gaussians linked over frames) join two Gaussians of this scene that have different colors.
-        assert!(link == Link::Apart || !varying.course.columns().contains(Attributes::SH), "{name}");
+        assert!(link == LinkMode::Apart || !varying.trajectory_delta.attributes().contains(Attributes::SH), "{name}");
         let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
         // Moving Gaussians cover a small part of these views, so the gain is small; static Gaussians must stay static.
         assert!(after > before + 0.02, "{name}: {before:.2} dB constant in time, {after:.2} varying in time");
@@ -273,7 +273,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
                 std::fs::create_dir(&out).unwrap();
             }
             scene.input.write(&varying, kind, &out, &Limits::NONE, &Events::IGNORED).unwrap();
-            let options = OpenOptions { link: Link::Never, ..OpenOptions::default() };
+            let options = OpenOptions { link: LinkMode::Never, ..OpenOptions::default() };
             let written = crate::models::open(&out, &options).unwrap();
             assert!(read(written.source()) == expected, "{name} as {kind:?}");
         }
@@ -286,12 +286,12 @@ fn without_bands_higher_sh_degrees_stay() {
     let scene = scene(folder.path());
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-    let reduction = CompressedModel::pruned(scored.ranked().take(300), &recipe.merge);
+    let reduction = CompressedModel::pruned(scored.ranking().best_ids(300), &recipe.merge);
     let (mut journal, count) = (Journal::default(), reduction.len());
     let refine =
         RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.with_fixed_higher_sh();
     let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
-    assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
+    assert_eq!((moved.delta.0.sh.width(), moved.delta.0.sh.len()), (3, count));
     assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
 }
 
@@ -300,7 +300,7 @@ fn models_without_possible_gain_stay_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let scene = scene(folder.path());
     let (whole, journal) = refined(&scene, 1500, 120, Vec::new());
-    assert!(whole.change.is_empty());
+    assert!(whole.delta.is_empty());
     assert_eq!((journal.left_out.len(), journal.left_out[0].what.as_str()), (1, "refinement"));
     let (none, journal) = refined(&scene, 0, 120, Vec::new());
     assert_eq!((none.len(), journal.left_out.len()), (0, 1));
@@ -343,7 +343,7 @@ fn the_optimizer_restarts_and_continues_with_a_subset() {
         let whole = optimizer.change();
         optimizer.pick(&some).unwrap();
         let picked = optimizer.quality(&views).unwrap().psnr;
-        let picked_model = CompressedModel { change: whole.pick(&some), ..reduction.pick(&some) };
+        let picked_model = CompressedModel { delta: whole.pick(&some), ..reduction.pick(&some) };
         let result = scene.input.reduced(&picked_model).unwrap();
         let fixed = vec![false; some.len()];
         let fresh = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();

@@ -1,7 +1,7 @@
 //! Comparison of one compressed model with the original, with everything that the report page shows of it.
 
 use super::film::FilmPanel;
-use super::findings::{Close, ResultData};
+use super::findings::{ResultData, WorstPlaceImages};
 use super::run::RunFiles;
 use super::shown::ShownImage;
 
@@ -16,5 +16,5 @@ pub(super) struct Analysis {
     /// Animations that the page shows.
     pub(super) films: Vec<FilmPanel>,
     /// For each failure mode that can be judged, the images of the place where it is worst.
-    pub(super) close: Vec<Close>,
+    pub(super) close: Vec<WorstPlaceImages>,
 }

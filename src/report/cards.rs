@@ -4,8 +4,8 @@
 use super::analysis::Analysis;
 use super::findings::ResultData;
 use super::html::{bytes, count, db, escape, figure, percent};
-use crate::evaluation::found::Both;
-use crate::models::Size;
+use crate::evaluation::found::ByModel;
+use crate::models::ModelSize;
 
 /// Returns the HTML of the head of the page: names of the models, verdict, and cards (of one result) or a table (of
 /// several).
@@ -117,11 +117,11 @@ fn milliseconds(value: f64) -> String {
 
 /// Returns the parts of the size that both models have (at least 1% of the compressed model's bytes), as (name, bytes
 /// before, bytes after); empty for fewer than two parts.
-pub(super) fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
-    let parts = size.original.named().into_iter().zip(size.compressed.named());
+pub(super) fn size_parts(size: &ByModel<ModelSize>) -> Vec<(&'static str, u64, u64)> {
+    let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
     // Parts below a hundredth of the whole are left out.
-    let least = size.compressed.whole() / 100;
+    let least = size.compressed.total() / 100;
     let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > least).collect();
     if both.len() > 1 { both } else { Vec::new() }
 }

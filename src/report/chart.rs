@@ -69,7 +69,7 @@ pub struct Plot {
 
 /// Chart of horizontal bars, or marks, with one value per name.
 #[derive(Debug, Clone, Default)]
-pub struct Bars {
+pub struct BarChart {
     /// Description of the chart for readers who do not see it.
     pub title: String,
     /// Measured quantity and its unit, written below the axis.
@@ -83,7 +83,7 @@ pub struct Bars {
 
 /// Chart of stacked counts: for each bin of values, the counts of several groups on top of one another.
 #[derive(Debug, Clone, Default)]
-pub struct Stack {
+pub struct StackedHistogram {
     /// Description of the chart for readers who do not see it.
     pub title: String,
     /// Axis of the binned values.
@@ -229,7 +229,7 @@ impl Plot {
     }
 }
 
-impl Bars {
+impl BarChart {
     /// Returns the bars as an `<svg>` element, whose height depends on the number of bars.
     pub fn svg(&self) -> String {
         const ROW: f64 = 24.0;
@@ -269,7 +269,7 @@ impl Bars {
     }
 }
 
-impl Stack {
+impl StackedHistogram {
     /// Returns the stacked counts as an `<svg>` element.
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
@@ -495,8 +495,8 @@ mod tests {
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         assert_eq!(svg.matches("<circle").count(), 1 + 2, "the legend's and one per point");
         assert!(plot(&[(f64::NAN, 1.0)]).svg().contains("nothing to show"));
-        assert!(Bars::default().svg().contains("nothing to show"));
-        assert!(Stack::default().svg().contains("nothing to show"));
+        assert!(BarChart::default().svg().contains("nothing to show"));
+        assert!(StackedHistogram::default().svg().contains("nothing to show"));
     }
 
     #[test]
@@ -546,7 +546,7 @@ mod tests {
         assert_eq!(scale.at(0.0), Some(200.0));
         assert!(scale.at(4.0) < scale.at(1.0));
         let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];
-        let svg = Stack { edges: vec![0.0, 1.0, 2.0], groups, ..Stack::default() }.svg();
+        let svg = StackedHistogram { edges: vec![0.0, 1.0, 2.0], groups, ..StackedHistogram::default() }.svg();
         assert_eq!(svg.matches("class=\"area").count(), 3, "an empty bin has no bar");
     }
 }

@@ -1,7 +1,7 @@
 //! Images of the report page: sliders that compare the original with compressed models, and animations.
 
 use super::analysis::Analysis;
-use super::film::{KINDS, QUALITY};
+use super::film::{IMAGE_NAMES, JPEG_QUALITY};
 use super::html::{db, escape, figure};
 use super::shown::{MEDIAN, ShownImage, WORST};
 
@@ -144,8 +144,8 @@ pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
     );
     // Of every column its name, the result it belongs to, and the kind of image.
     let columns: Vec<(String, usize, usize)> = match results.len() {
-        1 => KINDS.iter().enumerate().map(|(kind, name)| ((*name).to_owned(), 0, kind)).collect(),
-        _ => std::iter::once((KINDS[0].to_owned(), 0, 0))
+        1 => IMAGE_NAMES.iter().enumerate().map(|(kind, name)| ((*name).to_owned(), 0, kind)).collect(),
+        _ => std::iter::once((IMAGE_NAMES[0].to_owned(), 0, 0))
             .chain(names.iter().enumerate().map(|(result, name)| (name.clone(), result, 1)))
             .collect(),
     };
@@ -176,7 +176,7 @@ pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
         };
         out += &format!(
             "<p class=\"note\">View {}, by its camera at frame {}: {} frames, evenly from first to last; {difference}JPEG of \
-             quality {QUALITY}, the figures are those of the renders themselves{}.</p>\n</div>\n",
+             quality {JPEG_QUALITY}, the figures are those of the renders themselves{}.</p>\n</div>\n",
             film.view,
             film.camera_of_frame,
             film.frames.len(),

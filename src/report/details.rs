@@ -1,7 +1,7 @@
 //! Collapsed sections of the report page: all figures, the stages of the run, the scores, the notes and the data files.
 
 use super::analysis::Analysis;
-use super::chart::{Bars, ChartAxis, Stack};
+use super::chart::{BarChart, ChartAxis, StackedHistogram};
 use super::document::{figure_of, heading, links, list};
 use super::findings::ResultData;
 use super::histogram::Histogram;
@@ -200,7 +200,7 @@ fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&Stage
     if bars.len() < 2 {
         return String::new();
     }
-    let chart = Bars { title: title.to_owned(), label: label.to_owned(), bars, is_fitted: false };
+    let chart = BarChart { title: title.to_owned(), label: label.to_owned(), bars, is_fitted: false };
     figure_of(title, &chart.svg())
 }
 
@@ -239,7 +239,7 @@ fn histogram(of: &Histogram) -> String {
         let more = if zero > 0 { format!(" (and {} at 0)", count(zero)) } else { String::new() };
         (format!("{name}{more}"), bins.to_vec())
     };
-    Stack {
+    StackedHistogram {
         title: format!("{} of kept, dropped and merged Gaussians", of.meaning),
         x: match of.log {
             true => ChartAxis { label: of.name.to_owned(), log: true, from_zero: false },

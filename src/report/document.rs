@@ -5,7 +5,7 @@
 
 use super::chart;
 use super::html::escape;
-use crate::files::page_policy::{digest_of, policy};
+use crate::files::page_policy::{policy_digest, policy_meta_element};
 
 const STYLE: &str = include_str!("page.css");
 
@@ -13,8 +13,8 @@ const STYLE: &str = include_str!("page.css");
 /// contain text from files.
 pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     let scripts: Vec<String> = scripts.iter().map(|script| format!("\n{script}")).collect();
-    let digests: Vec<String> = scripts.iter().map(|script| digest_of(script)).collect();
-    let policy = policy(&[
+    let digests: Vec<String> = scripts.iter().map(|script| policy_digest(script)).collect();
+    let policy = policy_meta_element(&[
         ("img-src", &["data:".to_owned()]),
         // Sizes of images are attributes, which no digest can allow.
         ("style-src", &["'unsafe-inline'".to_owned()]),

@@ -10,7 +10,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::traits::{GaussianKind, Traits};
+use super::traits::{GaussianKind, KindFlags};
 use crate::evaluation::RenderedViews;
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{AttributeValues, Camera, Gaussians, SH_C0};
@@ -18,21 +18,21 @@ use crate::render::{Image, render};
 
 /// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
 /// colors.
-pub const VISIBLE_DB: f64 = 40.0;
+pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
 /// Minimum difference in dB between the PSNR where a kind of Gaussian is visible and the PSNR elsewhere for a failure
 /// mode to be flagged: 3 dB lower is twice the squared error.
-pub const APART_DB: f64 = 3.0;
+pub const MIN_PSNR_GAP_DB: f64 = 3.0;
 /// Minimum fraction of the pixels that a kind of Gaussian must cover in a render to be judged there.
-pub const SHOWN: f64 = 1e-3;
+pub const MIN_PIXEL_SHARE: f64 = 1e-3;
 /// Minimum fraction of a kind's contribution to renders that must have been dropped or merged for its failure mode to
 /// be flagged.
-pub const LOST: f64 = 0.01;
+pub const MIN_LOST_SHARE: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
-pub const CROP: u32 = 64;
+pub const CROP_SIDE_PX: u32 = 64;
 
 /// Sums over the pixels of one view of the error between both models' renders, in total and for each kind of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub struct Observed {
+pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
     kinds: [FailureSums; 3],
     /// Sum over pixels of e², the squared difference of the two renders, averaged over channels.
@@ -71,7 +71,7 @@ pub enum Verdict {
 /// Render in which a failure mode is worst.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WorstPlace {
-    /// Index of the render in [`crate::evaluation::found::Evaluation::pictures`].
+    /// Index of the render in [`crate::evaluation::found::Evaluation::views`].
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
@@ -88,7 +88,8 @@ pub struct FailureMode {
     /// Name of the failure mode.
     pub name: &'static str,
     /// Description of the kind of Gaussian that the failure mode concerns.
-    pub happens_to: String,
+    #[serde(rename = "happens_to")]
+    pub kind_description: String,
     /// Verdict on the failure mode.
     pub verdict: Verdict,
     /// Number of Gaussians of this kind in the original.
@@ -105,10 +106,12 @@ pub struct FailureMode {
     /// maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
     /// Share of this kind in all pixels of all compared renders, from 0 to 1.
-    pub shown: f64,
+    #[serde(rename = "shown")]
+    pub pixel_share: f64,
     /// PSNR where the kind is visible, with each pixel weighted by the share of the kind, dB; `None` if the kind is
     /// nowhere visible.
-    pub psnr_there: Option<f64>,
+    #[serde(rename = "psnr_there")]
+    pub psnr_on_kind: Option<f64>,
     /// PSNR where the kind is not visible, with each pixel weighted by the share of all others, dB.
     pub psnr_elsewhere: Option<f64>,
     /// Fraction of the original's brightness gradients that the compressed renders lose where the kind is visible;
@@ -133,7 +136,7 @@ pub struct KindMembers {
 
 /// Renders the Gaussians `state` with colors that encode their kinds (`traits`): red, green and blue of a pixel are the
 /// shares of the three kinds in it.
-pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
+pub fn shares_of_pixels(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
         // Color is 0.5 + SH_C0 · coefficient.
@@ -154,11 +157,11 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -
 ///
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.
-pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &RenderedViews) -> Observed {
+pub fn sum_errors(state: &Gaussians, traits: &[KindFlags], camera: &Camera, taken: &RenderedViews) -> ViewErrorSums {
     let shares = shares_of_pixels(state, traits, camera);
     let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
-    let mut found = Observed { pixels: (width * height) as f64, ..Observed::default() };
+    let mut found = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
     let error = squared_error(&taken.original, &taken.compressed);
     for (i, (error, shares)) in error.iter().zip(shares.data.chunks_exact(3)).enumerate() {
         found.error += error;
@@ -194,7 +197,7 @@ fn brightness(image: &Image) -> Vec<f64> {
 
 /// Judges the failure mode of one kind of Gaussian. `seen` holds the error sums of all renders, `names` their (frame,
 /// view).
-pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
+pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
     let sum = |value: fn(&FailureSums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
@@ -206,19 +209,19 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names:
     let psnr_elsewhere = db((all_error - error).max(0.0), pixels - weight);
     let detail = sum(|s| s.detail);
     let worst = (0..seen.len())
-        .filter(|&place| seen[place].kinds[at].weight >= SHOWN * seen[place].pixels)
+        .filter(|&place| seen[place].kinds[at].weight >= MIN_PIXEL_SHARE * seen[place].pixels)
         .filter_map(|place| Some((place, db(seen[place].kinds[at].error, seen[place].kinds[at].weight)?)))
         .min_by(|a, b| a.1.total_cmp(&b.1))
         .map(|(place, psnr)| WorstPlace { place, frame: names[place].0, view: names[place].1, psnr });
     let lost = members.fates.is_some().then_some(members.shares.1);
     let apart = psnr_there
         .zip(psnr_elsewhere)
-        .is_some_and(|(there, elsewhere)| there < VISIBLE_DB && there <= elsewhere - APART_DB);
+        .is_some_and(|(there, elsewhere)| there < VISIBLE_ERROR_PSNR_DB && there <= elsewhere - MIN_PSNR_GAP_DB);
     let verdict = if members.count == 0 {
         Verdict::Absent
     } else if worst.is_none() {
         Verdict::Unseen
-    } else if lost.is_some_and(|lost| lost < LOST) {
+    } else if lost.is_some_and(|lost| lost < MIN_LOST_SHARE) {
         Verdict::Untouched
     } else if apart {
         Verdict::Flagged
@@ -227,15 +230,15 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names:
     };
     FailureMode {
         name,
-        happens_to,
+        kind_description: happens_to,
         verdict,
         gaussians: members.count,
         dropped: members.fates.map(|fates| fates.0),
         merged: members.fates.map(|fates| fates.1),
         coverage: members.shares.0,
         coverage_lost: lost,
-        shown,
-        psnr_there,
+        pixel_share: shown,
+        psnr_on_kind: psnr_there,
         psnr_elsewhere,
         detail_lost: (detail > 0.0).then(|| 1.0 - sum(|s| s.kept_detail) / detail),
         worst,
@@ -244,24 +247,27 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names:
 
 /// Returns the name of the failure mode of a kind of Gaussian, and a description of the Gaussians of this kind.
 fn described(kind: GaussianKind) -> (&'static str, String) {
-    use super::traits::{COLOR_CHANGE, FAST, NEIGHBORS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
+    use super::traits::{
+        COLOR_CHANGE, MAX_STILL_MOTION, MIN_FAST_MOTION, MIN_NON_RIGID_CHANGE, MIN_THIN_RATIO, NEIGHBORS,
+        OPACITY_CHANGE,
+    };
     match kind {
         GaussianKind::Motion => (
             "fast, non-rigid motion",
             format!(
                 "Gaussians that move by {}% of the scene extent per frame or more (root mean square), while the \
                  distance to half of their {NEIGHBORS} nearest neighbors changes by {}% or more",
-                100.0 * FAST,
-                100.0 * NON_RIGID
+                100.0 * MIN_FAST_MOTION,
+                100.0 * MIN_NON_RIGID_CHANGE
             ),
         ),
-        GaussianKind::Thin => ("thin structures", format!("Gaussians {THIN} times as long as wide or more")),
+        GaussianKind::Thin => ("thin structures", format!("Gaussians {MIN_THIN_RATIO} times as long as wide or more")),
         GaussianKind::Appearance => (
             "fine changes of appearance",
             format!(
                 "Gaussians that stand still (up to {}% of the extent per frame) while their opacity varies by {} or \
                  their color by {} (standard deviation) or more",
-                100.0 * STILL,
+                100.0 * MAX_STILL_MOTION,
                 OPACITY_CHANGE,
                 COLOR_CHANGE
             ),
@@ -277,10 +283,10 @@ fn db(error: f64, weight: f64) -> Option<f64> {
 
 /// Returns the upper left corner of the square with the largest error of one kind of Gaussian: the sum of w e² over its
 /// pixels, where w is the share of the kind and e² the squared difference of the renders. The square has a side of
-/// [`CROP`] pixels, or less in a smaller render. In a tie, the first square by rows is taken.
+/// [`CROP_SIDE_PX`] pixels, or less in a smaller render. In a tie, the first square by rows is taken.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
-    let (across, down) = ((CROP as usize).min(width), (CROP as usize).min(height));
+    let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));
     // sums[y][x] is the sum over the rectangle above and left of (x, y).
     let stride = width + 1;
     let mut sums = vec![0.0; stride * (height + 1)];
@@ -306,10 +312,10 @@ pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -
     best.1
 }
 
-/// Returns the part of `image` whose upper left pixel is (`left`, `top`), with [`CROP`] pixels along each side or fewer
+/// Returns the part of `image` whose upper left pixel is (`left`, `top`), with [`CROP_SIDE_PX`] pixels along each side or fewer
 /// at the border.
 pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
-    let (width, height) = (CROP.min(image.width - left), CROP.min(image.height - top));
+    let (width, height) = (CROP_SIDE_PX.min(image.width - left), CROP_SIDE_PX.min(image.height - top));
     let row = |y: u32| {
         let start = 3 * (y as usize * image.width as usize + left as usize);
         &image.data[start..start + 3 * width as usize]

@@ -1,17 +1,17 @@
 //! Section of the report page about the failure modes.
 
-use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
-use super::findings::Close;
+use super::failure::{FailureMode, MIN_LOST_SHARE, MIN_PSNR_GAP_DB, VISIBLE_ERROR_PSNR_DB, Verdict};
+use super::findings::WorstPlaceImages;
 use super::html::{count, db, escape, figure, percent};
 
 /// Returns the HTML of a card for each failure mode, with its measurements and the part of a render in which it is
 /// worst.
-pub(super) fn modes(modes: &[FailureMode], close: &[Close]) -> String {
+pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String {
     let mut out = format!(
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \
-         the PSNR where the kind is visible is below {VISIBLE_DB} dB and at least {APART_DB} dB below the PSNR elsewhere, \
+         the PSNR where the kind is visible is below {VISIBLE_ERROR_PSNR_DB} dB and at least {MIN_PSNR_GAP_DB} dB below the PSNR elsewhere, \
          and {}% or more of the kind’s coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
-        figure(100.0 * LOST)
+        figure(100.0 * MIN_LOST_SHARE)
     );
     for (number, mode) in modes.iter().enumerate() {
         let (class, word) = match mode.verdict {
@@ -24,7 +24,7 @@ pub(super) fn modes(modes: &[FailureMode], close: &[Close]) -> String {
         out += &format!(
             "<article class=\"{class}\"><h4>{} <em>{word}</em></h4>\n<p>{}.</p>\n<table>\n",
             capitalized(mode.name),
-            escape(&mode.happens_to)
+            escape(&mode.kind_description)
         );
         for (name, value) in rows(mode) {
             out += &format!("<tr><th>{name}</th><td>{value}</td></tr>\n");
@@ -56,8 +56,8 @@ fn rows(mode: &FailureMode) -> Vec<(&'static str, String)> {
             ("merged", of(mode.merged)),
             ("part of the scene’s coverage", Some(percent(mode.coverage, 1.0))),
             ("of that dropped or merged", mode.coverage_lost.map(|lost| percent(lost, 1.0))),
-            ("part of all pixels", Some(percent(mode.shown, 1.0))),
-            ("PSNR there", mode.psnr_there.map(db)),
+            ("part of all pixels", Some(percent(mode.pixel_share, 1.0))),
+            ("PSNR there", mode.psnr_on_kind.map(db)),
             ("PSNR elsewhere", mode.psnr_elsewhere.map(db)),
             ("edges there that are lost", mode.detail_lost.map(edges)),
             ("worst", mode.worst.map(|w| format!("frame {}, view {}: {}", w.frame, w.view, db(w.psnr)))),

@@ -18,7 +18,7 @@ use crate::memory_plan::Workload;
 use crate::metrics::psnr;
 use crate::model::FrameView;
 use crate::render::Image;
-use crate::scene::pictures::thin;
+use crate::scene::pictures::select_frames;
 
 /// Maximum number of animated views: the view of the worst render, and of the median one if it is another.
 pub const VIEWS: usize = 2;
@@ -29,7 +29,7 @@ pub const MAX_PIXELS: u64 = 90_000;
 /// Maximum number of pixels of a difference image in an animation. It is smaller because noise takes most bytes.
 pub const MAX_PIXELS_OF_DIFFERENCE: u64 = 30_000;
 /// JPEG quality of the images of animations, from 1 to 100.
-pub const QUALITY: u8 = 80;
+pub const JPEG_QUALITY: u8 = 80;
 
 /// Animation of one view on the report page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -59,11 +59,11 @@ pub struct FilmPanel {
 }
 
 /// Names of the three images of each frame, in the order of [`FilmPanel::images`].
-pub const KINDS: [&str; 3] = ["original", "compressed", "difference"];
+pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 
 /// Returns the bytes of memory of the animations and of the page that contains them, estimated at one byte per pixel
 /// each.
-pub fn bytes(work: &Workload) -> u64 {
+pub fn memory_bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)
 }
@@ -72,19 +72,19 @@ pub fn bytes(work: &Workload) -> u64 {
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
+pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let every = side.scene.source().info().times.len();
     let mut films: Vec<FilmPanel> = Vec::new();
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
-        let FrameView { view, camera, .. } = side.picture(choice.place);
+        let FrameView { view, camera, .. } = side.view(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == MEDIAN);
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
             continue;
         }
         cameras.push(camera);
-        let pictures = thin((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
-        let made = side.both(&pictures, |[original, compressed]| {
+        let pictures = select_frames((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
+        let made = side.render_pairs(&pictures, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
             let images = [
@@ -113,7 +113,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
 
 /// Returns `image` as a data URI that contains a JPEG file.
 fn data_uri(image: &Image) -> Result<String> {
-    let bytes = jpeg_bytes(image, QUALITY)
+    let bytes = jpeg_bytes(image, JPEG_QUALITY)
         .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
     Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

@@ -5,8 +5,8 @@ use serde::Serialize;
 use super::failure::FailureMode;
 use super::film::FilmPanel;
 use super::histogram::Histogram;
-use super::shown::Choice;
-use crate::evaluation::found::{Evaluation, PictureScores};
+use super::shown::ChosenRender;
+use crate::evaluation::found::{Evaluation, ViewScores};
 use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::RenderTime;
@@ -20,7 +20,7 @@ pub struct ReportData {
     #[serde(flatten)]
     pub result: ResultData,
     /// Renders that the page shows.
-    pub shown: Vec<Choice>,
+    pub shown: Vec<ChosenRender>,
     /// Animations that the page shows.
     pub films: Vec<FilmPanel>,
     /// Result of the command `sweep` for the original, if one was given.
@@ -41,7 +41,7 @@ pub struct ResultData {
     /// Comparison with the original: mean scores overall, by view and by frame.
     pub evaluation: Evaluation,
     /// Scores of every compared render.
-    pub pictures: Vec<PictureScores>,
+    pub pictures: Vec<ViewScores>,
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
@@ -64,7 +64,7 @@ pub struct ResultData {
 
 /// Images of the place where a failure mode is worst: a square part of a render of both models.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Close {
+pub(super) struct WorstPlaceImages {
     /// Index of the failure mode in [`ResultData::failure_modes`].
     pub(super) mode: usize,
     /// Upper left pixel of the part in the render.

@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::run::Fate;
 use crate::files::csv::table;
 use crate::model::{Rows, Statistic, StatisticAccess};
-use crate::statistics::score::{Quantity, Scores};
+use crate::statistics::score::{ScoredQuantity, Scores};
 
 /// Maximum number of bins of a histogram.
 const BINS: usize = 40;
@@ -65,12 +65,12 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
         ("S", "the whole score", &scores.score),
-        (Quantity::Static.name(), Quantity::Static.property(), &scores.static_score),
-        (Quantity::Dynamic.name(), Quantity::Dynamic.property(), &scores.dynamic_score),
+        (ScoredQuantity::Static.name(), ScoredQuantity::Static.measured_property(), &scores.static_score),
+        (ScoredQuantity::Dynamic.name(), ScoredQuantity::Dynamic.measured_property(), &scores.dynamic_score),
     ];
     let part = |&count: &u32| f64::from(count) / frames.max(1) as f64;
     let statistic = |of: Statistic| {
-        let (values, most) = match of.values() {
+        let (values, most) = match of.accessors() {
             StatisticAccess::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
             StatisticAccess::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
         };

@@ -38,29 +38,29 @@ use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
 use crate::evaluation;
 use crate::evaluation::{EvaluateOptions, ModelPair, RenderedViews};
-use crate::files::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
 use crate::files::text::read_text;
 use crate::journal::Journal;
 use crate::journal::records::TermSummary;
 use crate::model::{Camera, Gaussians, Rows, Split, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stage::MeasuredOnArrival;
-use crate::pipeline::stages::measure::Measure;
-use crate::pruning::score::{SCORED_BYTES, Scored, UserOverrides};
+use crate::pipeline::stages::measure::MeasureStages;
+use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
 pub use findings::{ReportData, ResultData};
 
 use analysis::Analysis;
-use failure::{FailureMode, KindMembers, judge, observe};
-use findings::Close;
+use failure::{FailureMode, KindMembers, judge, sum_errors};
+use findings::WorstPlaceImages;
 use histogram::histograms;
 use run::{Fate, RunFiles};
-use shown::{Choice, ShownImage, choices, scores_at, show};
-use traits::{GaussianKind, Traits, shares, traits};
+use shown::{ChosenRender, ShownImage, choose_renders, create_images, with_scores_of};
+use traits::{GaussianKind, KindFlags, contribution_shares, kind_flags};
 
 /// File name of the report page.
-pub const PAGE: &str = "report.html";
+pub const PAGE_FILE: &str = "report.html";
 
 /// Options of the command `report`.
 #[derive(Debug, Clone)]
@@ -95,7 +95,7 @@ pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
 /// # Errors
 /// Fails as [`report`] does.
 pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
-    let mut inputs = options.evaluate.inputs();
+    let mut inputs = options.evaluate.input_paths();
     inputs.extend(options.more.iter().map(PathBuf::as_path));
     inputs.extend(options.sweep.as_deref());
     inputs.extend(options.precision.as_deref());
@@ -111,7 +111,7 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let mut results = vec![analyze(&options.evaluate, None, options.render_time)?];
     for path in &options.more {
         let evaluate = EvaluateOptions { compressed: path.clone(), ..options.evaluate.clone() };
-        let choices: Vec<Choice> = results[0].shown.iter().map(|shown| shown.choice.clone()).collect();
+        let choices: Vec<ChosenRender> = results[0].shown.iter().map(|shown| shown.choice.clone()).collect();
         results.push(analyze(&evaluate, Some(&choices), options.render_time)?);
     }
     let page = page::page(&results, trade_off.as_ref(), precision.as_ref());
@@ -132,50 +132,50 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
 
 /// Compares the compressed model that `options` name with the original. The page will show the renders `wanted`; with
 /// `None` they are chosen here.
-fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bool) -> Result<Analysis> {
+fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
-    let run = RunFiles::beside(&options.compressed, count, side.compressed_count());
+    let run = RunFiles::read_files_beside(&options.compressed, count, side.compressed_count());
     let mut notes = notes_on(&run, &side.scene)?;
 
     let recipe = recipe_to_score_with(&run)?;
-    let measure = Measure::new(&recipe, side.scene.has_cameras, UserOverrides::default());
-    side.keep_to(options.original.memory, |work, limits| {
-        let mut needs = measure.needs(work, limits, MeasuredOnArrival::default());
-        needs.push(traits::need(work));
-        needs.extend(evaluation::needs(work, limits).into_iter().map(|mut need| {
-            need.per_gaussian.push(("rows", SCORED_BYTES + 8));
-            need.fixed.push(("films", film::bytes(work)));
+    let measure = MeasureStages::new(&recipe, side.scene.has_cameras, UserOverrides::default());
+    side.plan_memory(options.original.memory, |work, limits| {
+        let mut needs = measure.resource_estimates(work, limits, MeasuredOnArrival::default());
+        needs.push(traits::resource_estimate(work));
+        needs.extend(evaluation::resource_estimates(work, limits).into_iter().map(|mut need| {
+            need.per_gaussian.push(("rows", SCORING_BYTES_PER_GAUSSIAN + 8));
+            need.fixed.push(("films", film::memory_bytes(work)));
             need
         }));
         needs
     })?;
-    let in_parts = side.scene.work.keeps();
-    let compared = if in_parts { Some(side.compare()?) } else { None };
+    let in_parts = side.scene.work.is_enabled();
+    let compared = if in_parts { Some(side.evaluate_as_first_stage()?) } else { None };
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     if in_parts {
         // The comparison above has the key of `evaluate`; the keys of later stages also depend on the recipe.
-        side.scene.work.follow_from(CacheKey::new(&(&side.scene.schedule, &recipe)));
+        side.scene.work.depend_on(CacheKey::new(&(&side.scene.schedule, &recipe)));
     }
     let scored = measure.measure(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
-    let find_traits = || traits(side.scene.source(), &scored, recipe.scan.alpha_min);
-    let traits = side.scene.work.known("traits", side.scene.work.key(&()), find_traits)?;
+    let find_traits = || kind_flags(side.scene.source(), &scored, recipe.scan.alpha_min);
+    let traits = side.scene.work.get_or_compute("traits", side.scene.work.key(&()), find_traits)?;
     let rows = scored.rows()?;
     let members = members(&rows, &traits, run.fates.as_deref());
-    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| observe(state, &traits, camera, taken);
+    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| sum_errors(state, &traits, camera, taken);
     let (evaluation, seen) = match compared {
         None => side.observe(look)?,
-        Some(compared) => (compared, side.observe_in_parts("failure", look)?),
+        Some(compared) => (compared, side.observe_sharded("failure", look)?),
     };
     side.scene.work.end_shard_before("the page")?;
-    let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
+    let names: Vec<(usize, u32)> = evaluation.views.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
         GaussianKind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
-    let choices = wanted.map_or_else(|| choices(&evaluation), |wanted| scores_at(&evaluation, wanted));
+    let choices = wanted.map_or_else(|| choose_renders(&evaluation), |wanted| with_scores_of(&evaluation, wanted));
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
-    let films = film::films(&side, &shown)?;
+    let films = film::render_films(&side, &shown)?;
     let render_time = if render_time { side.render_time()? } else { None };
 
     notes.extend(evaluation.notes.iter().cloned());
@@ -186,7 +186,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bo
     };
     let data = ResultData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
-        pictures: evaluation.pictures.clone(),
+        pictures: evaluation.views.clone(),
         evaluation: evaluation.without_folders(),
         render_time,
         failure_modes,
@@ -244,10 +244,10 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let mut first = None;
     for split in [Some(Split::Train), None, scene.rig.held_out()] {
         let schedule = scene.rig.schedule(times, split)?;
-        if schedule.pairs() == 0 {
+        if schedule.pair_count() == 0 {
             continue;
         }
-        if wanted.is_none_or(|wanted| wanted == schedule.pairs()) {
+        if wanted.is_none_or(|wanted| wanted == schedule.pair_count()) {
             return Ok(schedule);
         }
         first.get_or_insert(schedule);
@@ -275,9 +275,9 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
 
 /// Returns for each kind of Gaussian its number, the numbers of dropped and merged ones, and its contribution. `fates`
 /// is `None` without an index map (file that maps input to output Gaussians).
-fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembers; 3] {
+fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
-    let shares = shares(rows, traits, |i| fate(i) != Fate::Kept);
+    let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
     std::array::from_fn(|kind| {
         let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
         KindMembers {
@@ -292,23 +292,23 @@ fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembe
 /// images of both.
 fn show_again(
     side: &ModelPair,
-    choices: &[Choice],
+    choices: &[ChosenRender],
     modes: &[FailureMode],
-    traits: &[Traits],
-) -> Result<(Vec<ShownImage>, Vec<Close>)> {
+    traits: &[KindFlags],
+) -> Result<(Vec<ShownImage>, Vec<WorstPlaceImages>)> {
     let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
     let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
     let (mut shown, mut close) = (Vec::new(), Vec::new());
-    let made = side.again(&places, |place, state, camera, taken| {
+    let made = side.render_again(&places, |place, state, camera, taken| {
         for choice in choices.iter().filter(|choice| choice.place == place) {
-            shown.push(show(choice, &taken)?);
+            shown.push(create_images(choice, &taken)?);
         }
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
             let shares = failure::shares_of_pixels(state, traits, camera);
             let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
             let part = |image| shown::data_uri(&failure::crop(image, corner));
             let images = [part(&taken.original)?, part(&taken.compressed)?];
-            close.push(Close { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
+            close.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
         }
         Ok(())
     })?;
@@ -330,11 +330,11 @@ fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFile
         "verdict": report.result.verdict,
     });
     let mut files = vec![
-        (PAGE, page.to_owned()),
+        (PAGE_FILE, page.to_owned()),
         ("report.json", json),
         ("pictures.csv", report.result.evaluation.csv()),
         ("failure_modes.csv", tables::failure_modes(&report.result.failure_modes)),
-        (MARKER, format!("{marker:#}\n")),
+        (SUMMARY_FILE, format!("{marker:#}\n")),
     ];
     files.extend(report.result.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
     files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(&of.stages))));

@@ -8,11 +8,12 @@ use super::document::{document, figure_of, links, list};
 use super::html::{count, escape, figure, file_name};
 use super::trade_off::Chart;
 use crate::evaluation::precision::{
-    ADDED, KEPT, PICTURES, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, STAYING, meaning,
+    ADDED_ERROR, COUNT_ERROR, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, RENDER_ERROR,
+    SELECTION_DISTANCE, axis_label,
 };
 
 /// File name of the page that the command `precision` writes.
-pub const PAGE: &str = "precision.html";
+pub const PAGE_FILE: &str = "precision.html";
 
 /// Measure of work (time or memory): its name, and the function that returns its value.
 type WorkMeasure = (&'static str, fn(&PrecisionSetting) -> Option<f64>);
@@ -64,13 +65,13 @@ fn conditions(found: &PrecisionDiagram) -> String {
         count(found.gaussians),
         count(found.frames),
         count(found.pictures),
-        count(found.frames_looked_at),
+        count(found.frames_scored),
         found.judged,
         escape(&found.cameras),
         count(found.kept),
         found.threads,
         found.runs,
-        found.enough,
+        found.max_setting_seconds,
     );
     said + &list(&found.notes)
 }
@@ -92,13 +93,20 @@ fn turned(knob: &PrecisionKnob) -> String {
 /// first error also against wall time and memory. An error that is always 0 has no chart.
 pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     let mut errors: Vec<&String> =
-        knob.curves.iter().flat_map(|curve| &curve.marks).flat_map(|m| m.errors.keys()).collect();
+        knob.curves.iter().flat_map(|curve| &curve.settings).flat_map(|m| m.errors.keys()).collect();
     // Errors of renders come first.
-    errors
-        .sort_by_key(|error| ([ADDED, PICTURES, KEPT, STAYING].iter().position(|of| of == error).unwrap_or(4), *error));
+    errors.sort_by_key(|error| {
+        (
+            [ADDED_ERROR, RENDER_ERROR, SELECTION_DISTANCE, COUNT_ERROR].iter().position(|of| of == error).unwrap_or(4),
+            *error,
+        )
+    });
     errors.dedup();
     let seen = |error: &&String| {
-        knob.curves.iter().flat_map(|curve| &curve.marks).any(|mark| mark.errors.get(*error).is_some_and(|&e| e > 0.0))
+        knob.curves
+            .iter()
+            .flat_map(|curve| &curve.settings)
+            .any(|mark| mark.errors.get(*error).is_some_and(|&e| e > 0.0))
     };
     let errors: Vec<&String> = errors.into_iter().filter(seen).collect();
     let mut charts: Vec<Chart> = errors.iter().map(|error| chart(knob, error, WORK[0])).collect();
@@ -110,7 +118,7 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
 fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
-            curve.marks.iter().filter_map(|mark| Some((mark, at(mark)?, *mark.errors.get(error)?))).collect();
+            curve.settings.iter().filter_map(|mark| Some((mark, at(mark)?, *mark.errors.get(error)?))).collect();
         Series {
             name: curve.name.clone(),
             points: marks.iter().map(|&(_, work, error)| (work, error)).collect(),
@@ -120,21 +128,22 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
         }
     });
     let log = |label: String| ChartAxis { label, log: true, from_zero: false };
-    let title = format!("{}: {}, by {}", knob.name, meaning(error), work.split(',').next().unwrap_or(work));
-    let plot = Plot { title: title.clone(), x: log(work.to_owned()), y: log(meaning(error)), series: series.collect() };
+    let title = format!("{}: {}, by {}", knob.name, axis_label(error), work.split(',').next().unwrap_or(work));
+    let plot =
+        Plot { title: title.clone(), x: log(work.to_owned()), y: log(axis_label(error)), series: series.collect() };
     (title, plot.svg())
 }
 
 /// Returns the label of a measurement in a chart: the value of the parameter, with a star if it is the value in the
 /// recipe.
 fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
-    let own = if curve.own == Some(mark.value) { "*" } else { "" };
+    let own = if curve.recipe_value == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))
 }
 
 /// Returns an HTML table of all measurements of a curve.
 fn table(curve: &PrecisionCurve) -> String {
-    let mut errors: Vec<&String> = curve.marks.iter().flat_map(|mark| mark.errors.keys()).collect();
+    let mut errors: Vec<&String> = curve.settings.iter().flat_map(|mark| mark.errors.keys()).collect();
     errors.sort_unstable();
     errors.dedup();
     let names: String = errors.iter().map(|error| format!("<th>{}</th>", escape(error))).collect();
@@ -143,10 +152,10 @@ fn table(curve: &PrecisionCurve) -> String {
          aria-label=\"Values\"><table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
          <th>MiB</th><th>dB</th>{names}</tr>\n",
         escape(&curve.name),
-        escape(&curve.against),
+        escape(&curve.reference),
         escape(&curve.name)
     );
-    for mark in &curve.marks {
+    for mark in &curve.settings {
         let cost = &mark.cost;
         let known = |value: Option<f64>| value.map_or("–".to_owned(), figure);
         let cells = [
@@ -168,10 +177,10 @@ fn table(curve: &PrecisionCurve) -> String {
         .iter()
         .map(|order| {
             let expected = order.expected.map_or(String::new(), |expected| format!(" (theory: {expected})"));
-            format!("order of {}: {:.2}{expected}", order.of, order.observed)
+            format!("order of {}: {:.2}{expected}", order.error, order.observed)
         })
         .collect();
-    said.extend(curve.enough.map(|enough| {
+    said.extend(curve.sufficient_value.map(|enough| {
         format!("from {} on it adds less than a tenth of the model's own error to renders", figure(enough))
     }));
     out += &list(&said);
@@ -183,11 +192,11 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::evaluation::cost::{Cost, Spread};
-    use crate::evaluation::precision::Source;
+    use crate::evaluation::cost::{Cost, MedianAndRange};
+    use crate::evaluation::precision::ErrorSource;
 
     fn mark(value: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
-        let seconds = Spread::from_values(vec![value]);
+        let seconds = MedianAndRange::from_values(vec![value]);
         let errors: BTreeMap<String, f64> = errors.iter().map(|&(of, error)| (of.to_owned(), error)).collect();
         let cost = Cost { runs: 1, seconds, processor_seconds: Some(seconds), peak_memory_bytes: Some(1 << 22) };
         PrecisionSetting { value, step: 1.0 / value, cost, errors, psnr: None }
@@ -197,14 +206,15 @@ mod tests {
         PrecisionKnob {
             name: "look".to_owned(),
             about: "<b>".to_owned(),
-            source: Source::Discretization,
+            source: ErrorSource::Discretization,
             curves: vec![PrecisionCurve::new("look_pictures", "all", marks, Some(2.0), &[])],
         }
     }
 
     #[test]
     fn every_error_has_a_diagram_over_time_and_the_first_over_memory_too() {
-        let marks = [4.0, 2.0, 1.0].map(|value| mark(value, &[("C", 0.1 / value), (ADDED, 0.2 / value), ("W", 0.0)]));
+        let marks =
+            [4.0, 2.0, 1.0].map(|value| mark(value, &[("C", 0.1 / value), (ADDED_ERROR, 0.2 / value), ("W", 0.0)]));
         let charts = charts(&knob(marks.to_vec()));
         let titles: Vec<&str> = charts.iter().map(|chart| chart.0.as_str()).collect();
         assert_eq!(

@@ -2,7 +2,7 @@
 //! visible; a chart without differences is left out.
 
 use super::analysis::Analysis;
-use super::chart::{Bars, ChartAxis, Plot, Series};
+use super::chart::{BarChart, ChartAxis, Plot, Series};
 use super::document::figure_of;
 use crate::evaluation::found::{Comparison, FrameMeans, QualityMeans, ViewMeans};
 
@@ -82,6 +82,6 @@ fn by_view(of: &Comparison, title: &str) -> String {
     let hidden = bars.len().saturating_sub(MOST_VIEWS);
     bars.truncate(MOST_VIEWS);
     let more = if hidden > 0 { format!(" (the {MOST_VIEWS} worst of {})", hidden + MOST_VIEWS) } else { String::new() };
-    let chart = Bars { title: title.to_owned(), label: format!("PSNR, dB{more}"), bars, is_fitted: true };
+    let chart = BarChart { title: title.to_owned(), label: format!("PSNR, dB{more}"), bars, is_fitted: true };
     figure_of(title, &chart.svg())
 }

@@ -9,12 +9,12 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::files::atomic::MARKER;
+use crate::files::atomic::SUMMARY_FILE;
 use crate::files::names::shown_name;
 use crate::files::npy::header_is_sound;
 use crate::files::open::open_file;
 use crate::files::text::read_text;
-use crate::pipeline::stages::write::{INDEX_MAP, RECIPE, beside};
+use crate::pipeline::stages::write::{INDEX_MAP_FILE, RECIPE_FILE, companion_path};
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 
@@ -47,11 +47,11 @@ impl RunFiles {
     /// its original has `original` Gaussians.
     ///
     /// A file that is absent or does not fit is no error: any two models can be compared.
-    pub fn beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
+    pub fn read_files_beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
         let is_folder = result.is_dir();
         let mut run = RunFiles::default();
-        let take = |name: &str| beside(result, is_folder, name);
-        let (summary, recipe, map) = (take(MARKER), take(RECIPE), take(INDEX_MAP));
+        let take = |name: &str| companion_path(result, is_folder, name);
+        let (summary, recipe, map) = (take(SUMMARY_FILE), take(RECIPE_FILE), take(INDEX_MAP_FILE));
         match read_summary(&summary) {
             Ok(found) => run.summary = Some(found),
             Err(why) => run.missing.push(format!("{}: {why}", shown_name(&summary))),
@@ -137,17 +137,17 @@ mod tests {
     #[test]
     fn what_is_absent_or_of_another_scene_is_named_and_no_failure() {
         let folder = tempfile::tempdir().unwrap();
-        let run = RunFiles::beside(folder.path(), 4, 2);
+        let run = RunFiles::read_files_beside(folder.path(), 4, 2);
         assert!(run.summary.is_none() && run.recipe.is_none() && run.fates.is_none());
         assert_eq!(run.missing.len(), 3);
-        write_index_map(&[Some(0), None, Some(1)], &folder.path().join(INDEX_MAP)).unwrap();
-        fs::write(folder.path().join(MARKER), "{\"tool\": \"splatsieve\"}").unwrap();
-        fs::write(folder.path().join(RECIPE), "[select]\nkeep_fraction = 7.0").unwrap();
-        let run = RunFiles::beside(folder.path(), 4, 2);
+        write_index_map(&[Some(0), None, Some(1)], &folder.path().join(INDEX_MAP_FILE)).unwrap();
+        fs::write(folder.path().join(SUMMARY_FILE), "{\"tool\": \"splatsieve\"}").unwrap();
+        fs::write(folder.path().join(RECIPE_FILE), "[select]\nkeep_fraction = 7.0").unwrap();
+        let run = RunFiles::read_files_beside(folder.path(), 4, 2);
         assert!(run.fates.is_none() && run.summary.is_none() && run.recipe.is_none());
         for part in ["original's 4 Gaussians, found [3]", "not a summary of compress", "keep_fraction"] {
             assert!(run.missing.iter().any(|why| why.contains(part)), "{part}: {:?}", run.missing);
         }
-        assert!(RunFiles::beside(folder.path(), 3, 2).fates.is_some());
+        assert!(RunFiles::read_files_beside(folder.path(), 3, 2).fates.is_some());
     }
 }

@@ -1,7 +1,7 @@
 //! Choice of the renders that the page shows, and their images.
 //!
 //! Input: the scores of all renders, from which some renders are chosen, and then the images of the chosen renders,
-//! which the caller renders a second time. Output: PNG files as data URIs. A page holds at most [`CHOSEN`] renders of
+//! which the caller renders a second time. Output: PNG files as data URIs. A page holds at most [`MAX_SHOWN`] renders of
 //! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
@@ -23,7 +23,7 @@ pub(super) const MEDIAN: &str = "median render";
 
 /// Maximum number of renders that the page shows: the worst one, the worst one of the worst view, the worst one of the
 /// worst frame, and the median one.
-pub const CHOSEN: usize = 4;
+pub const MAX_SHOWN: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
@@ -35,10 +35,10 @@ const MAX_FACTOR: u32 = 64;
 
 /// Render that the page shows, with its scores.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Choice {
+pub struct ChosenRender {
     /// Reasons for the choice, such as "worst render".
     pub why: Vec<String>,
-    /// Index of the render in [`Evaluation::pictures`].
+    /// Index of the render in [`Evaluation::views`].
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
@@ -56,8 +56,8 @@ pub struct Choice {
 
 /// Chooses the renders that the page shows, the worst first. A render that is chosen for several reasons occurs once,
 /// with all its reasons.
-pub fn choices(found: &Evaluation) -> Vec<Choice> {
-    let pictures = &found.pictures;
+pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
+    let pictures = &found.views;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
         places.min_by(|&a, &b| pictures[a].loss.psnr.total_cmp(&pictures[b].loss.psnr))
     };
@@ -73,7 +73,7 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
         ("worst frame", of_frame),
         (MEDIAN, by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
     ];
-    let mut chosen: Vec<Choice> = Vec::new();
+    let mut chosen: Vec<ChosenRender> = Vec::new();
     for (why, place) in wanted {
         let Some(place) = place else { continue };
         if let Some(same) = chosen.iter_mut().find(|choice| choice.place == place) {
@@ -82,17 +82,25 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
         }
         let of = &pictures[place];
         let ImageScore { psnr, ssim, flip, .. } = of.loss;
-        chosen.push(Choice { why: vec![why.to_owned()], place, frame: of.frame, view: of.view, psnr, ssim, flip });
+        chosen.push(ChosenRender {
+            why: vec![why.to_owned()],
+            place,
+            frame: of.frame,
+            view: of.view,
+            psnr,
+            ssim,
+            flip,
+        });
     }
     chosen
 }
 
 /// Returns the renders `choices`, which were chosen for another compressed model of the same original, with their
 /// scores in the evaluation `found`.
-pub fn scores_at(found: &Evaluation, choices: &[Choice]) -> Vec<Choice> {
-    let scored = |choice: &Choice| {
-        let ImageScore { psnr, ssim, flip, .. } = found.pictures[choice.place].loss;
-        Choice { psnr, ssim, flip, ..choice.clone() }
+pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
+    let scored = |choice: &ChosenRender| {
+        let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;
+        ChosenRender { psnr, ssim, flip, ..choice.clone() }
     };
     choices.iter().map(scored).collect()
 }
@@ -101,7 +109,7 @@ pub fn scores_at(found: &Evaluation, choices: &[Choice]) -> Vec<Choice> {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
     /// Chosen render, with its scores.
-    pub choice: Choice,
+    pub choice: ChosenRender,
     /// Names and data URIs of the images: original, compressed, difference and, if there is one, photograph.
     pub images: Vec<(&'static str, String)>,
     /// Width and height of the shown images, pixels.
@@ -117,7 +125,7 @@ pub struct ShownImage {
 ///
 /// # Errors
 /// Fails if the render has no pixels, which PNG does not allow.
-pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
+pub fn create_images(choice: &ChosenRender, taken: &RenderedViews) -> Result<ShownImage> {
     let shrunk = shrinkage(&taken.original, MAX_PIXELS);
     let difference = difference(&taken.compressed, &taken.original);
     let factor = brightening(&difference);

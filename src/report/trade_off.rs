@@ -10,7 +10,7 @@ use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
 
 /// File name of the page that the command `sweep` writes.
-pub const PAGE: &str = "sweep.html";
+pub const PAGE_FILE: &str = "sweep.html";
 
 /// Chart: its title, and its `<svg>` element.
 pub type Chart = (String, String);
@@ -77,7 +77,7 @@ pub(super) fn search(goal: &GoalSummary) -> String {
 /// varied parameter.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let curves = curves(found);
-    let kept = |point: &TradeOffPoint| Some(100.0 * found.fraction(point));
+    let kept = |point: &TradeOffPoint| Some(100.0 * found.kept_fraction(point));
     let megabytes = |point: &TradeOffPoint| Some(point.bytes as f64 / 1e6);
     let seconds = |point: &TradeOffPoint| Some(point.seconds);
     let memory = |point: &TradeOffPoint| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
@@ -113,7 +113,7 @@ fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let first = knob.settings.first().map(|setting| &setting.point);
     let is_beside = |point: &&TradeOffPoint| {
         let without = Method::ALL.into_iter().find(|method| method.name() == point.method);
-        let refined = without.and_then(Method::refined).map(Method::name);
+        let refined = without.and_then(Method::with_refinement).map(Method::name);
         first.is_some_and(|first| first.asked == point.asked && refined == Some(first.method.as_str()))
     };
     let mut series = vec![Series {
@@ -129,7 +129,7 @@ fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
         paired: true,
         ..Series::default()
     }));
-    let kept = first.map_or(1.0, |point| found.fraction(point));
+    let kept = first.map_or(1.0, |point| found.kept_fraction(point));
     let title = format!("Error by run time, {}% kept, by {}", figure(100.0 * kept), knob.parameter);
     let (x, y) = (log("time to compress, s"), log(ERROR));
     (title.clone(), Plot { title, x, y, series }.svg())
@@ -170,7 +170,7 @@ fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
         }
     }
     curves.iter_mut().for_each(|curve| curve.points.sort_by_key(|point| point.count));
-    for (method, refined) in Method::ALL.into_iter().filter_map(|method| Some((method, method.refined()?))) {
+    for (method, refined) in Method::ALL.into_iter().filter_map(|method| Some((method, method.with_refinement()?))) {
         let pair = [refined, method].map(Method::name);
         if pair.iter().all(|&name| curves.iter().any(|curve| curve.name == name)) {
             let place =
@@ -186,7 +186,7 @@ fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::trade_off::Setting;
+    use crate::evaluation::trade_off::EffortSetting;
 
     fn point(method: &str, count: usize, psnr: f64, peak_memory_bytes: Option<u64>) -> TradeOffPoint {
         let bytes = count as u64 * 248;
@@ -250,7 +250,7 @@ mod tests {
 
     #[test]
     fn a_knob_is_drawn_with_its_values_beside_what_it_starts_from() {
-        let setting = |(value, psnr): (u32, f64)| Setting { value, point: point("default", 10, psnr, None) };
+        let setting = |(value, psnr): (u32, f64)| EffortSetting { value, point: point("default", 10, psnr, None) };
         let settings = [(100, 20.0), (1500, 40.0)].map(setting).to_vec();
         let knob = EffortCurve { parameter: "refine_steps".to_owned(), settings };
         let mut other_size = point("no-refine", 50, 30.0, None);

@@ -1,6 +1,6 @@
 //! Kinds of Gaussian that compression is known to hurt.
 //!
-//! Input: the original's frames and statistics. Output: the [`Traits`] (membership in each kind) of every Gaussian. The
+//! Input: the original's frames and statistics. Output: the [`KindFlags`] (membership in each kind) of every Gaussian. The
 //! kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. The
 //! paper gives no thresholds; the thresholds here are this project's. Memory: where colors vary, one frame of colors
 //! and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
@@ -14,24 +14,24 @@ use crate::merging::neighbors::PointIndex;
 use crate::merging::tree::TreePoint;
 use crate::model::{Attributes, Gaussians, Rows, SH_C0, opacity};
 use crate::passes::{FrameReaders, gather};
-use crate::pruning::score::{SCORED_BYTES, Scored};
+use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Minimum trajectory magnitude D of a fast Gaussian, as a fraction of the scene extent per frame: one pixel per frame
 /// in a render that shows the scene over 500 pixels.
-pub const FAST: f64 = 2e-3;
+pub const MIN_FAST_MOTION: f64 = 2e-3;
 /// Minimum relative change of the distance between neighbors that counts as non-rigid motion: root mean square over
 /// time, exceeded for half of the neighbors.
-pub const NON_RIGID: f64 = 0.05;
+pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
 /// Minimum distance by which a change of distance is divided, as a fraction of the scene extent; closer neighbors may
 /// change places invisibly.
 const NEAREST: f64 = 1e-3;
 /// Number of nearest neighbors of a Gaussian whose distances are measured over time.
 pub const NEIGHBORS: usize = 8;
 /// Minimum ratio of the largest to the middle scale of a thin Gaussian.
-pub const THIN: f64 = 5.0;
+pub const MIN_THIN_RATIO: f64 = 5.0;
 /// Maximum trajectory magnitude D of a still Gaussian, as a fraction of the scene extent per frame.
-pub const STILL: f64 = 5e-4;
+pub const MAX_STILL_MOTION: f64 = 5e-4;
 /// Minimum standard deviation of the opacity over the life span (frames in which the Gaussian is alive) that counts as
 /// a change of appearance.
 pub const OPACITY_CHANGE: f64 = 0.05;
@@ -39,14 +39,14 @@ pub const OPACITY_CHANGE: f64 = 0.05;
 /// as a change of appearance: root mean square over the channels, colors in [0, 1]; five steps of 1/255.
 pub const COLOR_CHANGE: f64 = 0.02;
 /// Maximum number of frames, evenly spaced, at which distances and colors are measured.
-pub const SAMPLES: usize = 24;
+pub const MAX_SAMPLED_FRAMES: usize = 24;
 
 /// Kind of Gaussian that compression is known to damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GaussianKind {
     /// Fast, and moving differently from its neighbors.
     Motion,
-    /// Much longer than wide: the largest scale is at least [`THIN`] times the middle one.
+    /// Much longer than wide: the largest scale is at least [`MIN_THIN_RATIO`] times the middle one.
     Thin,
     /// Hardly moving, but changing in opacity or color.
     Appearance,
@@ -57,30 +57,30 @@ impl GaussianKind {
     pub const ALL: [GaussianKind; 3] = [GaussianKind::Motion, GaussianKind::Thin, GaussianKind::Appearance];
 }
 
-/// Returns the resource estimate (memory, time, reads) of [`traits`].
-pub fn need(work: &Workload) -> ResourceEstimate {
+/// Returns the resource estimate (memory, time, reads) of [`kind_flags`].
+pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
-        ("rows", SCORED_BYTES),
-        ("states", work.state(Attributes::POSITION | Attributes::LOG_SCALE)),
-        ("colors", 88 + work.state(Attributes::SH | Attributes::OPACITY)),
+        ("rows", SCORING_BYTES_PER_GAUSSIAN),
+        ("states", work.state_bytes(Attributes::POSITION | Attributes::LOG_SCALE)),
+        ("colors", 88 + work.state_bytes(Attributes::SH | Attributes::OPACITY)),
         ("neighbors", 190),
         ("readers", work.input.reader),
-        ("held", work.held(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
+        ("held", work.kept_frames_bytes(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
     ];
-    let frames = SAMPLES.min(work.frames as usize) as u64;
-    let reads = work.scattered_reads(1, &Limits::NONE) + 2.0 * work.scattered_reads(frames, &Limits::NONE);
-    let seconds = 2e-5 * work.count() + work.reading(work.count(), 2.0 * frames as f64);
-    ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
+    let frames = MAX_SAMPLED_FRAMES.min(work.frames as usize) as u64;
+    let reads = work.scattered_full_reads(1, &Limits::NONE) + 2.0 * work.scattered_full_reads(frames, &Limits::NONE);
+    let seconds = 2e-5 * work.gaussian_count() + work.reading_seconds(work.gaussian_count(), 2.0 * frames as f64);
+    ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.filling_blocks()] }
 }
 
 /// Membership of one Gaussian in each kind, in the order of [`GaussianKind::ALL`].
-pub type Traits = [bool; 3];
+pub type KindFlags = [bool; 3];
 
 /// Determines to which kinds every Gaussian belongs. A Gaussian that is never visible belongs to none.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
-pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<Traits>> {
+pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<KindFlags>> {
     let (rows, extent) = (scored.rows()?, scored.reference.extent);
     let mut found = vec![[false; 3]; rows.len()];
     let frames = samples(source.info().times.len());
@@ -90,15 +90,18 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     let visible = |i: usize| rows.life[i] > 0 && rows.c[i] > 0.0;
     let all: Vec<u32> = (0..rows.len() as u32).collect();
     let reference = gather(source, &all, scored.reference.frame, Attributes::POSITION | Attributes::LOG_SCALE)?;
-    let fast: Vec<u32> =
-        all.iter().copied().filter(|&i| visible(i as usize) && rows.d[i as usize] >= FAST * extent).collect();
+    let fast: Vec<u32> = all
+        .iter()
+        .copied()
+        .filter(|&i| visible(i as usize) && rows.d[i as usize] >= MIN_FAST_MOTION * extent)
+        .collect();
     for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
-        found[id as usize][GaussianKind::Motion as usize] = bent >= NON_RIGID;
+        found[id as usize][GaussianKind::Motion as usize] = bent >= MIN_NON_RIGID_CHANGE;
     }
     let recolored = color_change(source, &all, &frames, alpha_min)?;
     for i in (0..rows.len()).filter(|&i| visible(i)) {
         found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
-        found[i][GaussianKind::Appearance as usize] = rows.d[i] <= STILL * extent
+        found[i][GaussianKind::Appearance as usize] = rows.d[i] <= MAX_STILL_MOTION * extent
             && (rows.v[i].sqrt() >= OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= COLOR_CHANGE));
     }
     Ok(found)
@@ -106,7 +109,7 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
 
 /// Returns for each kind of Gaussian its contribution to renders as a fraction of that of all Gaussians, and the
 /// fraction of it that belongs to Gaussians for which `is_lost` is true.
-pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
+pub fn contribution_shares(rows: &Rows, traits: &[KindFlags], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
     std::array::from_fn(|kind| {
@@ -121,12 +124,12 @@ pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -
 
 fn is_thin(mut log_scale: [f32; 3]) -> bool {
     log_scale.sort_unstable_by(f32::total_cmp);
-    f64::from(log_scale[2]) - f64::from(log_scale[1]) >= THIN.ln()
+    f64::from(log_scale[2]) - f64::from(log_scale[1]) >= MIN_THIN_RATIO.ln()
 }
 
-/// Returns at most [`SAMPLES`] of the indices from 0 to `frames` − 1, evenly spaced from first to last.
+/// Returns at most [`MAX_SAMPLED_FRAMES`] of the indices from 0 to `frames` − 1, evenly spaced from first to last.
 fn samples(frames: usize) -> Vec<usize> {
-    let count = frames.min(SAMPLES);
+    let count = frames.min(MAX_SAMPLED_FRAMES);
     (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
 }
 
@@ -169,7 +172,7 @@ fn bending(
     };
     let mut reader =
         FrameReaders::open(source, Ids::List(&followed), Attributes::POSITION, &ReadPlan::new(frames.to_vec()))?;
-    let mut state = reader.state();
+    let mut state = reader.state_buffer();
     for &frame in frames {
         reader.read(frame, Attributes::POSITION, &mut state)?;
         let now = &state.position;
@@ -201,7 +204,7 @@ fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_m
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
     let columns = Attributes::SH | Attributes::OPACITY;
     let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::new(frames.to_vec()))?;
-    let mut now = reader.state();
+    let mut now = reader.state_buffer();
     for &frame in frames {
         reader.read(frame, columns, &mut now)?;
         for (i, (n, sum, squares)) in sums.iter_mut().enumerate() {
@@ -309,7 +312,7 @@ mod tests {
         assert_eq!(samples(1), [0]);
         assert_eq!(samples(3), [0, 1, 2]);
         let many = samples(1000);
-        assert_eq!((many.len(), many[0], many[SAMPLES - 1]), (SAMPLES, 0, 999));
+        assert_eq!((many.len(), many[0], many[MAX_SAMPLED_FRAMES - 1]), (MAX_SAMPLED_FRAMES, 0, 999));
         assert!(many.windows(2).all(|pair| pair[0] < pair[1]));
     }
 }

@@ -18,20 +18,20 @@ const MIN_COSINE: f64 = -0.6;
 /// away from it, seen from the point where the optical axes meet; if there are none, it is the nearest camera at
 /// another position. (Paths between neighbors only would leave the middle of a rig empty.) Returns no camera if all
 /// cameras are at one position. The random numbers are the same in every run.
-pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
+pub fn cameras_between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);
     let mut found = Vec::with_capacity(count);
     for _ in 0..count {
-        let Some(from) = cameras.get(random.below(cameras.len())) else { break };
+        let Some(from) = cameras.get(random.next_below(cameras.len())) else { break };
         let squared_distance = |other: &&Camera| other.center().distance_squared(from.center());
         let elsewhere = || cameras.iter().filter(|other| squared_distance(other) > 0.0);
         let direction = |camera: &Camera| (camera.center() - focus).normalize_or_zero();
         let is_near = |other: &&Camera| direction(other).dot(direction(from)) > MIN_COSINE;
         let near: Vec<&Camera> = elsewhere().filter(is_near).collect();
         let nearest = || elsewhere().min_by(|a, b| squared_distance(a).total_cmp(&squared_distance(b)));
-        let Some(to) = near.get(random.below(near.len())).copied().or_else(nearest) else { continue };
-        let fraction = MIN_FRACTION + (1.0 - 2.0 * MIN_FRACTION) * random.unit();
+        let Some(to) = near.get(random.next_below(near.len())).copied().or_else(nearest) else { continue };
+        let fraction = MIN_FRACTION + (1.0 - 2.0 * MIN_FRACTION) * random.next_unit_f64();
         found.push(interpolated_camera(from, to, fraction, focus));
     }
     found
@@ -81,7 +81,7 @@ pub struct SplitMix64(pub u64);
 
 impl SplitMix64 {
     /// Returns the next 64 random bits.
-    pub fn bits(&mut self) -> u64 {
+    pub fn next_u64(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut bits = self.0;
         bits = (bits ^ (bits >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -90,19 +90,19 @@ impl SplitMix64 {
     }
 
     /// Returns a uniformly distributed random number in [0, 1).
-    pub fn unit(&mut self) -> f64 {
-        (self.bits() >> 11) as f64 / (1u64 << 53) as f64
+    pub fn next_unit_f64(&mut self) -> f64 {
+        (self.next_u64() >> 11) as f64 / (1u64 << 53) as f64
     }
 
     /// Returns a uniformly distributed random integer below `end`; 0 if `end` is 0.
-    pub fn below(&mut self, end: usize) -> usize {
-        ((u128::from(self.bits()) * end as u128) >> 64) as usize
+    pub fn next_below(&mut self, end: usize) -> usize {
+        ((u128::from(self.next_u64()) * end as u128) >> 64) as usize
     }
 
     /// Shuffles `values` into a random order.
     pub fn shuffle<T>(&mut self, values: &mut [T]) {
         for k in (1..values.len()).rev() {
-            values.swap(k, self.below(k + 1));
+            values.swap(k, self.next_below(k + 1));
         }
     }
 }
@@ -124,8 +124,8 @@ mod tests {
         let cameras = ring(9);
         let focus = DVec3::new(0.1, 0.2, 0.3);
         assert!(meeting_point(&cameras).distance(focus) < 1e-9);
-        let found = between(&cameras, 50);
-        assert_eq!((found.len(), &found), (50, &between(&cameras, 50)));
+        let found = cameras_between(&cameras, 50);
+        assert_eq!((found.len(), &found), (50, &cameras_between(&cameras, 50)));
         let distances: Vec<f64> = cameras.iter().map(|camera| camera.center().distance(focus)).collect();
         let [least, most] = [f64::min, f64::max].map(|pick| distances.iter().copied().reduce(pick).unwrap());
         for camera in &found {
@@ -142,12 +142,12 @@ mod tests {
     #[test]
     fn too_few_distinct_cameras_have_none_between() {
         let one = ring(1);
-        assert!(between(&[], 5).is_empty() && between(&one, 5).is_empty());
-        assert!(between(&[one[0].clone(), one[0].clone()], 5).is_empty());
+        assert!(cameras_between(&[], 5).is_empty() && cameras_between(&one, 5).is_empty());
+        assert!(cameras_between(&[one[0].clone(), one[0].clone()], 5).is_empty());
         // Optical axes that are parallel do not meet.
         let aside =
             |x: f64| Camera { translation: DVec3::new(x, 0.0, 0.0), rotation: DMat3::IDENTITY, ..one[0].clone() };
-        assert!(between(&[aside(0.0), aside(1.0)], 5).iter().all(|camera| camera.center().is_finite()));
+        assert!(cameras_between(&[aside(0.0), aside(1.0)], 5).iter().all(|camera| camera.center().is_finite()));
     }
 
     #[test]
@@ -158,7 +158,7 @@ mod tests {
         assert!(!values.is_sorted());
         values.sort_unstable();
         assert!(values.iter().copied().eq(0..100));
-        assert!((0..1000).all(|_| random.below(3) < 3 && (0.0..1.0).contains(&random.unit())));
-        assert_eq!(random.below(0), 0);
+        assert!((0..1000).all(|_| random.next_below(3) < 3 && (0.0..1.0).contains(&random.next_unit_f64())));
+        assert_eq!(random.next_below(0), 0);
     }
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{InputOptions, Scene};
 use crate::error::{Error, Result, ShowPath};
-use crate::models::{self, InputModel, OpenOptions, Timing};
+use crate::models::{self, InputModel, OpenOptions, TimeOrigin};
 
 /// Maximum difference between the times of the same frame in two models, as a fraction of the time span. Files round
 /// times.
@@ -17,11 +17,11 @@ const TIME_TOLERANCE: f64 = 1e-6;
 /// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.
 pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let times = &original.source().info().times;
-    let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;
+    let input = models::open(path, &OpenOptions { iteration: None, ..options.open_options() })?;
     let input = match input.timing() {
-        Timing::Continuous => input.with_times(times.clone())?,
-        Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
-        Timing::Numbered | Timing::Stamped => input,
+        TimeOrigin::Continuous => input.with_times(times.clone())?,
+        TimeOrigin::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
+        TimeOrigin::Numbered | TimeOrigin::Stamped => input,
     };
     let found = &input.source().info().times;
     let expected = |what: String| format!("{what}, as in {}", original.path.shown());

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use crate::cache;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
-use crate::files::cameras::{CameraOptions, Clock, Times};
+use crate::files::cameras::{CameraOptions, TimeConvention, TimesSource};
 use crate::memory_plan::Budget;
 use crate::model::{Rig, Split};
 use crate::models;
-use crate::models::{Conventions, InputModel, Link, OpenOptions};
+use crate::models::{InputModel, LinkMode, OpenOptions, TrainingConventions};
 use crate::progress::Events;
 
 /// Options for opening an input together with its cameras.
@@ -21,11 +21,11 @@ pub struct InputOptions {
     /// Training iteration to read from a model folder; `None`: the latest one found.
     pub iteration: Option<u32>,
     /// Training conventions that the files of a model do not state.
-    pub conventions: Conventions,
+    pub conventions: TrainingConventions,
     /// Whether a folder with one PLY file per frame may lack frames.
     pub allow_gaps: bool,
     /// Whether the Gaussians of successive frames are matched with each other and linked into tracks.
-    pub link: Link,
+    pub link: LinkMode,
     /// Number of frames at which a model that is continuous in time is evaluated; `None`: the times of the cameras are
     /// used.
     pub frames: Option<usize>,
@@ -34,7 +34,7 @@ pub struct InputOptions {
     /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
     /// Origin of the times of views if the camera file does not state them.
-    pub times: Times,
+    pub times: TimesSource,
     /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,
     /// Folder for temporary files during the run: the packed frames of a stream, and data that does not fit into
@@ -57,7 +57,7 @@ impl InputOptions {
     }
 
     /// Returns those of the options that apply to the input without its cameras.
-    pub fn opening(&self) -> OpenOptions {
+    pub fn open_options(&self) -> OpenOptions {
         OpenOptions {
             iteration: self.iteration,
             allow_gaps: self.allow_gaps,
@@ -125,8 +125,8 @@ pub struct OpenedInput {
 pub fn load_cameras(
     options: &InputOptions,
     path: Option<&Path>,
-    times: Times,
-    clock: Clock,
+    times: TimesSource,
+    clock: TimeConvention,
     input: Option<&dyn InputModel>,
 ) -> Result<Option<Rig>> {
     let Some(path) = path else { return Ok(None) };

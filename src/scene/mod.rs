@@ -2,12 +2,12 @@
 
 mod absent;
 pub mod between;
+pub mod camera_path;
 mod compressed;
 mod frames;
 mod input;
 mod open;
 pub mod outside;
-pub mod path;
 pub mod photographs;
 pub mod pictures;
 mod stream;
@@ -18,7 +18,7 @@ use std::path::PathBuf;
 use crate::cache::Cache;
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::memory_plan::{Budget, Plan, ResourceEstimate, Throughput, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Throughput, Workload};
 use crate::model::{Rig, Split, ViewSchedule};
 use crate::models::InputModel;
 use crate::progress::Events;
@@ -27,9 +27,9 @@ use crate::source::Reads;
 use absent::Absent;
 pub use compressed::open_compressed;
 pub use input::{InputOptions, OpenedInput, load_cameras};
-pub use open::{first_box, from_input, open_input, open_scene, scratch_beside};
-pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, room_to_pack};
-pub use work::kept_work;
+pub use open::{first_frame_box, from_input, open_input, open_scene, scratch_beside};
+pub use stream::{FrameQuota, frame_quota, is_linked, link_stream, open_stream, receiving_estimate};
+pub use work::open_cache;
 pub(crate) use work::stamps;
 
 /// Input together with its cameras, and what a run needs to read and cache it.
@@ -93,7 +93,7 @@ impl Scene {
             planned_reads: None,
             pace: Throughput::UNKNOWN,
             scratch: std::env::temp_dir(),
-            work: Cache::none(),
+            work: Cache::disabled(),
             digest: None,
             notes: Vec::new(),
             events: Events::IGNORED,
@@ -103,30 +103,31 @@ impl Scene {
 
     /// Returns the properties of the scene from which memory and time are estimated.
     pub fn workload(&self) -> Workload {
-        let work = Workload::new(self.source().info(), self.input.residence()).seen(&self.rig, &self.schedule);
-        Workload { pace: self.pace, ..work }
+        let work =
+            Workload::new(self.source().info(), self.input.memory_profile()).with_views(&self.rig, &self.schedule);
+        Workload { throughput: self.pace, ..work }
     }
 
     /// Plans the memory of the stages that `needs` describes, and makes this scene keep to the limits of the plan.
     ///
     /// # Errors
     /// Fails if the stages do not fit into the memory budget under any limits.
-    pub fn keep_to(
+    pub fn plan_memory(
         &mut self,
         budget: Budget,
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
     ) -> Result<()> {
-        let plan = Plan::fit(self.workload(), budget, &self.events, needs)?;
-        plan.tell_time(budget.tell, &self.events);
-        self.follow(&plan);
+        let plan = MemoryPlan::fit_budget(self.workload(), budget, &self.events, needs)?;
+        plan.send_times(budget.tell, &self.events);
+        self.apply_plan(&plan);
         Ok(())
     }
 
     /// Makes this scene keep to the limits of the memory plan `plan`.
-    pub fn follow(&mut self, plan: &Plan) {
+    pub fn apply_plan(&mut self, plan: &MemoryPlan) {
         self.limits = plan.limits;
-        self.planned_reads = Some(plan.reads());
-        if plan.limits.tiles_held {
+        self.planned_reads = Some(plan.full_reads());
+        if plan.limits.keeps_tiles {
             self.input.hold_decoded();
         }
     }
@@ -136,10 +137,10 @@ impl Scene {
     ///
     /// # Errors
     /// Fails if a file does not exist any more.
-    pub fn whole(&self) -> Result<Reads> {
+    pub fn full_read(&self) -> Result<Reads> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;
-        let bytes = if self.input.residence().frame_block > 0 { self.input.stored_bytes()? } else { 0 };
+        let bytes = if self.input.memory_profile().frame_block > 0 { self.input.stored_bytes()? } else { 0 };
         Ok(Reads { bytes, tiles: 0, states })
     }
 }

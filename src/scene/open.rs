@@ -6,15 +6,15 @@ use glam::DVec3;
 
 use super::Scene;
 use super::input::{InputOptions, OpenedInput, load_cameras};
-use super::pictures::no_picture;
+use super::pictures::no_view_error;
 use super::stream::open_packed_stream;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
-use crate::files::cameras::{Clock, Times};
+use crate::files::cameras::{TimeConvention, TimesSource};
 use crate::model::RobustBox;
 use crate::model::{Attributes, Rig, opacity};
 use crate::models;
-use crate::models::{InputModel, Timing};
+use crate::models::{InputModel, TimeOrigin};
 use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
@@ -32,11 +32,11 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     }
     let path = &options.path;
     let mut notes = Vec::new();
-    let input = models::open(path, &options.opening())?;
+    let input = models::open(path, &options.open_options())?;
     let rig = load_input_cameras(options, &*input)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {
-        Timing::Continuous => {
+        TimeOrigin::Continuous => {
             let times = match options.frames {
                 None if !times.is_empty() => times,
                 // The given number of frames equals the number of the cameras' times, so these times are used.
@@ -48,7 +48,7 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
         _ if options.frames.is_some() => {
             return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.shown())));
         }
-        Timing::Numbered if !times.is_empty() => {
+        TimeOrigin::Numbered if !times.is_empty() => {
             let found = input.source().info().times.len();
             if times.len() != found {
                 return Err(Error::usage(format!(
@@ -60,7 +60,7 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
             }
             input.with_times(times)?
         }
-        Timing::Numbered | Timing::Stamped => input,
+        TimeOrigin::Numbered | TimeOrigin::Stamped => input,
     };
     // Some notes of the input depend on the times of its frames.
     let notes = [input.notes(), notes].concat();
@@ -73,17 +73,17 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
 fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the image names of a still scene are not times.
-    let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
+    let is_still = input.timing() != TimeOrigin::Continuous && input.source().info().times.len() == 1;
     let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
     let times = match options.times {
-        Times::Own if is_still && by_name => Times::None,
+        TimesSource::Own if is_still && by_name => TimesSource::None,
         _ => options.times.clone(),
     };
     let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, Some(input));
     let rig = load(input.clock())?;
     let fits = |rig: &Rig| rig.schedule(&input.source().info().times, options.split).is_ok();
-    match rig.as_ref().is_some_and(|rig| input.timing() == Timing::Stamped && !fits(rig)) {
-        true => Ok(load(Clock::Given)?.filter(fits).or(rig)),
+    match rig.as_ref().is_some_and(|rig| input.timing() == TimeOrigin::Stamped && !fits(rig)) {
+        true => Ok(load(TimeConvention::Given)?.filter(fits).or(rig)),
         false => Ok(rig),
     }
 }
@@ -150,8 +150,8 @@ pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> 
         }
     };
     let scene = Scene::new(options.path.clone(), input, rig, options.split)?;
-    if scene.schedule.pairs() == 0 && !scene.source().info().times.is_empty() {
-        return Err(no_picture(&scene.rig));
+    if scene.schedule.pair_count() == 0 && !scene.source().info().times.is_empty() {
+        return Err(no_view_error(&scene.rig));
     }
     let mut scene =
         Scene { has_cameras, scratch: options.scratch_folder(), notes, events: options.events.clone(), ..scene };
@@ -169,7 +169,7 @@ const DEFAULT_FRAMES: usize = 60;
 const MAX_FRAMES: usize = 1_000_000;
 
 fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf> {
-    options.cameras.clone().or_else(|| cameras::find(input.data_folder()?, &options.path))
+    options.cameras.clone().or_else(|| cameras::find_training_cameras(input.data_folder()?, &options.path))
 }
 
 /// Returns virtual cameras all around the surface of a scene with only one frame. Memory: 64 bytes per Gaussian.
@@ -189,13 +189,13 @@ fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
 /// Returns a virtual camera rig (cameras placed by the program) around the robust box of the first frame, which leaves
 /// out the outermost 1% of the positions on each side.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
-    let (middle, extent) = first_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.middle, found.extent()));
+    let (middle, extent) = first_frame_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.median, found.extent()));
     Ok(cameras::virtual_rig(middle, extent))
 }
 
 /// Returns the robust box of the first frame's positions, which leaves out the outermost 1% on each side; `None` if
 /// there are no frames. Memory: 16 bytes per Gaussian.
-pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
+pub fn first_frame_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
         return Ok(None);
     }

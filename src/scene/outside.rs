@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
-use super::between::{SplitMix64, between, meeting_point};
+use super::between::{SplitMix64, cameras_between, meeting_point};
 use crate::model::{Camera, ViewSchedule};
 
 /// View number of the views from cameras outside the rig, which no data set has.
@@ -56,10 +56,8 @@ impl RigCone {
             let gain = |own: &&DVec3| own.dot(rest);
             let best = self.directions.iter().max_by(|a, b| gain(a).total_cmp(&gain(b)));
             let Some(best) = best.filter(|own| gain(own) > EXACT_ENOUGH) else { break };
-            let before = used.clone();
             used.push((*best, 0.0));
             if !fit_weights(&mut used, direction) {
-                used = before;
                 break;
             }
             rest = direction - used.iter().map(|(own, weight)| *own * *weight).sum::<DVec3>();
@@ -108,19 +106,19 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
 /// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from the
 /// mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly anything
 /// outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every run.
-pub fn outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
+pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
     let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
-    let bases = [cameras, &between(cameras, count)].concat();
+    let bases = [cameras, &cameras_between(cameras, count)].concat();
     let mut random = SplitMix64(3);
     let mut found = Vec::with_capacity(count);
     for _ in 0..count * TRIES {
         if found.len() == count {
             break;
         }
-        let base = &bases[random.below(bases.len())];
+        let base = &bases[random.next_below(bases.len())];
         let offset = base.center() - cone.focus;
-        let factor = 1.0 + (max_factor - 1.0) * random.unit();
+        let factor = 1.0 + (max_factor - 1.0) * random.next_unit_f64();
         let Some(axis) = middle.cross(offset).try_normalize() else { continue };
         let angle = middle.angle_between(offset);
         let more = angle.min(PI - angle).min((factor - 1.0) * angle);
@@ -144,11 +142,11 @@ impl Scene {
     /// Adds cameras outside the rig, so that Gaussians that only these see are kept, and refined. `reach`, from 0 to 1,
     /// states how far outside the quality counts: the angles of the rig from its mean direction grow up to the factor
     /// 1 + `reach`, and every frame gets `reach` times as many views outside the rig as it has inside. Adds none if
-    /// `reach` is 0 or the rig has no outside (see [`outside`]).
+    /// `reach` is 0 or the rig has no outside (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
         let most = self.schedule.max_views_per_frame();
         let cameras = match reach > 0.0 {
-            true => outside(&self.used_cameras(), (CAMERAS_PER_VIEW * most).min(MAX_CAMERAS), 1.0 + reach),
+            true => cameras_outside(&self.rig_cameras(), (CAMERAS_PER_VIEW * most).min(MAX_CAMERAS), 1.0 + reach),
             false => Vec::new(),
         };
         if cameras.is_empty() {
@@ -164,17 +162,17 @@ impl Scene {
             let more = taken..taken + (reach * views.len() as f64).ceil() as usize;
             taken = more.end;
             let outside = more.map(|k| (VIEW_NUMBER, (first + k % count) as u32));
-            schedule.push(1, &views.iter().copied().chain(outside).collect::<Vec<_>>());
+            schedule.push_frames(1, &views.iter().copied().chain(outside).collect::<Vec<_>>());
         }
-        let rig_cameras = self.used_cameras().len();
-        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {rig_cameras}"));
+        let of_rig = self.rig_cameras().len();
+        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {of_rig}"));
         (self.schedule, self.outside) = (schedule, reach);
         self.depend_on_views();
     }
 
     /// Returns the cameras of the rig that take views of the schedule.
-    pub fn used_cameras(&self) -> Vec<Camera> {
-        let used = self.schedule.used().into_iter().map(|index| index as usize);
+    pub fn rig_cameras(&self) -> Vec<Camera> {
+        let used = self.schedule.used_cameras().into_iter().map(|index| index as usize);
         used.filter(|&index| index < self.rig.cameras.len()).map(|index| self.schedule.cameras[index].clone()).collect()
     }
 }
@@ -196,7 +194,7 @@ mod tests {
     fn angle_is_zero_inside_and_exact_outside() {
         let cameras = arc(5, 60.0);
         let cone = RigCone::new(&cameras);
-        let between_two = between(&cameras, 20);
+        let between_two = cameras_between(&cameras, 20);
         assert!(cameras.iter().chain(&between_two).all(|camera| cone.angle_outside(camera) < 1e-6));
         // Beyond the end of the arc, the last camera of the arc is nearest.
         let beyond = Camera::look_at(DVec3::new(4.0, 0.0, 1.0), DVec3::ZERO, 0.8, (64, 48));
@@ -209,8 +207,8 @@ mod tests {
     #[test]
     fn new_cameras_are_outside_and_see_the_focus() {
         let cameras = arc(7, 60.0);
-        let (cone, found) = (RigCone::new(&cameras), outside(&cameras, 40, 2.0));
-        assert_eq!((found.len(), &found), (40, &outside(&cameras, 40, 2.0)));
+        let (cone, found) = (RigCone::new(&cameras), cameras_outside(&cameras, 40, 2.0));
+        assert_eq!((found.len(), &found), (40, &cameras_outside(&cameras, 40, 2.0)));
         let widest = found.iter().map(|camera| cone.angle_outside(camera).to_degrees()).fold(0.0, f64::max);
         assert!((20.0..=30.0).contains(&widest), "{widest}");
         for camera in &found {
@@ -225,7 +223,7 @@ mod tests {
     fn rigs_all_around_have_no_outside() {
         let eyes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
         let around = eyes.map(|eye| Camera::look_at(3.0 * eye + DVec3::splat(0.01), DVec3::ZERO, 0.8, (64, 48)));
-        assert!(outside(&around, 5, 2.0).is_empty());
-        assert!(outside(&[], 5, 2.0).is_empty() && outside(&around[..1], 5, 2.0).is_empty());
+        assert!(cameras_outside(&around, 5, 2.0).is_empty());
+        assert!(cameras_outside(&[], 5, 2.0).is_empty() && cameras_outside(&around[..1], 5, 2.0).is_empty());
     }
 }

@@ -57,14 +57,14 @@ impl Photographs {
     ) -> Result<(Vec<FrameView>, Photographs)> {
         check_folder(folder)?;
         let cameras = camera_folders(folder)?;
-        let named = |picture: FrameView| Some((picture, inside(folder, rig.image(picture, times)?)?));
+        let named = |picture: FrameView| Some((picture, inside(folder, rig.image_path(picture, times)?)?));
         let mut found: Vec<(FrameView, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
         if found.is_empty() {
             let numbered = |picture: FrameView| Some((picture, numbered_file(folder, picture, &cameras)?));
             found = pictures.iter().copied().filter_map(numbered).collect();
         }
         if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
-            let named = rig.image(picture, times).and_then(Path::file_name);
+            let named = rig.image_path(picture, times).and_then(Path::file_name);
             let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
             let expected = format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).shown());
             return Err(Error::input(
@@ -88,7 +88,7 @@ impl Photographs {
     ///
     /// # Errors
     /// Fails if a file does not exist any more.
-    pub fn stamps(&self, pictures: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
+    pub fn file_stamps(&self, pictures: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
         let mut files = Vec::with_capacity(pictures.len());
         for picture in pictures {
             if let Some(file) = self.files.get(&(picture.frame, picture.view)) {

@@ -3,7 +3,7 @@
 use super::Scene;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
 use crate::model::{Attributes, FrameView, Rig, Split};
 use crate::render;
 
@@ -26,7 +26,7 @@ pub enum ViewSet {
 /// # Errors
 /// Fails if a view has a time that is not the time of any frame, if the split has no views, or if two cameras have the
 /// same frame and view number, which happens only if each split numbers its views on its own.
-pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<FrameView>> {
+pub fn select_views(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<FrameView>> {
     let mut found = Vec::new();
     for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
         let mut views = views.to_vec();
@@ -42,13 +42,13 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<Fra
         )));
     }
     if found.is_empty() {
-        return Err(no_picture(rig));
+        return Err(no_view_error(rig));
     }
     Ok(found)
 }
 
 /// Returns the error that the chosen split has no views. It names the splits of `rig` that have some.
-pub fn no_picture(rig: &Rig) -> Error {
+pub fn no_view_error(rig: &Rig) -> Error {
     let has = |split: &Split| rig.shots.iter().any(|shot| shot.split == *split);
     let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
     let available: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
@@ -63,14 +63,14 @@ pub fn no_picture(rig: &Rig) -> Error {
 /// Returns the view with the number `view` at frame `frame`, among the views that `part` selects.
 ///
 /// # Errors
-/// Fails as [`pictures`] does, and if the sequence has no such frame or the frame has no such view number.
-pub fn picture(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view: u32) -> Result<FrameView> {
+/// Fails as [`select_views`] does, and if the sequence has no such frame or the frame has no such view number.
+pub fn select_view(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view: u32) -> Result<FrameView> {
     if frame >= frame_times.len() {
         let last = frame_times.len().saturating_sub(1);
         return Err(Error::usage(format!("--frame {frame}: expected 0 to {last}, the frames of this sequence")));
     }
     let here: Vec<FrameView> =
-        pictures(rig, frame_times, part)?.into_iter().filter(|picture| picture.frame == frame).collect();
+        select_views(rig, frame_times, part)?.into_iter().filter(|picture| picture.frame == frame).collect();
     here.iter().find(|picture| picture.view == view).copied().ok_or_else(|| {
         let views: Vec<String> = here.iter().map(|picture| picture.view.to_string()).collect();
         let views = if views.is_empty() { "none".to_owned() } else { views.join(", ") };
@@ -81,7 +81,7 @@ pub fn picture(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view
 /// Returns the views of at most `count` (at least one) different frames of `pictures`. The frames are evenly spaced and
 /// include the first and the last. Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even,
 /// as numpy's `round(linspace(0, K − 1, count))` does.
-pub fn thin(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
+pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
     frames.dedup();
@@ -124,7 +124,7 @@ const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 ///
 /// # Errors
 /// Fails if a component of the color is not from 0 to 1.
-pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
+pub fn render_background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     match asked {
         Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {
             Err(Error::usage(format!("--background: expected red, green, blue from 0 to 1, found {rgb:?}")))
@@ -135,24 +135,30 @@ pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
 
 /// Returns the resource estimate (memory, time, reads) of the stage `stage`, which renders all views of `models` models
 /// and holds `pixel` bytes per pixel of each render.
-pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> ResourceEstimate {
-    let pictures = work.threads.min(limits.pictures_together as u64);
+pub fn render_estimate(
+    work: &Workload,
+    limits: &Limits,
+    stage: &'static str,
+    models: u64,
+    pixel: u64,
+) -> ResourceEstimate {
+    let pictures = work.threads.min(limits.views_together as u64);
     ResourceEstimate {
         stage,
         reads: models as f64,
         seconds: models as f64
-            * (work.reading(work.count(), work.frames as f64)
-                + work.render_seconds(work.pictures as f64, work.count(), RENDER)),
+            * (work.reading_seconds(work.gaussian_count(), work.frames as f64)
+                + work.render_seconds(work.pictures as f64, work.gaussian_count(), RENDER_COST)),
         per_gaussian: vec![
-            ("states", models * work.state(Attributes::all())),
+            ("states", models * work.state_bytes(Attributes::all())),
             ("readers", models * work.input.reader),
-            ("held", models * work.held(limits, Attributes::all())),
+            ("held", models * work.kept_frames_bytes(limits, Attributes::all())),
             ("views", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![
-            work.arriving(),
+            work.filling_blocks(),
             ("views", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
-            Workload::listed(work.pictures as f64),
+            Workload::view_list(work.pictures as f64),
         ],
     }
 }
@@ -217,26 +223,29 @@ mod tests {
             (5, 3, Some(0.5), Split::Train),
         ]);
         let times = [0.0, 0.5, 1.0];
-        assert_eq!(pairs(&pictures(&rig, &times, ViewSet::HeldOut).unwrap()), [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]);
-        assert_eq!(pairs(&pictures(&rig, &times, ViewSet::Split(Split::Train)).unwrap()), [(1, 5)]);
-        assert_eq!(pictures(&rig, &times, ViewSet::All).unwrap().len(), 6);
-        assert_eq!(pairs(&[picture(&rig, &times, ViewSet::All, 1, 5).unwrap()]), [(1, 5)]);
+        assert_eq!(
+            pairs(&select_views(&rig, &times, ViewSet::HeldOut).unwrap()),
+            [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]
+        );
+        assert_eq!(pairs(&select_views(&rig, &times, ViewSet::Split(Split::Train)).unwrap()), [(1, 5)]);
+        assert_eq!(select_views(&rig, &times, ViewSet::All).unwrap().len(), 6);
+        assert_eq!(pairs(&[select_view(&rig, &times, ViewSet::All, 1, 5).unwrap()]), [(1, 5)]);
     }
 
     #[test]
     fn all_views_are_used_if_none_are_held_out() {
         let rig = rig(&[(0, 0, None, Split::Train)]);
-        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], ViewSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
-        let message = pictures(&rig, &[0.0], ViewSet::Split(Split::Test)).unwrap_err().to_string();
+        assert_eq!(pairs(&select_views(&rig, &[0.0, 1.0], ViewSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
+        let message = select_views(&rig, &[0.0], ViewSet::Split(Split::Test)).unwrap_err().to_string();
         assert!(message.contains("--split"), "{message}");
     }
 
     #[test]
     fn equal_views_are_merged_and_conflicting_ones_refused() {
         let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
-        assert_eq!(pairs(&pictures(&same, &[0.0], ViewSet::All).unwrap()), [(0, 3)]);
+        assert_eq!(pairs(&select_views(&same, &[0.0], ViewSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
-        let message = pictures(&two, &[0.0], ViewSet::All).unwrap_err().to_string();
+        let message = select_views(&two, &[0.0], ViewSet::All).unwrap_err().to_string();
         assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
     }
 
@@ -245,7 +254,8 @@ mod tests {
         let every = |frames: usize| -> Vec<FrameView> {
             (0..frames).map(|frame| FrameView { frame: 3 * frame, view: 0, camera: 0 }).collect()
         };
-        let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
+        let kept =
+            |frames, count| pairs(&select_frames(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
         // Values of np.round(np.linspace(0, 59, 15)) and np.round(np.linspace(0, 9, 3)), where 4.5 rounds to 4.
         assert_eq!(kept(60, 15), [0, 4, 8, 13, 17, 21, 25, 30, 34, 38, 42, 46, 51, 55, 59]);
         assert_eq!(kept(10, 3), [0, 4, 9]);

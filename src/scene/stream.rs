@@ -6,15 +6,15 @@ use std::path::Path;
 
 use super::input::{InputOptions, OpenedInput, load_cameras};
 use crate::error::{Error, Result};
-use crate::files::cameras::Clock;
+use crate::files::cameras::TimeConvention;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
-use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
+use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rig};
 use crate::models::MemoryProfile;
-use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frame_block};
+use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frames_per_tile};
 use crate::models::{InputModel, LinkedFrames};
-use crate::passes::BLOCK;
+use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::statistics;
 
 /// Name of standard input in messages to the user.
@@ -49,7 +49,8 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
 /// of the container).
 pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
-    let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
+    let rig =
+        load_cameras(options, options.cameras.as_deref(), options.times.clone(), TimeConvention::Normalized, None)?;
     let stream = open_stream(options)?;
     if is_linked(stream.header(), options) {
         return link_stream(stream, options, rig);
@@ -63,8 +64,8 @@ pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> 
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
 /// of the container).
 fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
-    let mut quota = room_to_pack(options, stream.header())?;
-    ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
+    let mut quota = frame_quota(options, stream.header())?;
+    ReceivedStream::receive_and_pack(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
 }
 
 /// Returns whether Gaussians of successive frames are linked into tracks: if the frames share no Gaussian ids, or if
@@ -79,14 +80,16 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
 /// of the container).
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
-    let joins = options.link.joins();
+    let joins = options.link.joins_tracks();
     let input = match stream.header().is_unlinked {
-        true => LinkedFrames::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
+        true => {
+            LinkedFrames::receive_and_link(stream, Path::new(STANDARD_INPUT), joins, &options.open_options().ply())?
+        }
         false => LinkedFrames::relink(
             &pack_stream(stream, options)?,
             "linked frame stream",
             joins,
-            &options.opening().ply(),
+            &options.open_options().ply(),
         )?,
     };
     let notes = input.notes();
@@ -97,16 +100,17 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 ///
 /// # Errors
 /// Fails if the memory budget is too small for one block of frames (the frames in a tile of the container).
-pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
-    let block = frame_block(header);
+pub fn frame_quota(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
+    let block = frames_per_tile(header);
     let held = (block + PREFETCH_FRAMES) as u64;
     let no_cameras = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
     let work = |frames| Workload::from_stream_header(header, block, &no_cameras, frames);
-    let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
-    Plan::fit(work(0), options.memory, &options.events, receive(0))?;
+    let receive =
+        |frames| move |work: &Workload, limits: &Limits| vec![receiving_estimate(work, limits, held, None, frames)];
+    MemoryPlan::fit_budget(work(0), options.memory, &options.events, receive(0))?;
     Ok(FrameQuota::new(options.memory, |budget, frames| {
-        let packed = Plan::closest(work(frames), budget, |_, _| Vec::new()).peak();
-        packed.max(Plan::closest(work(0), budget, receive(frames)).peak())
+        let packed = MemoryPlan::closest(work(frames), budget, |_, _| Vec::new()).peak_bytes();
+        packed.max(MemoryPlan::closest(work(0), budget, receive(frames)).peak_bytes())
     }))
 }
 
@@ -148,7 +152,7 @@ impl FrameQuota {
         if self.arrived <= self.most {
             return Ok(());
         }
-        let expected = format!("at most {} frames within the memory budget ({})", self.most, self.budget.named());
+        let expected = format!("at most {} frames within the memory budget ({})", self.most, self.budget.text());
         let found = format!("{} frames, and the stream continues", self.arrived);
         Err(Error::input(Path::new(STANDARD_INPUT), format!("frame {}", self.most), expected, found).hint(&self.hint))
     }
@@ -166,24 +170,27 @@ const PER_FRAME: u64 = 2 * (8 + 4);
 /// Estimates the memory of packing a stream of `frames` frames, of which `held` are in memory at a time. `measuring`
 /// tells what else is done as frames arrive: nothing (`None`), statistics (`Some(false)`), or statistics and renders of
 /// views (`Some(true)`).
-pub fn receiving(
+pub fn receiving_estimate(
     work: &Workload,
     limits: &Limits,
     held: u64,
     measuring: Option<bool>,
     frames: u64,
 ) -> ResourceEstimate {
-    let whole = work.state(Attributes::all());
-    let mut per_gaussian =
-        vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
-    let mut fixed = work.writing();
+    let whole = work.state_bytes(Attributes::all());
+    let mut per_gaussian = vec![
+        ("frames", held * work.state_bytes(work.varying)),
+        ("constant columns", whole - work.state_bytes(work.varying)),
+    ];
+    let mut fixed = work.write_buffers();
     fixed.push(("times", PER_FRAME * frames));
     if let Some(visible) = measuring {
         per_gaussian.push(("accumulators", statistics::BYTES_PER_GAUSSIAN as u64));
-        fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
+        fixed.push(("blocks", work.threads * GAUSSIANS_PER_BLOCK as u64 * whole));
         if visible {
             let nothing_held = Workload { input: MemoryProfile { frame_block: 0, ..work.input }, ..*work };
-            let (more, pictures) = nothing_held.looking(limits, Attributes::all().difference(Attributes::SH), 12);
+            let (more, pictures) =
+                nothing_held.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
             per_gaussian.extend(more);
             fixed.extend(pictures);
         }

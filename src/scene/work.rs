@@ -19,16 +19,16 @@ const DIGEST: &str = "input";
 impl Scene {
     /// Opens the cache folder that `options` name, and makes the keys of its entries depend on this scene.
     pub(super) fn open_cache(&mut self, options: &InputOptions) -> Result<()> {
-        (self.work, self.digest) = kept_work(options, &*self.input)?;
-        if self.work.keeps() {
-            self.work.follow_from(self.key());
+        (self.work, self.digest) = open_cache(options, &*self.input)?;
+        if self.work.is_enabled() {
+            self.work.depend_on(self.key());
         }
         Ok(())
     }
 
     /// Makes the keys of cache entries depend on the views of the schedule, which changed after the cache was opened.
     pub(super) fn depend_on_views(&mut self) {
-        self.work.follow_from(CacheKey::new(&self.schedule));
+        self.work.depend_on(CacheKey::new(&self.schedule));
     }
 
     /// Returns the digest (hash of the content) of the input.
@@ -41,7 +41,7 @@ impl Scene {
     ///
     /// # Errors
     /// Fails if a file or the cache folder cannot be read.
-    pub fn digest_of(&self, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
+    pub fn input_digest(&self, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
         cached_digest(&self.work, options, input)
     }
 
@@ -57,15 +57,15 @@ impl Scene {
 ///
 /// # Errors
 /// Fails if a file or the cache folder cannot be read.
-pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
-    let Some(asked) = &options.work else { return Ok((Cache::none(), None)) };
-    let instructions = render::instructions();
+pub fn open_cache(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
+    let Some(asked) = &options.work else { return Ok((Cache::disabled(), None)) };
+    let instructions = render::instruction_set();
     let mut work = Cache::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
     let digest = cached_digest(&work, options, input)?;
     // The key stands for this program, the machine's instruction set, and the content of the input as it was opened;
     // not for its path.
     let info = input.source().info();
-    work.follow_from(CacheKey::new(&(TOOL, instructions, &digest)).and(&(
+    work.depend_on(CacheKey::new(&(TOOL, instructions, &digest)).extended_by(&(
         info.count,
         &info.times,
         info.sh_degree,
@@ -78,8 +78,8 @@ pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cach
 /// Returns the digest (hash of the content) of `input`. Reads the input only if its files may have changed since the
 /// digest was cached.
 fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
-    match work.keeps() {
-        true => work.known(DIGEST, input_stamp(options)?, || input.digest()),
+    match work.is_enabled() {
+        true => work.get_or_compute(DIGEST, input_stamp(options)?, || input.digest()),
         false => input.digest(),
     }
 }

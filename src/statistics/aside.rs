@@ -49,7 +49,7 @@ impl StatisticsRows {
     pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<StatisticsRows> {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {
-            match statistic.values() {
+            match statistic.accessors() {
                 StatisticAccess::F64(values, _) => bytemuck::cast_slice(values(&rows)),
                 StatisticAccess::U32(values, _) => bytemuck::cast_slice(values(&rows)),
             }
@@ -92,7 +92,7 @@ impl SpilledRows {
     fn rows(&self) -> Result<Rows> {
         let mut rows = Rows::default();
         for &column in &self.columns {
-            match column.values() {
+            match column.accessors() {
                 StatisticAccess::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
                 StatisticAccess::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
             }

@@ -23,7 +23,7 @@ mod state;
 mod tests;
 
 pub use anisotropy::fill_anisotropy;
-pub use noise::{Snapped, snap, ulp};
+pub use noise::{SnapCounts, snap_noise_to_zero, ulp};
 pub use plan::ScanPlan;
 use scan::wanted;
-pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED};
+pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED_ATTRIBUTES};

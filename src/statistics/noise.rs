@@ -13,7 +13,7 @@ const KAPPA_NOISE_ULP: f64 = 4.0;
 
 /// Numbers of Gaussians whose motion was set to 0 because it was rounding noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Snapped {
+pub struct SnapCounts {
     /// Number of Gaussians whose trajectory magnitude D was set to 0.
     pub d: usize,
     /// Number of Gaussians whose curvature κ was set to 0.
@@ -30,9 +30,9 @@ pub fn ulp(x: f32) -> f64 {
 /// Sets every trajectory magnitude D below 2 ulp and curvature κ below 4 ulp of `largest_coordinate` to exactly 0,
 /// flags these rows, and returns their numbers. `largest_coordinate` is the largest |coordinate| of the whole scene, at
 /// least 0. Values that are 0 already are neither flagged nor counted.
-pub fn snap(rows: &mut Rows, largest_coordinate: f32) -> Snapped {
+pub fn snap_noise_to_zero(rows: &mut Rows, largest_coordinate: f32) -> SnapCounts {
     let ulp = ulp(largest_coordinate);
-    Snapped {
+    SnapCounts {
         d: snap_below(&mut rows.d, D_NOISE_ULP * ulp, &mut rows.flags, Flags::SNAPPED_D),
         kappa: snap_below(&mut rows.kappa, KAPPA_NOISE_ULP * ulp, &mut rows.flags, Flags::SNAPPED_KAPPA),
     }
@@ -71,7 +71,7 @@ mod tests {
             flags: vec![Flags::empty(); 3],
             ..Rows::default()
         };
-        assert_eq!(snap(&mut rows, 1e6), Snapped { d: 1, kappa: 1 });
+        assert_eq!(snap_noise_to_zero(&mut rows, 1e6), SnapCounts { d: 1, kappa: 1 });
         assert_eq!((rows.d, rows.kappa), (vec![0.0, 0.0, floor], vec![0.0, 2.0 * floor, 0.0]));
         assert_eq!(rows.flags, [Flags::SNAPPED_KAPPA, Flags::SNAPPED_D, Flags::empty()]);
     }

@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
 use crate::model::{Camera, Gaussians, Rows, SequenceInfo, ViewSchedule};
-use crate::passes::BLOCK;
+use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
-use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
+use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan, wanted};
 
 /// Statistics that a scan has computed.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -49,7 +49,7 @@ pub fn scan(source: &dyn FrameSource, schedule: &ViewSchedule, plan: &ScanPlan) 
 
 /// Returns the number of blocks of Gaussians into which [`scan`] divides a sequence.
 pub fn scan_units(info: &SequenceInfo) -> usize {
-    info.count.div_ceil(BLOCK)
+    info.count.div_ceil(GAUSSIANS_PER_BLOCK)
 }
 
 /// Scans only the blocks of Gaussians `blocks` at all frames. [`ScanResult::join`] combines several such results.
@@ -62,7 +62,8 @@ pub fn scan_blocks(
 ) -> Result<ScanResult> {
     let info = source.info();
     let frames = info.times.len();
-    let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
+    let gaussians =
+        info.count.min(blocks.end * GAUSSIANS_PER_BLOCK) - info.count.min(blocks.start * GAUSSIANS_PER_BLOCK);
     let progress = events.task("scan", "states", gaussians as u64 * frames as u64);
     let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
     let blocks = match source.ahead() {
@@ -119,8 +120,11 @@ pub struct RunningScan<'a> {
 impl<'a> RunningScan<'a> {
     /// Creates a scan of `count` Gaussians that has no frames yet.
     pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
-        let block = |start: usize| BlockScan::new(BLOCK.min(count - start), start, plan);
-        RunningScan { blocks: (0..count).step_by(BLOCK).map(block).collect(), alive_per_frame: Vec::new() }
+        let block = |start: usize| BlockScan::new(GAUSSIANS_PER_BLOCK.min(count - start), start, plan);
+        RunningScan {
+            blocks: (0..count).step_by(GAUSSIANS_PER_BLOCK).map(block).collect(),
+            alive_per_frame: Vec::new(),
+        }
     }
 
     /// Adds the next frames, which are all frames of `source`. `cameras` lists for each of them the cameras that see
@@ -136,18 +140,18 @@ impl<'a> RunningScan<'a> {
             .par_iter_mut()
             .enumerate()
             .map(|(block, scan)| {
-                let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
+                let range = block * GAUSSIANS_PER_BLOCK..info.count.min((block + 1) * GAUSSIANS_PER_BLOCK);
                 let mut state = Gaussians::zeros(range.len(), info.sh_degree);
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
                     let changed = wanted(first + t, info.varying);
                     // The buffer is new, so its first read must also fill the attributes that do not vary. They count
                     // as unchanged all the same, since the scan knows them already.
-                    let want = if t == 0 { changed | NEEDED } else { changed };
+                    let want = if t == 0 { changed | NEEDED_ATTRIBUTES } else { changed };
                     reader.read(t, want, &mut state)?;
-                    scan.frame(first + t, &state, cameras, changed);
+                    scan.add_frame(first + t, &state, cameras, changed);
                 }
-                Ok(scan.take_alive())
+                Ok(scan.take_alive_counts())
             })
             .collect::<Result<_>>()?;
         self.alive_per_frame.resize(first + cameras.len(), 0);
@@ -162,10 +166,10 @@ impl<'a> RunningScan<'a> {
     /// Returns the result after the last frame. `plan` is the plan for the complete sequence.
     ///
     /// # Panics
-    /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
+    /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::can_finish`]).
     pub fn finish(self, plan: &ScanPlan) -> ScanResult {
         let blocks = self.blocks.into_iter().map(|block| {
-            let found = block.finish_by(plan);
+            let found = block.finish_with_plan(plan);
             (found.rows, found.largest_coordinate)
         });
         joined(blocks, self.alive_per_frame)
@@ -177,14 +181,14 @@ mod tests {
     use std::sync::Mutex;
 
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::{Attributes, SequenceInfo, Split};
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
     /// Scene of which only the positions vary in time. It records what its readers read.
     struct RecordingScene {
-        scene: Scene,
+        scene: DemoScene,
         info: SequenceInfo,
         /// Frame and attributes of each read.
         reads: Mutex<Vec<(usize, Attributes)>>,
@@ -211,7 +215,7 @@ mod tests {
 
     #[test]
     fn constant_columns_are_read_once_without_changing_a_bit() {
-        let scene = Scene::new(1500, 5);
+        let scene = DemoScene::new(1500, 5);
         let info = scene.info().clone();
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
         let mut recording = RecordingScene { scene, info, reads: Mutex::default() };

@@ -32,7 +32,8 @@ pub struct ScanPlan {
     /// spaced.
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
-    pub(super) pairs: u32,
+    #[serde(rename = "pairs")]
+    pub(super) pair_count: u32,
     pub(super) coverage_exponent: i32,
 }
 
@@ -64,8 +65,8 @@ impl ScanPlan {
                 times.len()
             )));
         }
-        let pairs = u32::try_from(schedule.pairs())
-            .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pairs())))?;
+        let pairs = u32::try_from(schedule.pair_count())
+            .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pair_count())))?;
         let steps = if scan.motion == MotionParams::Runs { uneven_steps(times) } else { Vec::new() };
         if let Some(t) = steps.iter().position(|step| step.is_nan() || *step < LEAST_STEP) {
             return Err(Error::usage(format!(
@@ -77,26 +78,31 @@ impl ScanPlan {
                 times[times.len() - 1] - times[0]
             )));
         }
-        Ok(ScanPlan { steps, frames: times.len(), pairs, ..ScanPlan::arriving(scan, &schedule.cameras) })
+        Ok(ScanPlan {
+            steps,
+            frames: times.len(),
+            pair_count: pairs,
+            ..ScanPlan::for_arriving_frames(scan, &schedule.cameras)
+        })
     }
 
     /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If they turn out
-    /// to be, the plan for the complete sequence can finish the scan ([`ScanPlan::finishes`]).
-    pub fn arriving(scan: &ScanParams, cameras: &[Camera]) -> Self {
+    /// to be, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
+    pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
             alpha_min: scan.alpha_min,
             motion: scan.motion,
             steps: Vec::new(),
             frames: 0,
-            pairs: 0,
+            pair_count: 0,
             coverage_exponent: coverage_exponent(image_px),
         }
     }
 
     /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`.
-    pub fn finishes(&self, arriving: &ScanPlan) -> bool {
-        *arriving == ScanPlan { frames: arriving.frames, pairs: arriving.pairs, ..self.clone() }
+    pub fn can_finish(&self, arriving: &ScanPlan) -> bool {
+        *arriving == ScanPlan { frames: arriving.frames, pair_count: arriving.pair_count, ..self.clone() }
     }
 
     /// Returns T, the number of frames.
@@ -105,8 +111,8 @@ impl ScanPlan {
     }
 
     /// Returns M, the number of (frame, view) pairs.
-    pub fn pairs(&self) -> u32 {
-        self.pairs
+    pub fn pair_count(&self) -> u32 {
+        self.pair_count
     }
 
     /// Returns the resolution of the contribution C in pixels. Contributions are summed as integer multiples of this
@@ -144,7 +150,7 @@ mod tests {
 
     fn plan(times: &[f64]) -> Result<ScanPlan> {
         let mut schedule = ViewSchedule::default();
-        schedule.push(times.len(), &[]);
+        schedule.push_frames(times.len(), &[]);
         ScanPlan::new(&Recipe::preset("default").unwrap().scan, times, &schedule)
     }
 
@@ -192,10 +198,14 @@ mod tests {
     #[test]
     fn only_even_frames_finish_a_scan_begun_early() {
         let scan = Recipe::preset("default").unwrap().scan;
-        let arriving = ScanPlan::arriving(&scan, &[]);
-        assert!(plan(&[0.0, 1.0, 2.0]).unwrap().finishes(&arriving));
-        assert!(plan(&[]).unwrap().finishes(&arriving));
-        assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().finishes(&arriving));
-        assert!(!plan(&[0.0]).unwrap().finishes(&ScanPlan::arriving(&ScanParams { alpha_min: 0.5, ..scan }, &[])));
+        let arriving = ScanPlan::for_arriving_frames(&scan, &[]);
+        assert!(plan(&[0.0, 1.0, 2.0]).unwrap().can_finish(&arriving));
+        assert!(plan(&[]).unwrap().can_finish(&arriving));
+        assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().can_finish(&arriving));
+        assert!(
+            !plan(&[0.0])
+                .unwrap()
+                .can_finish(&ScanPlan::for_arriving_frames(&ScanParams { alpha_min: 0.5, ..scan }, &[]))
+        );
     }
 }

@@ -26,7 +26,7 @@ const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 const CARRY_BITS: u32 = 52;
 
 /// Attributes that a scan needs of every model; SH coefficients may be omitted.
-pub const NEEDED: Attributes = Attributes::all().difference(Attributes::SH);
+pub const NEEDED_ATTRIBUTES: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Returns the attributes to read at frame `frame`: all of them at frame 0, and only the `varying` ones after it.
 pub(super) fn wanted(frame: usize, varying: Attributes) -> Attributes {
@@ -59,10 +59,10 @@ pub struct BlockStatistics {
     /// Id of the block's first Gaussian.
     pub first_id: usize,
     /// Statistics, one row per Gaussian. The anisotropy `e` is 0 until [`super::fill_anisotropy`]; the trajectory
-    /// magnitude D and the curvature κ include rounding noise until [`super::snap`]. All statistics of a Gaussian with
+    /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a Gaussian with
     /// [`Flags::NON_FINITE`] are 0.
     pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive`] has not
+    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has not
     /// returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
@@ -95,10 +95,10 @@ impl<'a> BlockScan<'a> {
     /// # Panics
     /// Panics if frames are not added in order, or if an attribute does not have one value for each Gaussian of the
     /// block.
-    pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Attributes) {
+    pub fn add_frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Attributes) {
         assert_eq!(t, self.next_frame, "frames are scanned in order");
         self.next_frame += 1;
-        let changed = if t == 0 { changed | NEEDED } else { changed };
+        let changed = if t == 0 { changed | NEEDED_ATTRIBUTES } else { changed };
         self.advance(t, gaussians, changed);
         for cameras in cameras.chunks(PAIRS_PER_CARRY) {
             if self.uncarried + cameras.len() > PAIRS_PER_CARRY {
@@ -120,7 +120,7 @@ impl<'a> BlockScan<'a> {
 
     /// Returns how many of the block's Gaussians are alive in each frame added since the last call, and forgets these
     /// numbers.
-    pub fn take_alive(&mut self) -> Vec<u32> {
+    pub fn take_alive_counts(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
     }
 
@@ -190,7 +190,7 @@ impl<'a> BlockScan<'a> {
     /// Returns the statistics after all frames have been added.
     pub fn finish(self) -> BlockStatistics {
         let plan = self.plan;
-        self.finish_by(plan)
+        self.finish_with_plan(plan)
     }
 
     /// Returns the statistics of a scan that began before all frames were known. `plan` is the plan for the complete
@@ -199,12 +199,12 @@ impl<'a> BlockScan<'a> {
     /// # Panics
     /// Panics if frames are missing, or if `plan` differs from the plan with which this scan began in more than the
     /// frames that were not known then.
-    pub fn finish_by(mut self, plan: &ScanPlan) -> BlockStatistics {
+    pub fn finish_with_plan(mut self, plan: &ScanPlan) -> BlockStatistics {
         self.life.count_repeats();
         self.motion.count_steady_frames();
         assert_eq!(self.next_frame, plan.frames, "every frame is scanned");
-        assert!(std::ptr::eq(plan, self.plan) || plan.finishes(self.plan), "the plan is that of another scan");
-        let pairs = f64::from(plan.pairs.max(1));
+        assert!(std::ptr::eq(plan, self.plan) || plan.can_finish(self.plan), "the plan is that of another scan");
+        let pairs = f64::from(plan.pair_count.max(1));
         let resolution = plan.coverage_resolution_px();
         let sum = |(&coverage, &carried): (&u64, &u32)| (u128::from(carried) << CARRY_BITS) + u128::from(coverage);
         let life = self.life.frames();
@@ -271,15 +271,15 @@ mod tests {
             for opacities in opacity_frames {
                 let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();
                 let mut schedule = ViewSchedule::default();
-                schedule.push(times.len(), &[]);
+                schedule.push_frames(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut all, mut named] = [BlockScan::new(77, 0, &plan), BlockScan::new(77, 0, &plan)];
                 for (t, &opacity_frame) in opacities.iter().enumerate() {
                     let frame = test_frame(t, opacity_frame);
                     let changed = t > 0 && opacity_frame != opacities[t - 1];
-                    all.frame(t, &frame, &[], NEEDED);
+                    all.add_frame(t, &frame, &[], NEEDED_ATTRIBUTES);
                     let opacity = if changed { Attributes::OPACITY } else { Attributes::empty() };
-                    named.frame(t, &frame, &[], Attributes::POSITION | opacity);
+                    named.add_frame(t, &frame, &[], Attributes::POSITION | opacity);
                 }
                 let (all, named) = (all.finish(), named.finish());
                 let living = all.rows.life.iter().filter(|&&life| life > 0).count();
@@ -296,19 +296,19 @@ mod tests {
             for times in [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 1.5, 4.0, 4.5]] {
                 let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
                 let mut schedule = ViewSchedule::default();
-                schedule.push(times.len(), &[]);
+                schedule.push_frames(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut wide, mut baseline] = [BlockScan::new(LEN, 0, &plan), BlockScan::new(LEN, 0, &plan)];
                 for t in 0..times.len() {
                     let mut frame = Gaussians::zeros(LEN, 0);
-                    for column in NEEDED.iter() {
+                    for column in NEEDED_ATTRIBUTES.iter() {
                         for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
                             *x = 10.0 * random(1000 * t + i) - 7.0;
                         }
                     }
                     frame.position.set_row(t, [f32::NAN, f32::INFINITY, -3.0]);
-                    wide.advance(t, &frame, NEEDED);
-                    baseline.advance_portable(t, &frame, NEEDED);
+                    wide.advance(t, &frame, NEEDED_ATTRIBUTES);
+                    baseline.advance_portable(t, &frame, NEEDED_ATTRIBUTES);
                     wide.next_frame += 1;
                     baseline.next_frame += 1;
                 }

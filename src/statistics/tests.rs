@@ -4,7 +4,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
-use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap, ulp};
+use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap_noise_to_zero, ulp};
 use crate::diagnostics::selfcheck::oracle::statistics as oracle;
 use crate::model::hash_id;
 use crate::model::{Attributes, Camera, Flags, Gaussians, ViewSchedule};
@@ -41,7 +41,7 @@ fn camera(seed: u64) -> Camera {
 fn schedule(frames: usize, views: u32) -> ViewSchedule {
     let cameras: Vec<Camera> = (0..views.into()).map(camera).collect();
     let mut schedule = ViewSchedule::new(cameras);
-    schedule.push(frames, &(0..views).map(|v| (v, v)).collect::<Vec<_>>());
+    schedule.push_frames(frames, &(0..views).map(|v| (v, v)).collect::<Vec<_>>());
     schedule
 }
 
@@ -81,7 +81,7 @@ fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, scan: &
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
         let cameras: Vec<&Camera> = schedule.views(t).iter().map(|&(_, c)| &schedule.cameras[c as usize]).collect();
-        block.frame(t, frame, &cameras, Attributes::all());
+        block.add_frame(t, frame, &cameras, Attributes::all());
     }
     block.finish()
 }
@@ -105,7 +105,7 @@ fn scan_one(
         g.position.set_row(0, [x(t), 0.0, 0.0]);
         let alpha = opacity(t);
         g.opacity_logit.set_row(0, [(alpha / (1.0 - alpha)).ln() as f32]);
-        block.frame(t, &g, &[], Attributes::POSITION | Attributes::OPACITY);
+        block.add_frame(t, &g, &[], Attributes::POSITION | Attributes::OPACITY);
     }
     block.finish()
 }
@@ -236,7 +236,7 @@ fn opacities_0_and_1_give_zero_variance() {
     let mut block = BlockScan::new(1, 0, &plan);
     let mut g = Gaussians::zeros(1, 0);
     g.opacity_logit.set_row(0, [80.0]);
-    (0..20).for_each(|t| block.frame(t, &g, &[], Attributes::empty()));
+    (0..20).for_each(|t| block.add_frame(t, &g, &[], Attributes::empty()));
     let full = block.finish().rows;
     assert_eq!((full.v[0], full.life[0]), (0.0, 20));
 }
@@ -328,7 +328,7 @@ fn needle_keeps_the_digits_of_its_area() {
     g.rotation.set_row(0, [turn.w, turn.x, turn.y, turn.z].map(|x| x as f32));
     g.log_scale.set_row(0, [f64::ln(length) as f32, -30.0, -30.0]);
     let mut schedule = ViewSchedule::new(vec![camera.clone()]);
-    schedule.push(1, &[(0, 0)]);
+    schedule.push_frames(1, &[(0, 0)]);
     let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows.c[0];
     // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the fraction of its box inside the image.
     let (sx, sy) = (250.0 * length / depth / 2f64.sqrt(), 260.0 * length / depth / 2f64.sqrt());
@@ -345,12 +345,12 @@ fn offsets_up_to_1e7_snap_only_noise() {
         let resting = scan_one(2000, |t| (offset + noise * random(4, t as u64)) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = resting.rows;
         assert!(rows.d[0] > 0.0 && rows.d[0] < 2.0 * noise && rows.kappa[0] < 4.0 * noise, "{rows:?}");
-        let snapped = snap(&mut rows, resting.largest_coordinate);
+        let snapped = snap_noise_to_zero(&mut rows, resting.largest_coordinate);
         assert_eq!((snapped.d, snapped.kappa, rows.d[0], rows.kappa[0]), (1, 1, 0.0, 0.0));
         let moving =
             scan_one(2000, |t| (offset + 8.0 * noise * (t * t % 7) as f64) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = moving.rows;
-        assert_eq!(snap(&mut rows, moving.largest_coordinate).d, 0);
+        assert_eq!(snap_noise_to_zero(&mut rows, moving.largest_coordinate).d, 0);
         assert!(rows.d[0].is_finite() && rows.kappa[0].is_finite());
     }
 }
@@ -384,7 +384,7 @@ fn mean_coverage_of_300_000_equal_views_is_that_of_one() {
     let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
     frames[0].log_scale.planes_mut().fill(2.0);
     let mut many = ViewSchedule::new(one.cameras.clone());
-    many.push(1, &[(0, 0); 300_000]);
+    many.push_frames(1, &[(0, 0); 300_000]);
     let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(MotionParams::Runs)).rows);
     assert!(one.c.iter().filter(|&&c| c * 300_000.0 > 2f64.powi(64 - 34)).count() > 10, "the case must overflow");
     for i in 0..40 {
@@ -406,7 +406,7 @@ fn unchanged_columns_may_be_left_out_of_changed() {
     let mut block = BlockScan::new(300, 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
         let cameras: Vec<&Camera> = schedule.cameras.iter().collect();
-        block.frame(t, frame, &cameras, Attributes::POSITION | Attributes::LOG_SCALE);
+        block.add_frame(t, frame, &cameras, Attributes::POSITION | Attributes::LOG_SCALE);
     }
     assert_eq!(block.finish(), scan(&frames, &schedule, &recipe));
 }

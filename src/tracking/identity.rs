@@ -18,24 +18,24 @@ const NEGLIGIBLE: f64 = 1e-3;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrderDifference {
     /// Distance between the positions of Gaussians at the same index, in units of the smaller Gaussian's size.
-    pub moved: f64,
+    pub position_difference: f64,
     /// Distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the second), in
     /// units of the smaller Gaussian's size.
     pub apart: f64,
     /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between Gaussians at
     /// the same index.
-    pub unlike: f64,
+    pub appearance_difference: f64,
     /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between unrelated
     /// Gaussians, paired as for `apart`.
-    pub strangers: f64,
-    /// Whether equal indices in the two frames denote the same Gaussian: `moved` is at most half of `apart`, and
-    /// `unlike` is at most half of `strangers`.
-    pub holds: bool,
+    pub unrelated_pairs: f64,
+    /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is
+    /// at most half of `apart`, and `appearance_difference` is at most half of `unrelated_pairs`.
+    pub is_common: bool,
 }
 
 /// Compares two frames with equally many Gaussians, index by index, at up to 4096 indices. The order always holds if
 /// there are fewer than 16 Gaussians, or if Gaussians at the same index differ by no more than rounding.
-pub fn identity(before: &Gaussians, after: &Gaussians) -> OrderDifference {
+pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let (before, after) = (ComparedAppearance::all_from_state(before), ComparedAppearance::all_from_state(after));
     let count = before.len().min(after.len());
     let indices: Vec<usize> = (0..count).step_by(count.div_ceil(MAX_COMPARED).max(1)).collect();
@@ -46,7 +46,13 @@ pub fn identity(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let ((moved, unlike), (apart, strangers)) = (differences(0), differences(count / 2));
     let is_less = |own: f64, unrelated: f64| own <= NEGLIGIBLE || own <= MAX_PART_OF_UNRELATED * unrelated;
     let holds = count < MIN_GAUSSIANS || (is_less(moved, apart) && is_less(unlike, strangers));
-    OrderDifference { moved, apart, unlike, strangers, holds }
+    OrderDifference {
+        position_difference: moved,
+        apart,
+        appearance_difference: unlike,
+        unrelated_pairs: strangers,
+        is_common: holds,
+    }
 }
 
 /// Returns the distance between the positions of two Gaussians, divided by the smaller of their sizes.

@@ -74,14 +74,14 @@ impl Joiner {
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
     /// Updates the pairs of tracks by the frame that `linker` has linked last; to be called after every frame.
-    pub fn see(&mut self, linker: &Linker) {
+    pub fn add_frame(&mut self, linker: &Linker) {
         let tracks = linker.open_tracks();
         let born = self.0[0].predecessor.len();
         for joined in &mut self.0 {
             joined.update_pairs(tracks);
             joined.join_ended();
-            joined.predecessor.resize(linker.tracks() as usize, NONE);
-            joined.has_successor.resize(linker.tracks() as usize, false);
+            joined.predecessor.resize(linker.track_count() as usize, NONE);
+            joined.has_successor.resize(linker.track_count() as usize, false);
         }
         let (old, new) = tracks.split_at(tracks.partition_point(|track| (track.number as usize) < born));
         self.add_pairs(old, new);
@@ -241,7 +241,7 @@ fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
 /// Blends the Gaussians in the rows `rows` of `state` and writes the result to row `rows[0]`. The opacity becomes 1 −
 /// Π(1 − αᵢ); all other attributes become means weighted by the opacities αᵢ. Before averaging, quaternions get the
 /// sign closest to that of the first row. Does nothing if the opacities sum to 0 or are not finite.
-pub fn blend(state: &mut Gaussians, rows: &[usize]) {
+pub fn blend_rows(state: &mut Gaussians, rows: &[usize]) {
     let first = rows[0];
     let alpha = |&i: &usize| 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
     let alphas: Vec<f64> = rows.iter().map(alpha).collect();

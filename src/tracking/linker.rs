@@ -12,7 +12,7 @@ use super::track::{Candidate, MAX_CANDIDATES, NONE, OpenTrack, ROUNDS};
 use crate::model::Gaussians;
 
 /// Maximum number of consecutive frames in which a track may have no Gaussian before it ends.
-pub const GAP: u32 = 3;
+pub const MAX_GAP_FRAMES: u32 = 3;
 /// Parameters of the test whether a Gaussian takes the place of a track that has no Gaussian in this frame: distance
 /// from the expected position, in sizes of the Gaussian, that costs 1; and factor of the difference in appearance. The
 /// Gaussian passes with a cost of at most 1.
@@ -62,7 +62,7 @@ impl Linker {
     }
 
     /// Returns the number of tracks that have begun so far, including those that have ended.
-    pub fn tracks(&self) -> u32 {
+    pub fn track_count(&self) -> u32 {
         self.born
     }
 
@@ -110,7 +110,7 @@ impl Linker {
                 track.extend(appearances[gaussian as usize]);
             }
         }
-        self.tracks.retain(|track| track.frames_since_seen <= GAP + 1);
+        self.tracks.retain(|track| track.frames_since_seen <= MAX_GAP_FRAMES + 1);
         for (gaussian, track_number) in track_numbers.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
             *track_number = self.born;
             self.tracks.push(OpenTrack::new(self.born, appearances[gaussian]));

@@ -3,7 +3,7 @@
 //! Input: frames in order, each with any number of Gaussians in any order. Output: for every Gaussian the number of a
 //! *track*, which is one Gaussian followed through the frames. Memory: [`Linker::BYTES_PER_GAUSSIAN`] for every
 //! Gaussian of the frame that is being linked, and [`Linker::BYTES_PER_TRACK`] for every open track. A track is open if
-//! it had a Gaussian in this frame or in one of the [`GAP`] frames before it. Time: linear in the number of Gaussians,
+//! it had a Gaussian in this frame or in one of the [`MAX_GAP_FRAMES`] frames before it. Time: linear in the number of Gaussians,
 //! wherever they lie.
 //!
 //! The appearance of a Gaussian is its position x, its size s (the root mean square of its three scales), its shape Ŝ
@@ -47,7 +47,7 @@
 //!    plus one more for each earlier frame in which one of them was missing. When the earlier track of the cheapest
 //!    pair has ended, the later track is joined to it. Joins are made in the order of cost, each end and each beginning
 //!    once. A later track that ends while the earlier one continues was a part of it if they were close. Tracks of one
-//!    joined track that are present together are [blended](blend).
+//!    joined track that are present together are [blended](blend_rows).
 //!
 //! Tracks are numbered in the order of their births, and within a frame in its order. A Gaussian with a NaN is never
 //! compared: it continues a track only as an exact repeat. Colors are compared without the higher SH degrees, which
@@ -65,9 +65,9 @@ mod linker;
 mod links;
 mod track;
 
-pub use identity::{OrderDifference, identity};
-pub use join::{Joiner, blend};
-pub use linker::{FrameLinks, GAP, Linker};
+pub use identity::{OrderDifference, compare_order};
+pub use join::{Joiner, blend_rows};
+pub use linker::{FrameLinks, Linker, MAX_GAP_FRAMES};
 
 #[cfg(test)]
 mod oracle;

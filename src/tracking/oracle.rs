@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::GAP;
+use super::MAX_GAP_FRAMES;
 use crate::model::{Gaussians, SH_C0, opacity};
 
 /// Returns the size of Gaussian `i`: the root mean square of its three scales, scene units.
@@ -282,7 +282,7 @@ pub(super) fn slow_joined_tracks(
         if sizes_agree { cost } else { f64::INFINITY }
     };
     let first = |track: usize| *tracks[track].keys().next().unwrap();
-    let is_gone = |track: usize, frame: usize| frame > tracks[track].keys().last().unwrap() + GAP as usize;
+    let is_gone = |track: usize, frame: usize| frame > tracks[track].keys().last().unwrap() + MAX_GAP_FRAMES as usize;
     let last_seen = |track: usize, frame: usize| tracks[track].range(..=frame).last().unwrap().1;
     let mut predecessor: Vec<Option<usize>> = vec![None; tracks.len()];
     let mut has_successor = vec![false; tracks.len()];
@@ -321,7 +321,7 @@ pub(super) fn slow_joined_tracks(
                 let (at, missing) = position_at(&tracks[a], frame);
                 let appearance = last_seen(a, frame);
                 let all = cost(appearance, at, own, (r, q));
-                if missing <= GAP as usize && all <= 1.0 {
+                if missing <= MAX_GAP_FRAMES as usize && all <= 1.0 {
                     let close = cost(appearance, at, own, (1.0, 1.0)) <= 1.0;
                     candidates.push((all.to_bits(), (a, usize::from(missing == 0), close, false)));
                 }

@@ -90,7 +90,7 @@ fn tracks_equal_those_of_the_slow_linker() {
             let (state, _) = shuffled_part(&state, &mut random, |i| !is_away(i));
             let found = linker.link(&state);
             assert_eq!(found.tracks, slow.link(&state), "frame {t}, crowd {crowd}");
-            assert_eq!(linker.tracks(), slow.born);
+            assert_eq!(linker.track_count(), slow.born);
             linked += found.linked;
             doubtful += found.doubtful;
         }
@@ -158,7 +158,7 @@ fn tracks_survive_a_gap_of_three_frames_but_not_four() {
             let tracks = linker.link(&state.pick(&rows)).tracks;
             if t == 3 + away {
                 assert_eq!(tracks[39] == 39, continues, "{away} frames away");
-                assert_eq!(linker.tracks(), if continues { 40 } else { 41 });
+                assert_eq!(linker.track_count(), if continues { 40 } else { 41 });
             }
         }
     }
@@ -242,25 +242,28 @@ fn kept_order_is_told_from_shuffled_order() {
     let mut random = UniformNumbers(23);
     let cloud = cloud(5000, 4.0, &mut random);
     let next = later(&cloud, 1, 0.02, &mut random);
-    let kept = identity(&cloud, &next);
-    assert!(kept.holds && kept.moved < 2.0 && kept.apart > 5.0 && kept.unlike < 1e-6, "{kept:?}");
+    let kept = compare_order(&cloud, &next);
+    assert!(
+        kept.is_common && kept.position_difference < 2.0 && kept.apart > 5.0 && kept.appearance_difference < 1e-6,
+        "{kept:?}"
+    );
     let (mixed, _) = shuffled_part(&next, &mut random, |_| true);
-    let lost = identity(&cloud, &mixed);
-    assert!(!lost.holds && lost.moved > 5.0, "{lost:?}");
+    let lost = compare_order(&cloud, &mixed);
+    assert!(!lost.is_common && lost.position_difference > 5.0, "{lost:?}");
     // Each frame is sorted by position on its own, so equal indices denote near but unrelated Gaussians.
     let sorted = |state: &Gaussians| {
         let mut order: Vec<u32> = (0..5000).collect();
         order.sort_by(|&a, &b| state.position.plane(1)[a as usize].total_cmp(&state.position.plane(1)[b as usize]));
         state.pick(&order)
     };
-    let sorted = identity(&sorted(&cloud), &sorted(&next));
-    assert!(!sorted.holds, "{sorted:?}");
+    let sorted = compare_order(&sorted(&cloud), &sorted(&next));
+    assert!(!sorted.is_common, "{sorted:?}");
     // Equal Gaussians, Gaussians at rest and very few Gaussians: nothing speaks against the order.
     let alike = Gaussians::zeros(100, 0);
-    assert!(identity(&alike, &alike).holds && identity(&cloud, &cloud).holds);
+    assert!(compare_order(&alike, &alike).is_common && compare_order(&cloud, &cloud).is_common);
     let few: Vec<u32> = (0..9).collect();
-    assert!(identity(&cloud.pick(&few), &mixed.pick(&few)).holds);
-    assert!(identity(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).holds);
+    assert!(compare_order(&cloud.pick(&few), &mixed.pick(&few)).is_common);
+    assert!(compare_order(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).is_common);
 }
 
 /// Returns frames of `cloud`, with the index of each Gaussian. Gaussians are alive for `shortest` to `shortest` + 4
@@ -318,12 +321,12 @@ fn joined_tracks_equal_those_of_the_slow_joiner() {
         let (mut history, mut in_doubt, mut succeeded) = (History::new(), BTreeSet::new(), BTreeSet::new());
         for (t, (state, _)) in frames.iter().enumerate() {
             let linked = linker.link(state);
-            joiner.see(&linker);
+            joiner.add_frame(&linker);
             let doubted = linker.open_tracks().iter().filter(|track| track.is_in_doubt);
             in_doubt.extend(doubted.map(|track| track.number));
             let over = linker.open_tracks().iter().filter(|track| track.is_succeeded);
             succeeded.extend(over.map(|track| (t, track.number)));
-            history.resize(linker.tracks() as usize, BTreeMap::new());
+            history.resize(linker.track_count() as usize, BTreeMap::new());
             for (at, &track) in linked.tracks.iter().enumerate() {
                 history[track as usize].insert(t, seen(state, at));
             }
@@ -353,8 +356,8 @@ fn fading_tracks_are_joined_and_others_are_not() {
         let mut owners: Vec<BTreeSet<u32>> = Vec::new();
         for (state, ids) in &frames {
             let linked = linker.link(state);
-            joiner.see(&linker);
-            owners.resize(linker.tracks() as usize, BTreeSet::new());
+            joiner.add_frame(&linker);
+            owners.resize(linker.track_count() as usize, BTreeSet::new());
             for (&track, &i) in linked.tracks.iter().zip(ids) {
                 owners[track as usize].insert(i);
             }
@@ -375,7 +378,7 @@ fn blend_follows_its_formula() {
     let state = cloud(6, 1.0, &mut random);
     let rows = [4, 1, 3];
     let mut blended = state.clone();
-    blend(&mut blended, &rows);
+    blend_rows(&mut blended, &rows);
     let alphas = rows.map(|i| opacity(state.opacity_logit.plane(0)[i]));
     let near = |found: f32, expected: f64| assert!((f64::from(found) - expected).abs() < 1e-5, "{found}, {expected}");
     near(opacity(blended.opacity_logit.plane(0)[4]) as f32, 1.0 - alphas.iter().map(|a| 1.0 - a).product::<f64>());
@@ -400,12 +403,12 @@ fn blend_follows_its_formula() {
     for (logits, expected) in [([30.0, 30.0], 60.0), ([-30.0, -30.0], -30.0 + 2f32.ln()), ([50.0, -50.0], 50.0)] {
         let mut pair = state.pick(&[0, 1]);
         logits.iter().enumerate().for_each(|(i, &logit)| pair.opacity_logit.set_row(i, [logit]));
-        blend(&mut pair, &[0, 1]);
+        blend_rows(&mut pair, &[0, 1]);
         near(pair.opacity_logit.plane(0)[0], f64::from(expected));
     }
     let mut gone = state.pick(&[0, 1]);
     (0..2).for_each(|i| gone.opacity_logit.set_row(i, [f32::NEG_INFINITY]));
     let before = gone.clone();
-    blend(&mut gone, &[0, 1]);
+    blend_rows(&mut gone, &[0, 1]);
     assert!(gone == before, "invisible Gaussians must not change");
 }

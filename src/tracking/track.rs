@@ -28,7 +28,7 @@ pub(super) struct Round {
     pub(super) includes_missing: bool,
 }
 
-/// Track that may still continue: it had a Gaussian in the last frame or in one of the [`GAP`](super::GAP) frames
+/// Track that may still continue: it had a Gaussian in the last frame or in one of the [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames
 /// before.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {

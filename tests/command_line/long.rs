@@ -48,7 +48,7 @@ impl LongSequence {
                 let to = state.position.plane_mut(c).iter_mut();
                 to.zip(&at_rest).for_each(|(x, rest)| *x = rest[c] + weight * wave);
             }
-            if stream.frame(frame as f64, &state).is_err() {
+            if stream.write_frame(frame as f64, &state).is_err() {
                 return;
             }
         }

@@ -5,7 +5,7 @@ use std::fs;
 
 use crate::scene::{Workplace, files};
 use serde_json::{Value, json};
-use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
@@ -17,9 +17,9 @@ const FRAMES: usize = 70;
 /// views, of which one ends after 40 frames.
 fn workplace(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
-    let made = Scene::new(gaussians, FRAMES);
+    let made = DemoScene::new(gaussians, FRAMES);
     write_sequence(&made, OutputKind::Gseq, &workplace.path("scene.gseq"), 1, &Events::IGNORED).unwrap();
-    let fewer = Scene::new(gaussians * 3 / 4, FRAMES);
+    let fewer = DemoScene::new(gaussians * 3 / 4, FRAMES);
     write_sequence(&fewer, OutputKind::Gseq, &workplace.path("smaller.gseq"), 1, &Events::IGNORED).unwrap();
     let rig = made.rig();
     let shots: Vec<Value> = (0..3u32)

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::Value;
-use splatsieve::model::{AttributeValues, Attributes, Gaussians, color, opacity};
+use splatsieve::model::{AttributeValues, Attributes, Gaussians, color_from_sh, opacity};
 use splatsieve::models::{OpenOptions, open};
 use splatsieve::passes::gather_all;
 
@@ -84,7 +84,7 @@ fn assert_near(found: &Gaussians, expected: &Gaussians, steps: &Steps, what: &st
     near(&found.log_scale, &expected.log_scale, steps.log_scale, "log scale");
     near(&found.sh, &expected.sh, steps.sh, "SH coefficient");
     for i in 0..found.len() {
-        let [a, b] = [&found, &expected].map(|state| state.sh.row::<3>(i).map(color));
+        let [a, b] = [&found, &expected].map(|state| state.sh.row::<3>(i).map(color_from_sh));
         assert!(
             a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1.0 / 255.0),
             "{what}: color {i} is {a:?}, expected {b:?}"
@@ -204,7 +204,7 @@ fn three_js_reads_our_files() {
                 let (a, b) = (covariances[6 * i + k], covariance.col(column)[row]);
                 assert!((a - b).abs() <= 2.0 * relative * largest, "{name}, {i}: {a}, expected {b}");
             }
-            let rgb = original.sh.row::<3>(i).map(|dc| 255.0 * color(dc).clamp(0.0, 1.0));
+            let rgb = original.sh.row::<3>(i).map(|dc| 255.0 * color_from_sh(dc).clamp(0.0, 1.0));
             // Half a step of a .spz is 0.94, and the loader rounds down to bytes.
             for c in 0..3 {
                 assert!(

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use crate::scene::{Workplace, index_map, shared, state};
 use serde_json::Value;
-use splatsieve::files::splatv::write::words;
-use splatsieve::files::splatv::{MAGIC, SplatvGaussian, WORDS};
+use splatsieve::files::splatv::write::encode_words;
+use splatsieve::files::splatv::{MAGIC, SplatvGaussian, WORDS_PER_GAUSSIAN};
 use splatsieve::model::opacity;
 use splatsieve::scene::{InputOptions, open_scene};
 
@@ -30,8 +30,8 @@ fn valid_gaussian(i: usize) -> SplatvGaussian {
 
 /// Returns texture rows with defects: row 3 has no position, row 10 neither position nor rotation, rows 20 to 24 no
 /// rotation, row 30 no width; rows 40 to 47 have infinite temporal widths.
-fn rows() -> Vec<[u32; WORDS]> {
-    let mut rows: Vec<[u32; WORDS]> = (0..ROWS).map(|i| words(&valid_gaussian(i))).collect();
+fn rows() -> Vec<[u32; WORDS_PER_GAUSSIAN]> {
+    let mut rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = (0..ROWS).map(|i| encode_words(&valid_gaussian(i))).collect();
     rows[3][1] = f32::NAN.to_bits();
     (rows[10][0], rows[10][3], rows[10][4]) = (f32::INFINITY.to_bits(), 0, 0);
     rows[20..25].iter_mut().for_each(|row| (row[3], row[4]) = (0, 0));
@@ -43,7 +43,7 @@ fn rows() -> Vec<[u32; WORDS]> {
 const DROPPED: [usize; 8] = [3, 10, 20, 21, 22, 23, 24, 30];
 
 /// Writes a file whose texture ends after the last row, as numpy's `tobytes` leaves it.
-fn write(path: &Path, rows: &[[u32; WORDS]]) {
+fn write(path: &Path, rows: &[[u32; WORDS_PER_GAUSSIAN]]) {
     let text = r#"[{"type":"splat","size":65536,"texwidth":4096,"texheight":1,"cameras":[]}]"#;
     let mut bytes = [MAGIC.to_le_bytes(), (text.len() as u32).to_le_bytes()].concat();
     bytes.extend(text.as_bytes());

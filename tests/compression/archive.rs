@@ -107,7 +107,7 @@ fn archive_bytes_ignore_thread_count() {
 #[ignore = "needs time"]
 fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     let workplace = Workplace::new();
-    let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
+    let made = splatsieve::diagnostics::demo_scene::DemoScene::new(1500, 20);
     let raw = gseq::Compression::Raw;
     write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
     let how = "--ratio 0.5 --no-refine --prune-only";

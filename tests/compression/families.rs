@@ -4,14 +4,14 @@
 use std::path::Path;
 
 use crate::scene::{Workplace, state, tiny, without_sh_head};
-use splatsieve::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
+use splatsieve::compressed_model::{Cluster, CompressedModel, ParamDelta, ReferenceFrame};
 use splatsieve::limits::Limits;
 use splatsieve::model::{Attributes, Gaussians, NO_SH_LIMIT};
 use splatsieve::models;
 use splatsieve::models::{InputModel, OpenOptions};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
-use splatsieve::recipe::{Precision, Recipe};
+use splatsieve::recipe::{FieldPrecision, Recipe};
 
 /// Opens `path`, and gives it three times if its model has none of its own.
 fn open(path: &Path) -> Box<dyn InputModel> {
@@ -28,7 +28,7 @@ fn compress_by_three(input: &dyn InputModel) -> CompressedModel {
         let leader = compressed.kept[output as usize];
         compressed.clusters.push(Cluster { output, leader, members: vec![(leader, 0.625), (leader + 1, 0.375)] });
     }
-    let reference = Reference { frame: 0, extent: 1.0 };
+    let reference = ReferenceFrame { frame: 0, extent: 1.0 };
     compressed.proxies = input.solve(&compressed.clusters, reference, &rule).unwrap();
     compressed
 }
@@ -85,10 +85,10 @@ fn compressed_states_equal_written_states_after_any_delta() {
         let input = open(&path);
         let mut compressed = compress_by_three(&*input);
         for kind in kinds {
-            compressed.change = ParamDelta::default();
+            compressed.delta = ParamDelta::default();
             let [plain, _] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
             for column in Attributes::all().iter().chain([Attributes::all()]) {
-                compressed.change = delta_of_every_third(compressed.len(), column);
+                compressed.delta = delta_of_every_third(compressed.len(), column);
                 let [reduced, written] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
                 let case = format!("{}, {}, {kind:?}", path.display(), column.name());
                 assert!(reduced == written, "{case}: what is written differs from what was promised");
@@ -98,11 +98,11 @@ fn compressed_states_equal_written_states_after_any_delta() {
             }
             if kind == OutputKind::Model {
                 let [exact, _] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
-                compressed.field = Precision::Half;
+                compressed.field = FieldPrecision::Half;
                 let [reduced, written] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
                 assert!(input.can_round_field().unwrap() && reduced != exact, "nothing was rounded");
                 assert!(reduced == written, "a field in half precision differs from what was promised");
-                compressed.field = Precision::Exact;
+                compressed.field = FieldPrecision::Exact;
             }
             if input.needs_all_bands().is_none() {
                 for sh_degree in 0..input.source().info().sh_degree {

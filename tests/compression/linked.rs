@@ -10,7 +10,7 @@ use std::time::Instant;
 use crate::scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::model::Gaussians;
 use splatsieve::model::hash_id;
-use splatsieve::models::Link;
+use splatsieve::models::LinkMode;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 const FRAMES: usize = 37;
@@ -58,7 +58,7 @@ fn write_frames(workplace: &Workplace, folder: &str, count: usize) -> Vec<Vec<us
     (0..FRAMES).map(write).collect()
 }
 
-fn open(workplace: &Workplace, folder: &str, link: Link) -> Scene {
+fn open(workplace: &Workplace, folder: &str, link: LinkMode) -> Scene {
     let options = InputOptions { path: workplace.path(folder), link, ..InputOptions::default() };
     open_scene(&options).unwrap()
 }
@@ -68,7 +68,7 @@ fn tracks_hold_every_row_of_unlinked_frames_to_the_bit() {
     let workplace = Workplace::new();
     // Several blocks of Gaussians, some of which begin late or end early.
     let orders = write_frames(&workplace, "frames", 4000);
-    let scene = open(&workplace, "frames", Link::Apart);
+    let scene = open(&workplace, "frames", LinkMode::Apart);
     let count = scene.source().info().count;
     let lived = (0..4000).filter(|&i| (0..FRAMES).any(|t| is_alive(i, t))).count();
     assert_eq!(count, lived, "one track per Gaussian, across gaps of two frames");
@@ -110,12 +110,12 @@ fn frames_are_linked_if_rows_differ_or_on_request() {
         workplace.ply(&format!("kept/{t}.ply"), &mixed.pick(&back));
     }
     let kind = |folder: &str, link| open(&workplace, folder, link).input.kind();
-    assert_eq!(kind("kept", Link::Auto), "PLY frames");
-    assert_eq!(kind("mixed", Link::Auto), "linked PLY frames");
-    assert_eq!(kind("mixed", Link::Never), "PLY frames");
-    assert_eq!(kind("kept", Link::Always), "linked PLY frames");
+    assert_eq!(kind("kept", LinkMode::Auto), "PLY frames");
+    assert_eq!(kind("mixed", LinkMode::Auto), "linked PLY frames");
+    assert_eq!(kind("mixed", LinkMode::Never), "PLY frames");
+    assert_eq!(kind("kept", LinkMode::Always), "linked PLY frames");
     // Both have the same tracks in the order of the first frame.
-    let (kept, linked) = (open(&workplace, "kept", Link::Never), open(&workplace, "kept", Link::Always));
+    let (kept, linked) = (open(&workplace, "kept", LinkMode::Never), open(&workplace, "kept", LinkMode::Always));
     assert_eq!(state(kept.source(), 8), state(linked.source(), 8));
     let said = workplace.done("compress mixed -o out --ratio 0.5 --no-refine --verbose --link always");
     assert!(said.contains("frames were linked: as requested"), "{said}");
@@ -182,7 +182,7 @@ fn lives_that_fade_into_one_another_become_one_track() {
     for t in 0..frames {
         workplace.ply(&format!("frames/{t}.ply"), &fading_frame(count, t));
     }
-    let (apart, joined) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Auto));
+    let (apart, joined) = (open(&workplace, "frames", LinkMode::Apart), open(&workplace, "frames", LinkMode::Auto));
     let [apart_count, joined_count] = [&apart, &joined].map(|scene| scene.source().info().count);
     assert!(apart_count > 2 * count && joined_count <= count + count / 20, "{apart_count}, {joined_count}");
     let notes = joined.input.notes().join("\n");
@@ -296,7 +296,7 @@ fn steady_attributes_of_a_track_become_their_mean() {
     for t in 0..frames {
         workplace.ply(&format!("frames/{t}.ply"), &varying_frame(count, t));
     }
-    let (apart, held) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Always));
+    let (apart, held) = (open(&workplace, "frames", LinkMode::Apart), open(&workplace, "frames", LinkMode::Always));
     let [given, found] = [&apart, &held].map(|scene| {
         let states: Vec<Gaussians> = (0..frames).map(|t| state(scene.source(), t)).collect();
         states
@@ -416,7 +416,7 @@ fn cut_begins_new_tracks_and_is_noted() {
         }
         workplace.ply(&format!("frames/{t}.ply"), &gaussians);
     }
-    let scene = open(&workplace, "frames", Link::Apart);
+    let scene = open(&workplace, "frames", LinkMode::Apart);
     assert_eq!(scene.source().info().count, 600);
     let notes = scene.input.notes().join("\n");
     assert!(notes.contains("a cut at 5.ply"), "{notes}");
@@ -572,7 +572,7 @@ fn lives_in_containers_and_streams_join_on_request() {
     workplace.done("convert frames lives.gseq --link apart");
     // The container has ids of its own, which are used; a note says that lives are short.
     let [auto, apart, joined] =
-        [Link::Auto, Link::Apart, Link::Always].map(|link| open(&workplace, "lives.gseq", link));
+        [LinkMode::Auto, LinkMode::Apart, LinkMode::Always].map(|link| open(&workplace, "lives.gseq", link));
     let [auto_count, apart_count, joined_count] = [&auto, &apart, &joined].map(|scene| scene.source().info().count);
     assert_eq!((auto.input.kind(), joined.input.kind()), ("gseq container", "linked gseq container"));
     assert!(auto_count > 4 * count && apart_count > 4 * count, "{auto_count}, {apart_count}");
@@ -648,6 +648,6 @@ fn doubtful_links_begin_new_tracks_and_are_noted() {
         order.sort_by_key(|&i| hash_id(u64::from(i) << 20 | t as u64));
         workplace.ply(&format!("tiny/{t}.ply"), &state(scene.source(), t).pick(&order));
     }
-    let notes = open(&workplace, "tiny", Link::Auto).input.notes().join("\n");
+    let notes = open(&workplace, "tiny", LinkMode::Auto).input.notes().join("\n");
     assert!(notes.contains("links were ambiguous"), "{notes}");
 }

@@ -8,9 +8,11 @@ use glam::{DMat3, DQuat, DVec3};
 use splatsieve::limits::Limits;
 use splatsieve::merging::proxy::{ProxyState, merge_state};
 use splatsieve::model::{Attributes, Gaussians, SH_C0};
-use splatsieve::pipeline::{Only, Request, Target, compress_scene, score_scene};
+use splatsieve::pipeline::{PruneOrMerge, Request, Target, compress_scene, score_scene};
 use splatsieve::pruning::score::{Scored, UserOverrides};
-use splatsieve::recipe::{MergeParams, MergePass, MotionParams, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
+use splatsieve::recipe::{
+    MergeParams, MergePass, MotionParams, MotionSimilarity, ProxyHigherSh, ProxyOpacity, ProxyPosition, Recipe,
+};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 /// Change to the merging parameters that tightens one test.
@@ -106,12 +108,12 @@ fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pa
         .map(|&t| (all_frames.at(t, i) - all_frames.at(t - 1, i), all_frames.at(t, j) - all_frames.at(t - 1, j)))
         .collect();
     let similarity = match merge.trajectory {
-        Trajectory::Cosine => {
+        MotionSimilarity::Cosine => {
             let sum: f64 = steps.iter().map(|(a, b)| a.dot(*b) / (a.length() * b.length() + 1e-8)).sum();
             let terms = if recipe.scan.motion == MotionParams::Literal { common.len() } else { steps.len() };
             if terms == 0 { 0.0 } else { sum / terms as f64 }
         }
-        Trajectory::Alignment => {
+        MotionSimilarity::Alignment => {
             let noise = 2.0 * steps.len() as f64 * (merge.motion_noise * unit).powi(2);
             let dot: f64 = steps.iter().map(|(a, b)| a.dot(*b)).sum();
             let squares: f64 = steps.iter().map(|(a, b)| a.length_squared() + b.length_squared()).sum();
@@ -186,13 +188,13 @@ fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     ids.iter().zip(seen).map(|(&id, weight)| (id as u32, weight / total)).collect()
 }
 
-fn options(output: &Path, recipe: &Recipe, only: Only) -> Request {
+fn options(output: &Path, recipe: &Recipe, only: PruneOrMerge) -> Request {
     let input = InputOptions { path: tiny(), ..InputOptions::default() };
     Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
 }
 
 /// Compresses the tiny model and checks its clusters and proxies. Returns how many Gaussians joined others.
-fn assert_merges_as_specified(recipe: &Recipe, only: Only) -> usize {
+fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
@@ -200,7 +202,8 @@ fn assert_merges_as_specified(recipe: &Recipe, only: Only) -> usize {
     let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
     let all_frames = AllFrames::read(&scene);
     assert_eq!(summary.merge.unwrap().reference_frame, all_frames.reference);
-    let kept: Vec<usize> = (0..map.len()).filter(|&id| only == Only::Merge || scored.selection.keep[id]).collect();
+    let kept: Vec<usize> =
+        (0..map.len()).filter(|&id| only == PruneOrMerge::Merge || scored.selection.keep[id]).collect();
 
     let expected = clusters(&all_frames, &scored, &kept, recipe);
     let mut expected_map = vec![None; map.len()];
@@ -225,8 +228,8 @@ fn assert_is_mixture(
 ) {
     let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
     let mean = match merge.placement {
-        Placement::Leader => position(leader),
-        Placement::Mean => members.iter().map(|&(i, weight)| weight * position(i as usize)).sum(),
+        ProxyPosition::Leader => position(leader),
+        ProxyPosition::Mean => members.iter().map(|&(i, weight)| weight * position(i as usize)).sum(),
     };
     let spread: f64 = members.iter().map(|&(i, _)| (position(i as usize) - mean).length()).fold(0.0, f64::max);
     assert!((merged.position - mean).length() <= 1e-12 * (mean.length() + spread), "{}, {mean}", merged.position);
@@ -267,7 +270,7 @@ fn assert_is_mixture(
     for (k, &found) in merged.sh.iter().enumerate() {
         let coefficient = |i: u32| f64::from(states.sh.plane(k)[i as usize]);
         let expected = match merge.sh_high {
-            ShHigh::Heaviest if k >= 3 => coefficient(heaviest),
+            ProxyHigherSh::Heaviest if k >= 3 => coefficient(heaviest),
             _ => members.iter().map(|&(i, weight)| weight * coefficient(i)).sum::<f64>(),
         };
         assert!(
@@ -339,11 +342,11 @@ fn assert_solved_at_leaders(
             let tolerance = 4.0 * f64::from(f32::EPSILON) * size;
             let at = format!("{name} of the proxy at {place}, led by {leader}");
             assert!((f64::from(raw) - expected).abs() <= tolerance, "raw {at}: got {raw}, expected {expected}");
-            if merge.placement == Placement::Leader {
+            if merge.placement == ProxyPosition::Leader {
                 assert!((f64::from(found) - merged).abs() <= tolerance, "{at}: got {found}, expected {merged}");
             }
         }
-        if merge.placement == Placement::Leader {
+        if merge.placement == ProxyPosition::Leader {
             for (now, then) in frames.iter().zip(&all_frames.frames) {
                 assert_eq!(now.position.row::<3>(place), then.position.row::<3>(leader), "path of {place}");
             }
@@ -355,7 +358,7 @@ fn assert_solved_at_leaders(
 fn presets_merge_as_specified() {
     // The preset `strong` prunes most of the tiny model first, so few Gaussians are left to merge.
     for (preset, least) in [("paper", 100), ("default", 30), ("strong", 20)] {
-        let joined = assert_merges_as_specified(&by_formula(preset), Only::Both);
+        let joined = assert_merges_as_specified(&by_formula(preset), PruneOrMerge::Both);
         assert!(joined >= least, "{preset}: only {joined} joined");
     }
 }
@@ -363,16 +366,16 @@ fn presets_merge_as_specified() {
 #[test]
 fn merging_without_pruning_merges_as_specified() {
     for preset in ["paper", "default"] {
-        assert!(assert_merges_as_specified(&by_formula(preset), Only::Merge) > 30);
+        assert!(assert_merges_as_specified(&by_formula(preset), PruneOrMerge::Merge) > 30);
     }
 }
 
 #[test]
 fn later_passes_merge_groups_as_specified() {
     let mut recipe = by_formula("paper");
-    let one = assert_merges_as_specified(&recipe, Only::Both);
+    let one = assert_merges_as_specified(&recipe, PruneOrMerge::Both);
     recipe.merge.passes.push(MergePass { epsilon: 0.3, d0: 4.0, rho: 0.5, tau_m: 0.3 });
-    let two = assert_merges_as_specified(&recipe, Only::Both);
+    let two = assert_merges_as_specified(&recipe, PruneOrMerge::Both);
     assert!(two > one, "{two} joined in two passes, {one} in one");
 }
 
@@ -384,7 +387,7 @@ fn every_merging_test_binds_as_specified() {
         (recipe.merge.max_drift, recipe.merge.max_dead_time) = (0.05, 0.5);
         recipe
     };
-    let all = assert_merges_as_specified(&base(), Only::Merge);
+    let all = assert_merges_as_specified(&base(), PruneOrMerge::Merge);
     let edits: [(&str, Tighten); 9] = [
         ("epsilon", |m| m.passes[0].epsilon = 0.004),
         ("d0", |m| m.passes[0].d0 = 0.2),
@@ -399,7 +402,7 @@ fn every_merging_test_binds_as_specified() {
     for (gate, edit) in edits {
         let mut recipe = base();
         edit(&mut recipe.merge);
-        let joined = assert_merges_as_specified(&recipe, Only::Merge);
+        let joined = assert_merges_as_specified(&recipe, PruneOrMerge::Merge);
         assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
     }
 }
@@ -425,7 +428,7 @@ fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> Pat
 fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<u32>>, usize) {
     let (input, output) =
         (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));
-    let request = Request { only: Only::Merge, ..Request::new(input, output, recipe.clone()) };
+    let request = Request { only: PruneOrMerge::Merge, ..Request::new(input, output, recipe.clone()) };
     let (summary, map) = compress_scene(scene, &request).unwrap();
     (map, summary.merge.unwrap().proxies)
 }
@@ -483,13 +486,13 @@ fn jitter_below_the_noise_floor_is_not_motion() {
 #[test]
 fn proxies_that_drift_from_members_return_to_leaders() {
     let mut recipe = by_formula("default");
-    recipe.merge.placement = Placement::Mean;
+    recipe.merge.placement = ProxyPosition::Mean;
     recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
     recipe.merge.max_drift = 0.004;
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
-    let (_, map) = compress_scene(&scene, &options(&output, &recipe, Only::Merge)).unwrap();
+    let (_, map) = compress_scene(&scene, &options(&output, &recipe, PruneOrMerge::Merge)).unwrap();
     let (scored, all_frames) =
         (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), AllFrames::read(&scene));
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
@@ -528,9 +531,9 @@ fn number_of_pair_partitions_changes_no_byte() {
         let merge = |pairs_together: usize| {
             let (output, scratch) = (folder.path().join(format!("out{pairs_together}")), tempfile::tempdir().unwrap());
             let mut scene = crate::scene::scene(&tiny());
-            scene.limits = Limits { pairs_together, frames_held: 3, ..Limits::NONE };
+            scene.limits = Limits { pairs_together, max_kept_frames: 3, ..Limits::NONE };
             scene.scratch = scratch.path().to_owned();
-            let options = Request { target, ..options(&output, &recipe, Only::Both) };
+            let options = Request { target, ..options(&output, &recipe, PruneOrMerge::Both) };
             let (summary, map) = compress_scene(&scene, &options).unwrap();
             assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
             (lasting_files(&output), map, summary.merge.unwrap().passes)

@@ -5,7 +5,7 @@ use crate::scene::{by_formula, scene, tiny};
 use splatsieve::model::Rows;
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::{Scored, UserOverrides};
-use splatsieve::recipe::{Anisotropy, LowPriority, Recipe};
+use splatsieve::recipe::{Anisotropy, LowScorePolicy, Recipe};
 
 const COUNT: usize = 300;
 const FRAMES: f64 = 10.0;
@@ -76,7 +76,7 @@ fn plain_scores(rows: &Rows, recipe: &Recipe) -> PlainScores {
     let keep = (0..COUNT)
         .map(|i| {
             let passes = of_static[i] >= select.tau_static || of_dynamic[i] >= select.tau_dynamic;
-            passes && (select.low_priority == LowPriority::Rescue || candidates.contains(&i))
+            passes && (select.low_priority == LowScorePolicy::Rescue || candidates.contains(&i))
         })
         .collect();
     PlainScores { static_score, dynamic_score, score: sum, keep }
@@ -129,7 +129,7 @@ fn every_score_parameter_acts_as_specified() {
         |r| r.score.clip_norm = !r.score.clip_norm,
         |r| r.select.keep_fraction = 0.355,
         |r| (r.select.tau_static, r.select.tau_dynamic) = (0.4, 0.6),
-        |r| (r.select.low_priority, r.select.tau_static, r.select.tau_dynamic) = (LowPriority::Drop, 0.2, 0.3),
+        |r| (r.select.low_priority, r.select.tau_static, r.select.tau_dynamic) = (LowScorePolicy::Drop, 0.2, 0.3),
     ];
     for preset in ["paper", "default"] {
         let counts: Vec<usize> = edits
@@ -151,10 +151,10 @@ fn smaller_targets_keep_a_subset_of_larger_ones() {
     for preset in ["paper", "default"] {
         let selection = scored(&by_formula(preset)).selection;
         let own: Vec<u32> = (0..COUNT as u32).filter(|&i| selection.keep[i as usize]).collect();
-        assert_eq!(selection.ranking.take(own.len()), own, "the recipe's own count gives the recipe's own set");
-        let mut larger = selection.ranking.take(COUNT);
+        assert_eq!(selection.ranking.best_ids(own.len()), own, "the recipe's own count gives the recipe's own set");
+        let mut larger = selection.ranking.best_ids(COUNT);
         for m in (0..COUNT).rev() {
-            let smaller = selection.ranking.take(m);
+            let smaller = selection.ranking.best_ids(m);
             assert_eq!(smaller.len(), m);
             assert!(smaller.iter().all(|id| larger.binary_search(id).is_ok()), "{preset}: {m}");
             larger = smaller;

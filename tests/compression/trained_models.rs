@@ -80,8 +80,8 @@ fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
     // Motion and opacity do not depend on cameras; the cameras of one frame are enough to accept the scene.
     let first = scene.schedule.views(0).to_vec();
     scene.schedule = ViewSchedule::new(scene.schedule.cameras.clone());
-    scene.schedule.push(1, &first);
-    scene.schedule.push(scene.source().info().times.len() - 1, &[]);
+    scene.schedule.push_frames(1, &first);
+    scene.schedule.push_frames(scene.source().info().times.len() - 1, &[]);
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
     (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }

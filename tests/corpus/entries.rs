@@ -374,12 +374,12 @@ fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {
 
 /// Reads a pickle without its archive, within one MiB of memory.
 fn pickle_bytes(bytes: &[u8], _: &InputFolder) -> Outcome {
-    in_memory::pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
+    in_memory::check_pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
 }
 
 /// Reads JSON with the streaming parser of camera files.
 fn cameras_json(bytes: &[u8], _: &InputFolder) -> Outcome {
-    in_memory::cameras_json(bytes)?;
+    in_memory::check_cameras_json(bytes)?;
     Ok(())
 }
 

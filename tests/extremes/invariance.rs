@@ -13,7 +13,7 @@ use proptest::prelude::*;
 use splatsieve::files::container::Container;
 use splatsieve::model::{Attributes, Camera, Gaussians, Rig, Rows, Shot, Split};
 use splatsieve::outputs::container::write_container;
-use splatsieve::passes::HeldFrames;
+use splatsieve::passes::FramesInMemory;
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{MotionParams, Recipe};
@@ -44,7 +44,7 @@ impl GeneratedScene {
         recipe.select.tau_static = 0.3;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("world.gseq");
-        let mut held = HeldFrames::new(self.frames[0].len(), 0, Attributes::all(), Gaussians::zeros(0, 0));
+        let mut held = FramesInMemory::new(self.frames[0].len(), 0, Attributes::all(), Gaussians::zeros(0, 0));
         self.times.iter().zip(&self.frames).for_each(|(&time, frame)| held.push(time, frame.clone()));
         write_container(&held, &path, gseq::Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
         let shot =

@@ -141,7 +141,7 @@ impl Sequence {
             let mut stream = StreamWriter::new(to, Path::new("pipe"), header, &state).unwrap();
             for t in 0..frames {
                 fill(t, &mut state);
-                if stream.frame(time(t), &state).is_err() {
+                if stream.write_frame(time(t), &state).is_err() {
                     return;
                 }
             }

@@ -12,7 +12,7 @@ fn stream() -> Vec<u8> {
     let (mut bytes, state) = (Vec::new(), balls(4));
     let header = StreamHeader { count: 4, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
     let mut stream = StreamWriter::new(&mut bytes, Path::new("memory"), header, &state).unwrap();
-    (0..5).for_each(|t| stream.frame(f64::from(t), &state).unwrap());
+    (0..5).for_each(|t| stream.write_frame(f64::from(t), &state).unwrap());
     stream.finish().unwrap();
     bytes
 }

@@ -11,7 +11,7 @@ use std::process::Output;
 use crate::models;
 use assert_cmd::Command;
 use serde_json::{Value, json};
-use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
@@ -24,10 +24,10 @@ const SIZE: (usize, usize) = (48, 36);
 /// training view 1, and test view 3, which looks away from the scene.
 fn scene() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let made = Scene::new(400, FRAMES);
+    let made = DemoScene::new(400, FRAMES);
     write_sequence(&made, OutputKind::Gseq, &folder.path().join("scene.gseq"), 1, &Events::IGNORED).unwrap();
     write_sequence(
-        &Scene::new(300, FRAMES),
+        &DemoScene::new(300, FRAMES),
         OutputKind::Gseq,
         &folder.path().join("smaller.gseq"),
         1,
@@ -39,7 +39,7 @@ fn scene() -> TempDir {
 }
 
 fn write_cameras(folder: &Path, background: Value) {
-    let rig = Scene::new(400, FRAMES).rig();
+    let rig = DemoScene::new(400, FRAMES).rig();
     let frames: Vec<Value> = (0..4u32)
         .map(|view| {
             let camera = &rig.cameras[view as usize];
@@ -350,7 +350,7 @@ fn misuse_exits_with_2_and_leaves_no_files() {
 fn wrong_inputs_exit_with_1_and_leave_no_files() {
     let folder = scene();
     write_sequence(
-        &Scene::new(300, FRAMES + 1),
+        &DemoScene::new(300, FRAMES + 1),
         OutputKind::Gseq,
         &folder.path().join("longer.gseq"),
         1,

@@ -4,7 +4,9 @@
 use std::path::Path;
 
 use glam::DVec3;
-use splatsieve::diagnostics::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
+use splatsieve::diagnostics::selfcheck::made::clouds::{
+    Random, plain_camera, random_gaussians, single_gaussian, tilted_camera,
+};
 use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Attributes, Camera, Gaussians, Gradients, StoredParams};
 use splatsieve::models::ModelFolder;
@@ -35,22 +37,22 @@ fn step_both_ways(x: f32, step: f32) -> ([f32; 2], f64) {
 #[test]
 fn gradients_match_central_differences_of_the_oracle() {
     for (seed, count, degree, width, height) in [(1, 300, 3, 67, 45), (2, 900, 1, 64, 64), (3, 40, 2, 33, 100)] {
-        let (gaussians, camera) = (scene(seed, count, degree), camera(width, height));
+        let (gaussians, camera) = (random_gaussians(seed, count, degree), tilted_camera(width, height));
         // The loss is half the squared difference from noise, over the pixels in which f32 makes the same decisions as
         // f64.
-        let sure: Vec<f64> = oracle::picture(&gaussians, &camera, BACKGROUND, 1)
+        let sure: Vec<f64> = oracle::render_view(&gaussians, &camera, BACKGROUND, 1)
             .doubtful
             .iter()
             .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
             .collect();
         let mut random = Random(seed + 100);
-        let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.draw()).collect();
+        let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next_f32()).collect();
         let found = gradients(&gaussians, &camera, |picture| Image {
             data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
             ..*picture
         });
 
-        let blended = oracle::blended(&gaussians, &camera);
+        let blended = oracle::blended_indices(&gaussians, &camera);
         let loss = |changed: &Gaussians| -> f64 {
             let pixels = oracle::render_blended(changed, &camera, BACKGROUND, &blended);
             let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
@@ -89,7 +91,7 @@ fn gradients_match_central_differences_of_the_oracle() {
 fn gradient_of_one_gaussian_is_its_closed_form() {
     // An isotropic Gaussian on the axis has variance (f·s/z)² + 0.3 about the center of the image.
     let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
-    let (gaussians, camera) = (single(depth as f32, scale as f32, opacity as f32), plain_camera(size));
+    let (gaussians, camera) = (single_gaussian(depth as f32, scale as f32, opacity as f32), plain_camera(size));
     let seen = (50.0 * scale / depth).powi(2);
     let (variance, middle) = (seen + 0.3, f64::from(size) / 2.0 - 0.5);
     // The loss is the sum of a channel; the contrast is the color minus the background.
@@ -135,7 +137,7 @@ fn gradient_of_one_gaussian_is_its_closed_form() {
 #[test]
 fn image_moves_by_focal_length_over_depth() {
     // The loss is the first moment of the image along u; its derivative by x is alphas · f/z.
-    let (gaussians, camera) = (single(2.0, 0.05, 0.6), plain_camera(48));
+    let (gaussians, camera) = (single_gaussian(2.0, 0.05, 0.6), plain_camera(48));
     let found = gradients(&gaussians, &camera, |picture| {
         let mut moment = plain_image(&camera, [0.0; 3]);
         (0..moment.data.len()).step_by(3).for_each(|at| moment.data[at] = ((at / 3) as u32 % picture.width) as f32);
@@ -153,14 +155,14 @@ fn image_moves_by_focal_length_over_depth() {
 
 #[test]
 fn gradients_ignore_threads_buffers_frozen_attributes() {
-    let camera = camera(131, 77);
+    let camera = tilted_camera(131, 77);
     let noise = |picture: &Image| {
         let mut random = Random(7);
-        Image { data: picture.data.iter().map(|x| x - random.draw()).collect(), ..*picture }
+        Image { data: picture.data.iter().map(|x| x - random.next_f32()).collect(), ..*picture }
     };
     let mut kept = Renderer::new();
     for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
-        let scene = scene(seed, count, 2);
+        let scene = random_gaussians(seed, count, 2);
         let with = |renderer: &mut Renderer, columns, degree| {
             let mut found = Gradients::new(count, columns, degree);
             let value = renderer.gradient(&scene, &camera, BACKGROUND, |picture| (1.5, noise(picture)), &mut found);
@@ -189,7 +191,7 @@ fn gradients_ignore_threads_buffers_frozen_attributes() {
 
 #[test]
 fn gradients_of_several_renders_add_up() {
-    let (scene, views) = (scene(51, 200, 1), [camera(40, 40), camera(50, 30)]);
+    let (scene, views) = (random_gaussians(51, 200, 1), [tilted_camera(40, 40), tilted_camera(50, 30)]);
     let mut both = Gradients::new(200, Attributes::all(), 1);
     let mut renderer = Renderer::new();
     for camera in &views {
@@ -229,7 +231,7 @@ fn extremes_give_finite_gradients_and_undrawn_ones_zero() {
         |g| g.rotation.set_row(0, [1.0, f32::NAN, 0.0, 0.0]),
     ];
     for (k, extreme) in extremes.into_iter().enumerate() {
-        let mut scene = scene(61, 50, 1);
+        let mut scene = random_gaussians(61, 50, 1);
         // The extreme Gaussian is in front of the camera.
         scene.position.set_row(0, [0.02, -0.03, 2.0]);
         scene.rotation.set_row(0, [1.0, 0.3, -0.2, 0.5]);
@@ -248,7 +250,7 @@ fn extremes_give_finite_gradients_and_undrawn_ones_zero() {
 
 #[test]
 fn gradient_of_an_image_filling_gaussian_is_its_alpha() {
-    let mut wall = single(2.0, 1.0, 0.6);
+    let mut wall = single_gaussian(2.0, 1.0, 0.6);
     wall.log_scale.set_row(0, [40.0f32; 3]);
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0, 0.0, 0.0]));
@@ -260,7 +262,7 @@ fn gradient_of_an_image_filling_gaussian_is_its_alpha() {
 
 #[test]
 fn clamped_alpha_has_gradients_only_for_color() {
-    let mut wall = single(2.0, 1.0, 0.999);
+    let mut wall = single_gaussian(2.0, 1.0, 0.999);
     wall.log_scale.set_row(0, [5.0f32; 3]);
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0; 3]));
@@ -274,7 +276,7 @@ fn clamped_alpha_has_gradients_only_for_color() {
 
 #[test]
 fn nonfinite_pixels_have_no_gradient() {
-    let (scene, camera) = (scene(71, 300, 1), camera(50, 40));
+    let (scene, camera) = (random_gaussians(71, 300, 1), tilted_camera(50, 40));
     let spoiled = |value: f32| {
         gradients(&scene, &camera, |picture| {
             let mut pull = picture.clone();
@@ -302,14 +304,14 @@ fn stored_positions_get_gradients_through_the_field() {
     };
     let state = state_of(stored);
     let camera = Camera::look_at(DVec3::new(0.5, -4.0, 1.0), DVec3::ZERO, 0.7, (64, 64));
-    let blended = oracle::blended(&state, &camera);
-    let sure: Vec<f64> = oracle::picture(&state, &camera, BACKGROUND, 1)
+    let blended = oracle::blended_indices(&state, &camera);
+    let sure: Vec<f64> = oracle::render_view(&state, &camera, BACKGROUND, 1)
         .doubtful
         .iter()
         .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
         .collect();
     let mut random = Random(7);
-    let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.draw()).collect();
+    let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next_f32()).collect();
     let mut found = gradients(&state, &camera, |picture| Image {
         data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
         ..*picture
@@ -350,6 +352,6 @@ fn stored_positions_get_gradients_through_the_field() {
 fn empty_scenes_and_images_have_valid_gradients() {
     assert!(gradients(&Gaussians::zeros(0, 1), &plain_camera(17), Image::clone).is_empty());
     let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
-    let found = gradients(&single(2.0, 0.1, 0.5), &nothing, Image::clone);
+    let found = gradients(&single_gaussian(2.0, 0.1, 0.5), &nothing, Image::clone);
     assert!(found == Gradients::new(1, Attributes::all(), 0));
 }

@@ -3,7 +3,9 @@
 use std::num::NonZeroU32;
 
 use glam::DVec3;
-use splatsieve::diagnostics::selfcheck::made::clouds::{camera, plain_camera, scene, single};
+use splatsieve::diagnostics::selfcheck::made::clouds::{
+    plain_camera, random_gaussians, single_gaussian, tilted_camera,
+};
 use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
@@ -26,7 +28,7 @@ fn pixel(image: &Image, x: usize, y: usize) -> [f32; 3] {
 #[test]
 fn render_of_one_gaussian_is_its_closed_form() {
     let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
-    let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
+    let image = render(&single_gaussian(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
     // An isotropic Gaussian on the axis has variance (f·s/z)² + 0.3 about the center of the image.
     let variance = (50.0 * scale / depth).powi(2) + 0.3;
     let middle = f64::from(size) / 2.0 - 0.5;
@@ -49,9 +51,9 @@ fn random_scenes_match_the_oracle() {
     for (seed, count, degree, width, height) in
         [(1, 300, 3, 67, 45), (2, 2000, 2, 64, 64), (3, 40, 1, 33, 100), (4, 6000, 0, 80, 50)]
     {
-        let (scene, camera) = (scene(seed, count, degree), camera(width, height));
+        let (scene, camera) = (random_gaussians(seed, count, degree), tilted_camera(width, height));
         let background = [0.1, 0.9, 0.4];
-        let expected = oracle::picture(&scene, &camera, background, 1);
+        let expected = oracle::render_view(&scene, &camera, background, 1);
         let got = render(&scene, &camera, background);
         let doubtful = expected.doubtful.iter().filter(|&&doubtful| doubtful).count();
         assert!(doubtful * 20 < expected.doubtful.len(), "seed {seed}: {doubtful} pixels say nothing");
@@ -73,13 +75,13 @@ fn opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
     let camera = Camera { cx: 32.5, ..plain_camera(64) };
     let mut cut = 0;
     for step in 0..60 {
-        let one = single(2.0, 0.15 + 0.001 * step as f32, 0.95);
-        let expected = oracle::picture(&one, &camera, [0.0; 3], 1);
+        let one = single_gaussian(2.0, 0.15 + 0.001 * step as f32, 0.95);
+        let expected = oracle::render_view(&one, &camera, [0.0; 3], 1);
         let got = measure_contribution(&one, &camera, 1);
         assert!(
-            (got.pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
+            (got.in_pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
             "step {step}: got {}, expected {}",
-            got.pixels(0),
+            got.in_pixels(0),
             expected.sum[0]
         );
         // Extent without the rule, in pixels of the middle row of the image.
@@ -95,8 +97,8 @@ fn opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
 #[test]
 fn contributions_match_the_oracle_at_every_stride() {
     for (seed, s) in [(11, 1), (12, 2), (13, 3), (14, 4), (15, 7), (16, 40)] {
-        let (scene, camera) = (scene(seed, 400, 0), camera(67, 45));
-        let expected = oracle::picture(&scene, &camera, [0.0; 3], s);
+        let (scene, camera) = (random_gaussians(seed, 400, 0), tilted_camera(67, 45));
+        let expected = oracle::render_view(&scene, &camera, [0.0; 3], s);
         let got = measure_contribution(&scene, &camera, s);
         // Doubtful pixels may or may not count an alpha of 1/255.
         let doubtful = expected.doubtful.iter().filter(|&&doubtful| doubtful).count() as f64;
@@ -104,9 +106,9 @@ fn contributions_match_the_oracle_at_every_stride() {
             let (sum, max) = (expected.sum[i], expected.max[i]);
             let tolerance = 1e-5 * sum + 1e-7 + if s < 3 { doubtful / 255.0 } else { 2.0 / 255.0 };
             assert!(
-                (got.pixels(i) - sum).abs() <= tolerance,
+                (got.in_pixels(i) - sum).abs() <= tolerance,
                 "seed {seed} Gaussian {i}: sum {} for {sum}",
-                got.pixels(i)
+                got.in_pixels(i)
             );
             assert!(
                 (f64::from(got.max[i]) - max).abs() <= 1e-5 + 1.0 / 255.0,
@@ -115,7 +117,7 @@ fn contributions_match_the_oracle_at_every_stride() {
             );
         }
         let (total, expected) =
-            ((0..scene.len()).map(|i| got.pixels(i)).sum::<f64>(), expected.sum.iter().sum::<f64>());
+            ((0..scene.len()).map(|i| got.in_pixels(i)).sum::<f64>(), expected.sum.iter().sum::<f64>());
         assert!((total / expected - 1.0).abs() < 1e-4, "seed {seed}: total {total}, expected {expected}");
     }
 }
@@ -123,28 +125,28 @@ fn contributions_match_the_oracle_at_every_stride() {
 #[test]
 fn weights_and_transmittance_add_up_to_every_pixel() {
     // White Gaussians in front of black: the image is the sum of the weights.
-    let (mut scene, camera) = (scene(21, 500, 0), camera(70, 41));
+    let (mut scene, camera) = (random_gaussians(21, 500, 0), tilted_camera(70, 41));
     (0..3).for_each(|c| scene.sh.plane_mut(c).fill(0.5 / 0.282_094_8));
     let light: f64 = render(&scene, &camera, [0.0; 3]).data.iter().map(|&v| f64::from(v)).sum::<f64>() / 3.0;
     let contribution = measure_contribution(&scene, &camera, 1);
-    let weights: f64 = (0..scene.len()).map(|i| contribution.pixels(i)).sum();
+    let weights: f64 = (0..scene.len()).map(|i| contribution.in_pixels(i)).sum();
     assert!((light / weights - 1.0).abs() < 1e-6, "light {light}, weights {weights}");
 }
 
 #[test]
 fn stride_larger_than_the_image_counts_nothing() {
     // A stride of 1 counts what the render shows; a stride larger than the image counts nothing.
-    let (scene, camera) = (scene(22, 200, 0), camera(40, 40));
+    let (scene, camera) = (random_gaussians(22, 200, 0), tilted_camera(40, 40));
     assert!(measure_contribution(&scene, &camera, 1).sum.iter().any(|&sum| sum > 0));
     assert!(measure_contribution(&scene, &camera, 1000).sum.iter().all(|&sum| sum == 0));
 }
 
 #[test]
 fn renders_ignore_thread_count_and_kept_buffers() {
-    let camera = camera(131, 77);
+    let camera = tilted_camera(131, 77);
     let mut kept = Renderer::new();
     for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
-        let scene = scene(seed, count, 1);
+        let scene = random_gaussians(seed, count, 1);
         let expected = (kept.render(&scene, &camera, [0.2; 3]), {
             let mut contribution = Contribution::new(count);
             kept.contribution(&scene, &camera, nonzero(2), &mut contribution);
@@ -160,9 +162,10 @@ fn renders_ignore_thread_count_and_kept_buffers() {
 
 #[test]
 fn contributions_ignore_the_order_of_renders() {
-    let scene = scene(41, 500, 0);
-    let cameras: Vec<Camera> =
-        (0..4).map(|k| Camera { translation: DVec3::new(0.2 * f64::from(k), 0.0, 0.1), ..camera(50, 50) }).collect();
+    let scene = random_gaussians(41, 500, 0);
+    let cameras: Vec<Camera> = (0..4)
+        .map(|k| Camera { translation: DVec3::new(0.2 * f64::from(k), 0.0, 0.1), ..tilted_camera(50, 50) })
+        .collect();
     let mut forward = Contribution::new(scene.len());
     cameras.iter().for_each(|camera| contribution(&scene, camera, nonzero(1), &mut forward));
     let mut parts: Vec<Contribution> = cameras.iter().map(|camera| measure_contribution(&scene, camera, 1)).collect();
@@ -188,11 +191,11 @@ fn ties_in_depth_fall_to_the_lower_index() {
 #[test]
 fn gaussians_nearer_than_0_2_or_behind_are_not_drawn() {
     for depth in [-3.0, -0.1, 0.0, 0.1999, 0.2] {
-        let image = render(&single(depth, 0.5, 0.9), &plain_camera(32), [0.5; 3]);
+        let image = render(&single_gaussian(depth, 0.5, 0.9), &plain_camera(32), [0.5; 3]);
         assert!(image.data.iter().all(|&v| v == 0.5), "something is drawn at depth {depth}");
     }
     // The camera is inside a Gaussian whose center is beyond the near plane: it is drawn.
-    let image = render(&single(0.25, 300.0, 0.9), &plain_camera(32), [0.5; 3]);
+    let image = render(&single_gaussian(0.25, 300.0, 0.9), &plain_camera(32), [0.5; 3]);
     assert!((pixel(&image, 0, 31)[0] - 0.95).abs() < 1e-4, "got {:?}", pixel(&image, 0, 31));
 }
 
@@ -200,9 +203,9 @@ fn gaussians_nearer_than_0_2_or_behind_are_not_drawn() {
 #[test]
 fn giant_across_the_near_plane_covers_just_the_image() {
     for log_scale in [7.0, 14.0, 80.0, 1e3, 3e38] {
-        let mut giant = single(0.21, 1.0, 0.9);
+        let mut giant = single_gaussian(0.21, 1.0, 0.9);
         giant.log_scale.set_row(0, [log_scale; 3]);
-        let pixels = measure_contribution(&giant, &plain_camera(40), 1).pixels(0);
+        let pixels = measure_contribution(&giant, &plain_camera(40), 1).in_pixels(0);
         assert!(
             (pixels - 0.9 * 1600.0).abs() < 1e-2,
             "scale e^{log_scale}: {pixels} pixels, expected {}",
@@ -239,10 +242,10 @@ fn giant_background_is_visible_around_the_foreground() {
     both.opacity_logit.set_row(1, [1.0]);
     let contribution = measure_contribution(&both, &plain_camera(64), 1);
     assert!(
-        contribution.pixels(0) > 3900.0 && contribution.pixels(1) > 5.0,
+        contribution.in_pixels(0) > 3900.0 && contribution.in_pixels(1) > 5.0,
         "got {} and {}",
-        contribution.pixels(0),
-        contribution.pixels(1)
+        contribution.in_pixels(0),
+        contribution.in_pixels(1)
     );
 }
 
@@ -250,7 +253,7 @@ fn giant_background_is_visible_around_the_foreground() {
 fn nonfinite_gaussians_are_not_drawn() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         for place in 0..3 {
-            let mut one = single(2.0, 0.1, 0.9);
+            let mut one = single_gaussian(2.0, 0.1, 0.9);
             match place {
                 0 => one.position.set_row(0, [bad, 0.0, 2.0]),
                 1 => one.position.set_row(0, [0.0, 0.0, bad]),
@@ -267,6 +270,6 @@ fn empty_scenes_and_images_are_valid() {
     let image = render(&Gaussians::zeros(0, 3), &plain_camera(17), [0.1, 0.2, 0.3]);
     assert!(image.data.chunks_exact(3).all(|pixel| pixel == [0.1, 0.2, 0.3]));
     let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
-    assert!(render(&single(2.0, 0.1, 0.5), &nothing, [0.0; 3]).data.is_empty());
-    assert_eq!(measure_contribution(&single(2.0, 0.1, 0.5), &nothing, 1).sum, [0]);
+    assert!(render(&single_gaussian(2.0, 0.1, 0.5), &nothing, [0.0; 3]).data.is_empty());
+    assert_eq!(measure_contribution(&single_gaussian(2.0, 0.1, 0.5), &nothing, 1).sum, [0]);
 }

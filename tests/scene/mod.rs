@@ -310,13 +310,13 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
 /// Returns a preset that scores by projected coverage and uses no renders, so that formulas alone decide.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::model::Attributes;
-    use splatsieve::recipe::{AttributeGroups, Coverage, Precision, Recipe, ShDegreeRule, StaticTerm};
+    use splatsieve::recipe::{AttributeGroups, Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticScoreTerm};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
-    recipe.score.static_term = StaticTerm::Mean;
+    recipe.score.static_term = StaticScoreTerm::Mean;
     recipe.select.choose_by_views = false;
     recipe.refine.refine = AttributeGroups(Attributes::empty());
-    recipe.field.field = Precision::Exact;
+    recipe.field.field = FieldPrecision::Exact;
     recipe.bands.bands = ShDegreeRule::All;
     recipe
 }

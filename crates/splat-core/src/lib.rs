@@ -36,7 +36,7 @@ pub use gaussians::{AttributeValues, Attributes, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
 pub use hash::hash_id;
 pub use jacobian::Jacobian;
-pub use ranges::ranges;
+pub use ranges::format_ranges;
 pub use raw::StoredParams;
 pub use rig::{Rig, Shot, Split};
 pub use robust_box::RobustBox;
@@ -58,12 +58,12 @@ pub fn logit(opacity: f64) -> f64 {
 }
 
 /// Returns the value of one color channel from its SH coefficient of degree 0, which is equal from all directions.
-pub fn color(harmonic: f32) -> f64 {
+pub fn color_from_sh(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }
 
 /// Returns the SH coefficient of degree 0 that gives one color channel the value `color`.
-pub fn harmonic(color: f64) -> f32 {
+pub fn sh_from_color(color: f64) -> f32 {
     ((color - 0.5) / SH_C0) as f32
 }
 
@@ -101,14 +101,14 @@ impl SequenceInfo {
         if times.len() != self.times.len() {
             return Err(Error::usage(format!("{} times were given for {} frames", times.len(), self.times.len())));
         }
-        self.at(times)
+        self.with_frames_at(times)
     }
 
     /// Returns the same Gaussians with one frame at each of `times`, instead of the T frames so far.
     ///
     /// # Errors
     /// Fails if times are not finite or not strictly increasing. The message names the frames.
-    pub fn at(self, times: Vec<f64>) -> Result<SequenceInfo> {
+    pub fn with_frames_at(self, times: Vec<f64>) -> Result<SequenceInfo> {
         if let Some(i) = times.iter().position(|time| !time.is_finite()) {
             return Err(Error::usage(format!("the time of frame {i} is {}: expected a finite number", times[i])));
         }

@@ -13,7 +13,8 @@ pub struct StoredParams {
     /// Further parameters that only this model format has (velocities, time windows, features): one plane per
     /// parameter, with its value for every Gaussian, in an order that the format defines. Has no planes if there are
     /// none.
-    pub own: AttributeValues,
+    #[serde(rename = "own")]
+    pub format_specific: AttributeValues,
 }
 
 impl StoredParams {
@@ -29,7 +30,7 @@ impl StoredParams {
 
     /// Returns the parameters of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> StoredParams {
-        StoredParams { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
+        StoredParams { gaussians: self.gaussians.pick(rows), format_specific: self.format_specific.pick(rows) }
     }
 
     /// Copies the parameters of Gaussian `row` of `from` to Gaussian `to` of `self`. `from` must have at least as many
@@ -41,7 +42,7 @@ impl StoredParams {
         for column in Attributes::all().iter() {
             set(self.gaussians.column_mut(column), from.gaussians.column(column));
         }
-        set(&mut self.own, &from.own);
+        set(&mut self.format_specific, &from.format_specific);
     }
 }
 
@@ -49,7 +50,7 @@ impl From<Gaussians> for StoredParams {
     /// Creates the stored parameters of a model format that stores only the attributes of `gaussians`.
     fn from(gaussians: Gaussians) -> StoredParams {
         let own = AttributeValues::zeros(0, gaussians.len());
-        StoredParams { gaussians, own }
+        StoredParams { gaussians, format_specific: own }
     }
 }
 
@@ -59,20 +60,23 @@ mod tests {
 
     #[test]
     fn pick_and_set_row_copy_all_parameters() {
-        let mut raw = StoredParams { gaussians: Gaussians::zeros(3, 1), own: AttributeValues::zeros(2, 3) };
+        let mut raw = StoredParams { gaussians: Gaussians::zeros(3, 1), format_specific: AttributeValues::zeros(2, 3) };
         raw.gaussians.columns_mut(Attributes::all()).for_each(|column| {
             column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = k as f32);
         });
-        raw.own.set_row(2, [7.0, 8.0]);
+        raw.format_specific.set_row(2, [7.0, 8.0]);
         let picked = raw.pick(&[2, 0]);
         assert_eq!(
-            (picked.len(), picked.own.row(0), picked.gaussians.position.row(0)),
+            (picked.len(), picked.format_specific.row(0), picked.gaussians.position.row(0)),
             (2, [7.0, 8.0], [2.0, 5.0, 8.0])
         );
         let mut other = raw.clone();
         other.set_row(1, &picked, 0);
         assert_eq!(other.pick(&[1]), raw.pick(&[2]));
         let plain = StoredParams::from(raw.gaussians.clone()).pick(&[1]);
-        assert_eq!((plain.own.width(), plain.own.len(), plain.gaussians), (0, 1, raw.gaussians.pick(&[1])));
+        assert_eq!(
+            (plain.format_specific.width(), plain.format_specific.len(), plain.gaussians),
+            (0, 1, raw.gaussians.pick(&[1]))
+        );
     }
 }

@@ -123,13 +123,13 @@ impl Rig {
         };
         let mut schedule = ViewSchedule::new(self.cameras.clone());
         for of_one_frame in timed.chunk_by(|a, b| a.0 == b.0) {
-            schedule.push(of_one_frame[0].0 - schedule.frames(), &views_of(timeless.clone()));
-            schedule.push(
+            schedule.push_frames(of_one_frame[0].0 - schedule.frames(), &views_of(timeless.clone()));
+            schedule.push_frames(
                 1,
                 &views_of(of_one_frame.iter().map(|&(_, place)| place).chain(timeless.iter().copied()).collect()),
             );
         }
-        schedule.push(frame_times.len() - schedule.frames(), &views_of(timeless));
+        schedule.push_frames(frame_times.len() - schedule.frames(), &views_of(timeless));
         Ok(schedule)
     }
 
@@ -149,7 +149,7 @@ impl Rig {
 
     /// Returns the path of the photograph of the view `picture`, if the camera file names one. `frame_times` are the
     /// increasing times of the frames.
-    pub fn image(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
+    pub fn image_path(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();
             (shot.view, shot.camera) == (picture.view, picture.camera)
@@ -216,7 +216,7 @@ mod tests {
         let rig = rig(&shots);
         assert_eq!(rig.times(), times);
         let schedule = rig.schedule(&times, Some(Split::Train)).unwrap();
-        assert_eq!(schedule.pairs(), 12);
+        assert_eq!(schedule.pair_count(), 12);
         assert!(schedule.iter().all(|views| views == [(0, 0), (1, 1), (2, 2)]));
     }
 
@@ -228,7 +228,7 @@ mod tests {
         let views = |split| -> Vec<_> { rig.schedule(&times, split).unwrap().iter().map(<[_]>::to_vec).collect() };
         assert_eq!(views(Some(Split::Train)), [vec![(0, 0)], vec![], vec![(2, 2)]]);
         assert_eq!(views(Some(Split::Test)), [vec![], vec![(1, 1)], vec![]]);
-        assert_eq!(rig.schedule(&times, None).unwrap().pairs(), 3);
+        assert_eq!(rig.schedule(&times, None).unwrap().pair_count(), 3);
     }
 
     #[test]

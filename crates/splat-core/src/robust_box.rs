@@ -11,7 +11,7 @@ pub struct RobustBox {
     /// 1st percentile of the positions along each axis, scene units.
     pub low: DVec3,
     /// Median of the positions along each axis, scene units.
-    pub middle: DVec3,
+    pub median: DVec3,
     /// 99th percentile of the positions along each axis, scene units.
     pub high: DVec3,
 }
@@ -20,7 +20,7 @@ impl RobustBox {
     /// Computes the box of the positions `position` (`[3, N]`). Percentiles are nearest ranks among the finite values.
     /// An axis without finite values gets percentiles of 0.
     pub fn from_positions(position: &AttributeValues) -> RobustBox {
-        let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
+        let mut found = RobustBox { low: DVec3::ZERO, median: DVec3::ZERO, high: DVec3::ZERO };
         for axis in 0..3 {
             let mut values: Vec<f32> = position.plane(axis).iter().copied().filter(|x| x.is_finite()).collect();
             let mut percentile = |p: usize| -> f64 {
@@ -31,7 +31,7 @@ impl RobustBox {
                 (*values.select_nth_unstable_by(rank, f32::total_cmp).1).into()
             };
             found.low[axis] = percentile(1);
-            found.middle[axis] = percentile(50);
+            found.median[axis] = percentile(50);
             found.high[axis] = percentile(99);
         }
         found

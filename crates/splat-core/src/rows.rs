@@ -134,7 +134,7 @@ impl Statistic {
     }
 
     /// Returns the name of the statistic as a column of exported tables.
-    pub fn column(self) -> &'static str {
+    pub fn column_name(self) -> &'static str {
         self.declaration().column
     }
 
@@ -145,18 +145,18 @@ impl Statistic {
     }
 
     /// Returns the property of a Gaussian that this statistic measures.
-    pub fn property(self) -> &'static str {
+    pub fn measured_property(self) -> &'static str {
         self.declaration().property
     }
 
     /// Returns the functions that access the values of the statistic in [`Rows`].
-    pub const fn values(self) -> StatisticAccess {
+    pub const fn accessors(self) -> StatisticAccess {
         self.declaration().values
     }
 
     /// Returns the bytes that one value of the statistic takes.
     pub const fn bytes(self) -> usize {
-        match self.values() {
+        match self.accessors() {
             StatisticAccess::F64(..) => size_of::<f64>(),
             StatisticAccess::U32(..) => size_of::<u32>(),
         }
@@ -214,7 +214,7 @@ impl Rows {
     /// Appends the statistics in `next`, those of the following block of Gaussians, and leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
-            match statistic.values() {
+            match statistic.accessors() {
                 StatisticAccess::F64(_, values) => values(self).append(values(next)),
                 StatisticAccess::U32(_, values) => values(self).append(values(next)),
             }
@@ -225,7 +225,7 @@ impl Rows {
     /// Sets all statistics of Gaussian `i` to 0. Its flags stay unchanged.
     pub fn clear(&mut self, i: usize) {
         for statistic in Statistic::ALL {
-            match statistic.values() {
+            match statistic.accessors() {
                 StatisticAccess::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
                 StatisticAccess::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
             }
@@ -239,7 +239,7 @@ mod tests {
 
     #[test]
     fn names_of_statistics_are_distinct() {
-        for name in [Statistic::name, Statistic::column] {
+        for name in [Statistic::name, Statistic::column_name] {
             let mut names = Statistic::ALL.map(name);
             names.sort_unstable();
             assert!(names.windows(2).all(|two| two[0] != two[1]), "{names:?}");
@@ -250,7 +250,7 @@ mod tests {
     fn every_array_of_rows_belongs_to_one_statistic() {
         let mut rows = Rows::default();
         for (k, statistic) in Statistic::ALL.into_iter().enumerate() {
-            match statistic.values() {
+            match statistic.accessors() {
                 StatisticAccess::F64(_, values) => values(&mut rows).push(k as f64),
                 StatisticAccess::U32(_, values) => values(&mut rows).push(k as u32),
             }

@@ -53,7 +53,7 @@ impl ViewSchedule {
     }
 
     /// Appends `count` frames that all have the views `views`: pairs (view number, camera index).
-    pub fn push(&mut self, count: usize, views: &[(u32, u32)]) {
+    pub fn push_frames(&mut self, count: usize, views: &[(u32, u32)]) {
         let extends_last_run = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
         if count > 0 && !extends_last_run {
             self.runs.push(ViewRun { frame: self.frames, view: self.views.len() });
@@ -88,7 +88,7 @@ impl ViewSchedule {
     }
 
     /// Returns the number M of (frame, view) pairs, which is the number of views summed over all frames.
-    pub fn pairs(&self) -> usize {
+    pub fn pair_count(&self) -> usize {
         (0..self.runs.len()).map(|run| self.run_length(run) * self.views_of_run(run).len()).sum()
     }
 
@@ -98,7 +98,7 @@ impl ViewSchedule {
     }
 
     /// Returns the indices of the cameras that see at least one frame, increasing.
-    pub fn used(&self) -> Vec<u32> {
+    pub fn used_cameras(&self) -> Vec<u32> {
         let mut used: Vec<u32> = self.views.iter().map(|&(_, camera)| camera).collect();
         used.sort_unstable();
         used.dedup();
@@ -137,14 +137,14 @@ mod tests {
         let mut schedule = ViewSchedule::default();
         let mut expected: Vec<&[(u32, u32)]> = Vec::new();
         for (count, views) in pushed {
-            schedule.push(count, views);
+            schedule.push_frames(count, views);
             expected.extend(std::iter::repeat_n(views, count));
         }
         assert_eq!(schedule.iter().collect::<Vec<_>>(), expected);
         assert!(expected.iter().enumerate().all(|(frame, views)| schedule.views(frame) == *views));
-        assert_eq!((schedule.frames(), schedule.pairs(), schedule.max_views_per_frame()), (10, 10, 2));
-        assert_eq!((schedule.runs.len(), schedule.used()), (5, vec![0, 1]));
-        assert_eq!((ViewSchedule::default().frames(), ViewSchedule::default().pairs()), (0, 0));
+        assert_eq!((schedule.frames(), schedule.pair_count(), schedule.max_views_per_frame()), (10, 10, 2));
+        assert_eq!((schedule.runs.len(), schedule.used_cameras()), (5, vec![0, 1]));
+        assert_eq!((ViewSchedule::default().frames(), ViewSchedule::default().pair_count()), (0, 0));
     }
 
     #[test]
@@ -153,7 +153,7 @@ mod tests {
             let mut schedule = ViewSchedule::default();
             for frame in 0..frames {
                 let views_of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, frame)).collect();
-                schedule.push(1, &views_of_frame);
+                schedule.push_frames(1, &views_of_frame);
             }
             let held =
                 schedule.runs.capacity() * size_of::<ViewRun>() + schedule.views.capacity() * size_of::<(u32, u32)>();

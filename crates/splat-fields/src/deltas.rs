@@ -99,7 +99,7 @@ impl Deltas {
     ///
     /// The result is exact up to rounding, and for rotations up to the length of the quaternion. If a mask or a
     /// rotation delta is zero, no stored value leads to `state`, and the result is not finite.
-    pub fn solve(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
+    pub fn invert(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);
             let to = raw.column_mut(column);

@@ -23,7 +23,7 @@ use super::voxel::VoxelMask;
 pub struct FieldConfig {
     /// Attributes that the field changes, because the option that turns their head off (`no_dx`, `no_ds`, `no_dr`,
     /// `no_do`, `no_dshs`) is false.
-    pub active: Attributes,
+    pub deformed_attributes: Attributes,
     /// Whether an additional head computes a mask, a factor on the stored attributes of each Gaussian. If true,
     /// `empty_voxel` is ignored.
     pub static_mlp: bool,
@@ -73,7 +73,7 @@ pub struct Field {
 
 /// Results for one block of Gaussians that do not depend on time: the first part of evaluating a field.
 #[derive(Debug, Clone)]
-pub struct Prepared {
+pub struct PreparedPositions {
     rows: usize,
     input: PreparedInput,
     /// Mask of each Gaussian from the voxel grid; `None` if the field has no voxel grid.
@@ -89,7 +89,7 @@ enum PreparedInput {
 
 /// Reusable buffers for the outputs of the layers of a field. Each reader of frames has its own.
 #[derive(Debug, Clone, Default)]
-pub struct Scratch {
+pub struct LayerBuffers {
     features: Vec<CacheLine>,
     trunk: [Vec<CacheLine>; 2],
     hidden: Vec<CacheLine>,
@@ -133,7 +133,7 @@ impl Field {
 
         let shape = Gaussians::zeros(0, sh_degree);
         let mut wanted: Vec<_> = config
-            .active
+            .deformed_attributes
             .iter()
             .map(|column| (Some(column), head_name(column), shape.column(column).width()))
             .collect();
@@ -156,8 +156,8 @@ impl Field {
     }
 
     /// Returns the attributes that the field changes with time.
-    pub fn active(&self) -> Attributes {
-        self.config.active
+    pub fn deformed_attributes(&self) -> Attributes {
+        self.config.deformed_attributes
     }
 
     /// Returns whether the field has a mask, a factor on the stored attributes of each Gaussian.
@@ -170,7 +170,7 @@ impl Field {
         &self.config
     }
 
-    /// Returns the bytes of memory per Gaussian that [`Prepared`] takes.
+    /// Returns the bytes of memory per Gaussian that [`PreparedPositions`] takes.
     pub fn bytes_per_gaussian(&self) -> usize {
         let input = self.planes.as_ref().map_or(12, Planes::bytes_per_gaussian);
         input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
@@ -184,8 +184,8 @@ impl Field {
 
     /// Computes the part of the evaluation that does not depend on time, for Gaussians at the stored positions
     /// `position` (`[3, N]`).
-    pub fn prepare(&self, position: &AttributeValues) -> Prepared {
-        Prepared {
+    pub fn prepare(&self, position: &AttributeValues) -> PreparedPositions {
+        PreparedPositions {
             rows: position.len(),
             input: match &self.planes {
                 Some(planes) => PreparedInput::Planes(planes.prepare(position)),
@@ -206,10 +206,10 @@ impl Field {
     /// Fails if `time` is not finite, or if `out` has another SH degree than the field.
     pub fn deltas(
         &self,
-        prepared: &Prepared,
+        prepared: &PreparedPositions,
         time: f64,
         want: Attributes,
-        scratch: &mut Scratch,
+        scratch: &mut LayerBuffers,
         out: &mut Deltas,
     ) -> Result<()> {
         if !time.is_finite() {
@@ -217,7 +217,7 @@ impl Field {
                 "time of a deformation field: expected a finite number, found {time}"
             )));
         }
-        let want = want & self.config.active;
+        let want = want & self.config.deformed_attributes;
         if let Some(head) = self.heads.iter().find(|head| {
             head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
         }) {
@@ -259,10 +259,10 @@ impl Field {
     #[target_feature(enable = "avx2,fma")]
     fn evaluate_fma(
         &self,
-        prepared: &Prepared,
+        prepared: &PreparedPositions,
         time: f32,
         lines: &[TimeLines],
-        scratch: &mut Scratch,
+        scratch: &mut LayerBuffers,
         out: &mut Deltas,
     ) {
         self.evaluate::<true>(prepared, time, lines, scratch, out);
@@ -273,13 +273,13 @@ impl Field {
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &self,
-        prepared: &Prepared,
+        prepared: &PreparedPositions,
         time: f32,
         lines: &[TimeLines],
-        scratch: &mut Scratch,
+        scratch: &mut LayerBuffers,
         out: &mut Deltas,
     ) {
-        let Scratch { features, trunk, hidden } = scratch;
+        let LayerBuffers { features, trunk, hidden } = scratch;
         for start in (0..prepared.rows).step_by(LANES) {
             let lanes = LANES.min(prepared.rows - start);
             match (&self.planes, &prepared.input) {

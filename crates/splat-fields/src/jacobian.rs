@@ -9,7 +9,7 @@
 //! [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
-use super::field::{Field, Head, Mask, Scratch, add_frequencies, position_time_features};
+use super::field::{Field, Head, LayerBuffers, Mask, add_frequencies, position_time_features};
 use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
@@ -46,7 +46,7 @@ impl Field {
                 "time of a deformation field: expected a finite number, found {time}"
             )));
         }
-        let want = self.config.active & want;
+        let want = self.config.deformed_attributes & want;
         let mut found = Jacobian::default();
         if let Mask::None = self.mask {
             let head = self.heads.iter().find(|head| head.column == Some(Attributes::POSITION));
@@ -61,7 +61,7 @@ impl Field {
         };
         if !held.is_empty() {
             let mut deltas = Deltas::new(raw.sh_degree());
-            self.deltas(&self.prepare(&raw.position), time, held, &mut Scratch::default(), &mut deltas)?;
+            self.deltas(&self.prepare(&raw.position), time, held, &mut LayerBuffers::default(), &mut deltas)?;
             deltas.jacobian(&raw.rotation, &mut found);
         }
         Ok(found)

@@ -43,8 +43,8 @@ mod tests;
 mod voxel;
 
 pub use deltas::Deltas;
-pub use field::{Field, FieldConfig, Prepared, Scratch};
-pub use network::{Encoded, Network, PredictedMotion};
+pub use field::{Field, FieldConfig, LayerBuffers, PreparedPositions};
+pub use network::{EncodedPositions, Network, PredictedMotion};
 pub use planes::{Box3, Tap, tap, unread_rows};
 pub use tensors::{Tensor, Tensors};
 

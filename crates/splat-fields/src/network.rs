@@ -57,7 +57,7 @@ struct NetworkHead {
 
 /// Encoded positions of a block of Gaussians. They do not depend on time.
 #[derive(Debug, Clone, Default)]
-pub struct Encoded {
+pub struct EncodedPositions {
     rows: usize,
     /// Encodings in groups of [`LANES`] Gaussians, [`POSITION_INPUTS`] values per Gaussian; zero after the last
     /// Gaussian.
@@ -106,7 +106,7 @@ impl PredictedMotion {
 }
 
 impl Network {
-    /// Bytes of memory per Gaussian that [`Encoded`] takes.
+    /// Bytes of memory per Gaussian that [`EncodedPositions`] takes.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * POSITION_INPUTS;
 
     /// Builds the network from the tensors of the file `path` whose names begin with `prefix`. The tensors give the
@@ -197,7 +197,7 @@ impl Network {
     }
 
     /// Returns the attributes that the network changes, because it has a head (output layer) for them.
-    pub fn active(&self) -> Attributes {
+    pub fn deformed_attributes(&self) -> Attributes {
         self.heads.iter().map(|head| head.column).collect()
     }
 
@@ -218,7 +218,7 @@ impl Network {
     /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for k = 0; the
     /// double-angle formulas then give those for k + 1 from those for k. Each doubling doubles the error, from 1e-16 at
     /// first to 1e-13 at the last octave.
-    pub fn encode(&self, position: &AttributeValues) -> Encoded {
+    pub fn encode(&self, position: &AttributeValues) -> EncodedPositions {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
         for (axis, row) in (0..3).flat_map(|axis| (0..rows).map(move |row| (axis, row))) {
@@ -228,7 +228,7 @@ impl Network {
                 out[3 * k + axis].0[lane] = value;
             }
         }
-        Encoded { rows, values }
+        EncodedPositions { rows, values }
     }
 
     /// Computes into `out` the motion of the attributes `want` at `time`. The time is rounded to f32, as in the code of
@@ -236,7 +236,13 @@ impl Network {
     ///
     /// # Errors
     /// Fails if `time` is not finite.
-    pub fn motion(&self, encoded: &Encoded, time: f64, want: Attributes, out: &mut PredictedMotion) -> Result<()> {
+    pub fn motion(
+        &self,
+        encoded: &EncodedPositions,
+        time: f64,
+        want: Attributes,
+        out: &mut PredictedMotion,
+    ) -> Result<()> {
         let time = checked_time(time)?;
         for head in self.heads.iter().filter(|head| want.contains(head.column)) {
             let column = out.column_mut(head.column);
@@ -261,7 +267,7 @@ impl Network {
     ///
     /// # Errors
     /// Fails if `time` is not finite.
-    pub fn slopes(&self, position: &AttributeValues, time: f64) -> Result<AttributeValues> {
+    pub fn warp_jacobian(&self, position: &AttributeValues, time: f64) -> Result<AttributeValues> {
         let time = checked_time(time)?;
         let encoded = self.encode(position);
         let outputs = if self.predicts_screw_motion() { 6 } else { 3 };
@@ -279,21 +285,27 @@ impl Network {
     /// Calls [`Network::evaluate`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
+    fn evaluate_fma(&self, encoded: &EncodedPositions, time: f32, want: Attributes, out: &mut PredictedMotion) {
         self.evaluate::<true>(encoded, time, want, out);
     }
 
     /// Calls [`Network::differentiate`], compiled for the instruction sets AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn differentiate_fma(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
+    fn differentiate_fma(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
         self.differentiate::<true>(encoded, time, out);
     }
 
     /// Computes the motion of the attributes `want` into `out`. The compiler inlines this function and its callees into
     /// one copy per instruction set; `FMA` says whether fused multiply-adds are used.
     #[inline(always)]
-    fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
+    fn evaluate<const FMA: bool>(
+        &self,
+        encoded: &EncodedPositions,
+        time: f32,
+        want: Attributes,
+        out: &mut PredictedMotion,
+    ) {
         let (encoded_time, mut scratch) = (self.encode_time::<FMA>(time), NetworkScratch::default());
         for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
             let NetworkScratch { input, last, spare } = &mut scratch;
@@ -334,7 +346,7 @@ impl Network {
     /// Computes the derivatives of the position outputs with respect to the position into `out`, by one forward pass
     /// and one backward pass per output.
     #[inline(always)]
-    fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
+    fn differentiate<const FMA: bool>(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
         let encoded_time = self.encode_time::<FMA>(time);
         let encodings = POSITION_INPUTS + encoded_time.len();
         let mut activations: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];

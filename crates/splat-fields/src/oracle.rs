@@ -151,7 +151,7 @@ impl Oracle<'_> {
             1.0
         };
         let deform = |column: Attributes, name: &str, raw: &[f64]| -> Vec<f64> {
-            if !config.active.contains(column) {
+            if !config.deformed_attributes.contains(column) {
                 return raw.to_vec();
             }
             let delta = self.head(name, &hidden);

@@ -25,9 +25,9 @@ const WIDTH: usize = 22;
 const CHANNELS: usize = 5;
 
 /// Returns options of a field in which every attribute is deformed and every other option is off.
-pub fn plain() -> FieldConfig {
+pub fn plain_config() -> FieldConfig {
     FieldConfig {
-        active: Attributes::all(),
+        deformed_attributes: Attributes::all(),
         static_mlp: false,
         empty_voxel: false,
         grid_pe: 0,
@@ -39,7 +39,7 @@ pub fn plain() -> FieldConfig {
 /// Returns a state dict with random weights for a field with the options `config`, `depth` layers in its trunk (the MLP
 /// shared by all attributes), and SH degree 3. Feature planes have a different resolution along each axis, so that a
 /// test fails if axes are swapped.
-pub fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
+pub fn random_tensors(config: &FieldConfig, depth: usize) -> Tensors {
     let mut noise = Noise(7);
     let mut tensors = Tensors::new();
     let mut add = |name: &str, shape: &[usize], scale: f32| {

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use super::*;
 use crate::oracle::{Oracle, Parameters};
-use crate::synthetic::{Noise, plain, tensors};
+use crate::synthetic::{Noise, plain_config, random_tensors};
 use splat_core::{AttributeValues, Attributes, Gaussians, Gradients};
 
 /// Returns random stored Gaussians, some of them outside the box that the feature planes cover.
@@ -19,7 +19,7 @@ fn random_gaussians(len: usize) -> Gaussians {
 /// `want`.
 fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
-    field.deltas(&field.prepare(&raw.position), time, want, &mut Scratch::default(), &mut deltas).unwrap();
+    field.deltas(&field.prepare(&raw.position), time, want, &mut LayerBuffers::default(), &mut deltas).unwrap();
     let mut state = Gaussians::zeros(0, 3);
     deltas.apply(raw, want, &mut state);
     (state, deltas)
@@ -27,7 +27,7 @@ fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gauss
 
 /// Builds a deformation field with random weights and `depth` layers in its trunk.
 fn build(config: &FieldConfig, depth: usize) -> Field {
-    Field::new(&tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
+    Field::new(&random_tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
 }
 
 /// Returns all components of an attribute of Gaussian `i`.
@@ -38,7 +38,7 @@ fn values(column: &AttributeValues, i: usize) -> Vec<f64> {
 /// Asserts that the attributes that a field computes for random Gaussians match the f64 reference (oracle). `what`
 /// names the tested case in failures.
 fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
-    let tensors = tensors(&config, depth);
+    let tensors = random_tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
     let field = build(&config, depth);
     let raw = random_gaussians(40);
@@ -69,21 +69,25 @@ fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
 
 #[test]
 fn every_flag_matches_the_f64_oracle() {
-    assert_matches_oracle("plain", plain(), 1);
-    assert_matches_oracle("static_mlp", FieldConfig { static_mlp: true, ..plain() }, 1);
-    assert_matches_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1);
+    assert_matches_oracle("plain", plain_config(), 1);
+    assert_matches_oracle("static_mlp", FieldConfig { static_mlp: true, ..plain_config() }, 1);
+    assert_matches_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain_config() }, 1);
     assert_matches_oracle(
         "static_mlp over empty_voxel",
-        FieldConfig { static_mlp: true, empty_voxel: true, ..plain() },
+        FieldConfig { static_mlp: true, empty_voxel: true, ..plain_config() },
         1,
     );
-    assert_matches_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 1);
-    assert_matches_oracle("grid_pe of 1 has no effect", FieldConfig { grid_pe: 1, ..plain() }, 1);
-    assert_matches_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 1);
-    assert_matches_oracle("apply_rotation", FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }, 1);
+    assert_matches_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain_config() }, 1);
+    assert_matches_oracle("grid_pe of 1 has no effect", FieldConfig { grid_pe: 1, ..plain_config() }, 1);
+    assert_matches_oracle("no_grid", FieldConfig { no_grid: true, ..plain_config() }, 1);
+    assert_matches_oracle(
+        "apply_rotation",
+        FieldConfig { apply_rotation: true, static_mlp: true, ..plain_config() },
+        1,
+    );
     assert_matches_oracle(
         "everything",
-        FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() },
+        FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain_config() },
         3,
     );
 }
@@ -91,22 +95,30 @@ fn every_flag_matches_the_f64_oracle() {
 #[test]
 fn every_trunk_depth_matches_the_f64_oracle() {
     for depth in [1, 2, 4] {
-        assert_matches_oracle(&format!("depth {depth}"), plain(), depth);
+        assert_matches_oracle(&format!("depth {depth}"), plain_config(), depth);
     }
 }
 
 #[test]
 fn attributes_without_a_head_are_raw_and_unmasked() {
     for column in Attributes::all().iter() {
-        let config = FieldConfig { active: Attributes::all().difference(column), static_mlp: true, ..plain() };
+        let config = FieldConfig {
+            deformed_attributes: Attributes::all().difference(column),
+            static_mlp: true,
+            ..plain_config()
+        };
         assert_matches_oracle(&format!("without {}", column.name()), config, 1);
     }
-    assert_matches_oracle("no head at all", FieldConfig { active: Attributes::empty(), ..plain() }, 1);
+    assert_matches_oracle(
+        "no head at all",
+        FieldConfig { deformed_attributes: Attributes::empty(), ..plain_config() },
+        1,
+    );
 }
 
 #[test]
 fn states_do_not_depend_on_block_or_requested_attributes() {
-    let config = FieldConfig { static_mlp: true, ..plain() };
+    let config = FieldConfig { static_mlp: true, ..plain_config() };
     let field = build(&config, 2);
     let raw = random_gaussians(1100);
     let (all, _) = states(&field, &raw, 0.6, Attributes::all());
@@ -143,12 +155,12 @@ fn states_do_not_depend_on_block_or_requested_attributes() {
 #[test]
 fn solve_inverts_apply() {
     for apply_rotation in [false, true] {
-        let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain() }, 1);
+        let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain_config() }, 1);
         let raw = random_gaussians(50);
         let (state, deltas) = states(&field, &raw, 0.4, Attributes::all());
         let mask = deltas.mask.as_ref().unwrap();
         let mut solved = Gaussians::zeros(0, 3);
-        deltas.solve(&state, Attributes::all(), &mut solved);
+        deltas.invert(&state, Attributes::all(), &mut solved);
         let mut again = Gaussians::zeros(0, 3);
         deltas.apply(&solved, Attributes::all(), &mut again);
         for column in Attributes::all().iter() {
@@ -170,7 +182,7 @@ fn solve_inverts_apply() {
 
 #[test]
 fn nan_position_affects_no_other_gaussian() {
-    let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
+    let field = build(&FieldConfig { empty_voxel: true, ..plain_config() }, 1);
     let raw = random_gaussians(20);
     let (clean, _) = states(&field, &raw, 0.5, Attributes::all());
     let mut broken = raw.clone();
@@ -186,7 +198,7 @@ fn nan_position_affects_no_other_gaussian() {
 
 #[test]
 fn a_zero_quaternion_product_stays_zero() {
-    let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 1);
+    let field = build(&FieldConfig { apply_rotation: true, ..plain_config() }, 1);
     let mut raw = random_gaussians(3);
     raw.rotation.set_row(1, [0.0; 4]);
     assert_eq!(states(&field, &raw, 0.5, Attributes::all()).0.rotation.row::<4>(1), [0.0; 4]);
@@ -194,13 +206,13 @@ fn a_zero_quaternion_product_stays_zero() {
 
 #[test]
 fn an_empty_block_is_empty() {
-    let field = build(&plain(), 1);
+    let field = build(&plain_config(), 1);
     assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Attributes::all()).0.is_empty());
 }
 
 /// Returns the error message of building a field from tensors that `change` has altered.
 fn field_error(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
-    let mut tensors = tensors(&config, 1);
+    let mut tensors = random_tensors(&config, 1);
     change(&mut tensors);
     Field::new(&tensors, config, 3, Path::new("synthetic.pth")).expect_err("must be refused").to_string()
 }
@@ -215,19 +227,19 @@ fn assert_contains(message: &str, parts: &[&str]) {
 #[test]
 fn missing_tensor_is_named_with_its_flag() {
     let name = "deformation_net.opacity_deform.3.bias";
-    let message = field_error(plain(), |tensors| drop(tensors.remove(name)));
+    let message = field_error(plain_config(), |tensors| drop(tensors.remove(name)));
     assert_contains(&message, &["synthetic.pth", name, "no_do=False", "none"]);
-    let message = field_error(FieldConfig { empty_voxel: true, ..plain() }, |tensors| {
+    let message = field_error(FieldConfig { empty_voxel: true, ..plain_config() }, |tensors| {
         drop(tensors.remove("deformation_net.empty_voxel.grid"));
     });
     assert_contains(&message, &["empty_voxel.grid", "empty_voxel=True"]);
-    assert_contains(&field_error(plain(), Tensors::clear), &["deformation_net.grid.aabb"]);
+    assert_contains(&field_error(plain_config(), Tensors::clear), &["deformation_net.grid.aabb"]);
 }
 
 #[test]
 fn wrong_tensor_shape_is_named_with_both_shapes() {
     let reshape = |name: &'static str, shape: Vec<usize>| {
-        field_error(plain(), move |tensors| {
+        field_error(plain_config(), move |tensors| {
             let data = vec![0.0; shape.iter().product()];
             tensors.insert(format!("deformation_net.{name}"), Tensor { shape, data });
         })
@@ -245,7 +257,7 @@ fn wrong_tensor_shape_is_named_with_both_shapes() {
 
 #[test]
 fn weights_that_are_not_finite_are_refused() {
-    let message = field_error(plain(), |tensors| {
+    let message = field_error(plain_config(), |tensors| {
         tensors.get_mut("deformation_net.feature_out.0.weight").unwrap().data[17] = f32::NAN;
     });
     assert_contains(&message, &["feature_out.0.weight", "finite", "NaN at element 17"]);
@@ -253,8 +265,8 @@ fn weights_that_are_not_finite_are_refused() {
 
 #[test]
 fn unused_tensors_may_have_any_content() {
-    let config = FieldConfig { active: Attributes::POSITION, ..plain() };
-    let mut tensors = tensors(&config, 1);
+    let config = FieldConfig { deformed_attributes: Attributes::POSITION, ..plain_config() };
+    let mut tensors = random_tensors(&config, 1);
     tensors.insert("timenet.0.weight".into(), Tensor { shape: vec![1], data: vec![f32::NAN] });
     tensors.insert("deformation_net.shs_deform.1.weight".into(), Tensor { shape: vec![], data: vec![f32::NAN] });
     Field::new(&tensors, config, 3, Path::new("synthetic.pth")).unwrap();
@@ -262,10 +274,10 @@ fn unused_tensors_may_have_any_content() {
 
 #[test]
 fn times_that_are_not_finite_are_refused() {
-    let field = build(&plain(), 1);
+    let field = build(&plain_config(), 1);
     let prepared = field.prepare(&random_gaussians(1).position);
     let error = field
-        .deltas(&prepared, f64::NAN, Attributes::all(), &mut Scratch::default(), &mut Deltas::new(3))
+        .deltas(&prepared, f64::NAN, Attributes::all(), &mut LayerBuffers::default(), &mut Deltas::new(3))
         .expect_err("must be refused");
     assert_contains(&error.to_string(), &["NaN"]);
 }
@@ -303,7 +315,7 @@ fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients)
 /// Asserts that the derivatives of each attribute at a time with respect to its own stored values match finite
 /// differences of the f64 reference (oracle), for the attributes `columns`.
 fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Attributes) {
-    let tensors = tensors(&config, depth);
+    let tensors = random_tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
     let (field, raw) = (build(&config, depth), random_gaussians(40));
     let mut clipped = 0;
@@ -335,36 +347,43 @@ fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize
             }
         }
     }
-    let planes =
-        columns.contains(Attributes::POSITION) && !config.no_grid && config.active.contains(Attributes::POSITION);
+    let planes = columns.contains(Attributes::POSITION)
+        && !config.no_grid
+        && config.deformed_attributes.contains(Attributes::POSITION);
     assert!(!planes || clipped > 10, "{what}: only {clipped} coordinates lie outside the box");
 }
 
 #[test]
 fn derivatives_match_finite_differences_for_every_flag() {
     let all = Attributes::all();
-    assert_derivatives_match_oracle("plain", plain(), 1, all);
-    assert_derivatives_match_oracle("depth 3", plain(), 3, Attributes::POSITION);
-    assert_derivatives_match_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 2, Attributes::POSITION);
-    assert_derivatives_match_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 2, Attributes::POSITION);
-    assert_derivatives_match_oracle("apply_rotation", FieldConfig { apply_rotation: true, ..plain() }, 1, all);
-    let fixed = FieldConfig { active: all.difference(Attributes::POSITION | Attributes::SH), ..plain() };
+    assert_derivatives_match_oracle("plain", plain_config(), 1, all);
+    assert_derivatives_match_oracle("depth 3", plain_config(), 3, Attributes::POSITION);
+    assert_derivatives_match_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain_config() }, 2, Attributes::POSITION);
+    assert_derivatives_match_oracle(
+        "no_grid",
+        FieldConfig { no_grid: true, ..plain_config() },
+        2,
+        Attributes::POSITION,
+    );
+    assert_derivatives_match_oracle("apply_rotation", FieldConfig { apply_rotation: true, ..plain_config() }, 1, all);
+    let fixed =
+        FieldConfig { deformed_attributes: all.difference(Attributes::POSITION | Attributes::SH), ..plain_config() };
     assert_derivatives_match_oracle("without two heads", fixed, 1, all);
     // If the field has a mask, the Jacobian of positions neglects the derivative of the deltas, so positions are not
     // tested.
     let masked = all.difference(Attributes::POSITION);
     assert_derivatives_match_oracle(
         "static_mlp",
-        FieldConfig { static_mlp: true, apply_rotation: true, ..plain() },
+        FieldConfig { static_mlp: true, apply_rotation: true, ..plain_config() },
         1,
         masked,
     );
-    assert_derivatives_match_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1, masked);
+    assert_derivatives_match_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain_config() }, 1, masked);
 }
 
 #[test]
 fn derivative_of_masked_positions_is_the_mask() {
-    let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
+    let field = build(&FieldConfig { empty_voxel: true, ..plain_config() }, 1);
     let raw = random_gaussians(40);
     let (_, deltas) = states(&field, &raw, 0.3, Attributes::all());
     let by_state = noisy_gradients(raw.len(), Attributes::POSITION);
@@ -377,7 +396,7 @@ fn derivative_of_masked_positions_is_the_mask() {
 
 #[test]
 fn derivatives_do_not_depend_on_blocks() {
-    let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 2);
+    let field = build(&FieldConfig { apply_rotation: true, ..plain_config() }, 2);
     let raw = random_gaussians(300);
     let whole = field.jacobian(&raw, 0.6, Attributes::all()).unwrap();
     for block in [1, 16, 37] {
@@ -392,7 +411,7 @@ fn derivatives_do_not_depend_on_blocks() {
 
 #[test]
 fn derivatives_at_odd_positions_are_finite() {
-    for config in [plain(), FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }] {
+    for config in [plain_config(), FieldConfig { apply_rotation: true, static_mlp: true, ..plain_config() }] {
         let field = build(&config, 1);
         let mut raw = random_gaussians(8);
         for (i, value) in [f32::NAN, f32::INFINITY, f32::MAX, 0.0].into_iter().enumerate() {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Contribution {
     /// Contribution of each Gaussian: its weight alpha · transmittance summed over all pixels, in units of 2⁻²⁸ pixel
-    /// ([`Contribution::UNIT`]).
+    /// ([`Contribution::SUM_UNIT`]).
     ///
     /// Within a view, weights are summed per 16×16 tile in f32, in a fixed order, and each tile sum is rounded to a
     /// unit: relative error below 3e-6, absolute error below 2e-9 pixels per tile. A sum stops growing at 2⁶⁴ units
@@ -22,7 +22,7 @@ pub struct Contribution {
 impl Contribution {
     /// Unit of [`Contribution::sum`]: 2⁻²⁸ pixels. The smallest weight in a pixel, 1e-4 / 255, is 105 units. A sum can
     /// hold 800,000 fully covered images of 320×256.
-    pub const UNIT: f64 = 1.0 / (1u64 << 28) as f64;
+    pub const SUM_UNIT: f64 = 1.0 / (1u64 << 28) as f64;
 
     /// Creates zero contributions of `len` Gaussians.
     pub fn new(len: usize) -> Self {
@@ -40,8 +40,8 @@ impl Contribution {
     }
 
     /// Returns the contribution of Gaussian `i`, alpha · transmittance summed over all pixels, in pixels.
-    pub fn pixels(&self, i: usize) -> f64 {
-        self.sum[i] as f64 * Self::UNIT
+    pub fn in_pixels(&self, i: usize) -> f64 {
+        self.sum[i] as f64 * Self::SUM_UNIT
     }
 
     /// Adds `other`, the contributions of the same Gaussians in other views.
@@ -61,7 +61,7 @@ impl Contribution {
     /// Adds the contribution of Gaussian `i` in one tile: the `sum` of its weights over the pixels, and their largest,
     /// `max`.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
-        let units = (f64::from(sum) * (1.0 / Self::UNIT) + 0.5) as u64;
+        let units = (f64::from(sum) * (1.0 / Self::SUM_UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
         self.max[i] = self.max[i].max(max);
     }

@@ -6,7 +6,7 @@
 //! of a feature that is 1 everywhere.
 
 use super::render;
-use splat_core::{AttributeValues, Camera, Gaussians, harmonic};
+use splat_core::{AttributeValues, Camera, Gaussians, sh_from_color};
 
 /// Computes for each pixel the sum Σ w·f over the Gaussians, where f is a feature value of a Gaussian and w its weight
 /// in the pixel, as in the blending of colors.
@@ -20,7 +20,7 @@ pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera:
     let (planes, pixels) = (features.width(), camera.width as usize * camera.height as usize);
     assert_eq!(features.len(), gaussians.len(), "expected as many features as Gaussians");
     let mut state = Gaussians { sh: AttributeValues::zeros(3, gaussians.len()), ..gaussians.clone() };
-    state.sh.planes_mut().fill(harmonic(1.0));
+    state.sh.planes_mut().fill(sh_from_color(1.0));
     let opacity = render(&state, camera, [0.0; 3]).data;
     let mut blended = vec![0.0; planes * pixels];
     for first in (0..planes).step_by(3) {
@@ -30,7 +30,7 @@ pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera:
             let [least, span] = spans[c];
             for (to, &feature) in state.sh.plane_mut(c).iter_mut().zip(features.plane(plane)) {
                 let value = if feature.is_finite() { f64::from(feature) } else { least };
-                *to = harmonic((value - least) / span);
+                *to = sh_from_color((value - least) / span);
             }
         }
         let image = render(&state, camera, [0.0; 3]).data;
@@ -92,7 +92,7 @@ mod tests {
         let (mut state, camera) = scene();
         let mut colors = features(3);
         colors.planes_mut().iter_mut().for_each(|x| *x = x.abs());
-        let harmonics = colors.planes().iter().map(|&x| harmonic(x.into())).collect();
+        let harmonics = colors.planes().iter().map(|&x| sh_from_color(x.into())).collect();
         state.sh = AttributeValues::from_planes(3, harmonics);
         let expected = render(&state, &camera, [0.0; 3]).data;
         assert!(expected.iter().any(|&x| x > 0.5));

@@ -68,7 +68,7 @@ pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 
 /// Returns the name of the instruction set with which this machine renders, such as "AVX2".
-pub fn instructions() -> &'static str {
+pub fn instruction_set() -> &'static str {
     blend::BlendKernel::fastest().name()
 }
 

@@ -20,7 +20,7 @@ use super::project::Splat;
 /// Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
-    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::UNIT`]). Within a view, errors are summed per
+    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed per
     /// 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
     /// Floor: color difference (norm over red, green, blue) whose square is added to the squared difference between a
@@ -31,7 +31,7 @@ pub struct RemovalError {
 impl RemovalError {
     /// Unit of [`RemovalError::sum`]: a squared error of 2⁻³⁶. A sum can hold 3000 completely changed renders of
     /// 320×256 pixels.
-    pub const UNIT: f64 = 1.0 / (1u64 << 36) as f64;
+    pub const SUM_UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
     /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. `contrast_floor` is the field of
     /// this name.
@@ -79,7 +79,7 @@ impl RemovalError {
 
     /// Adds `error`, the removal error of Gaussian `i` in one tile of a view.
     pub(super) fn add(&mut self, i: usize, error: f32) {
-        let units = (f64::from(error) * (1.0 / Self::UNIT) + 0.5) as u64;
+        let units = (f64::from(error) * (1.0 / Self::SUM_UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
     }
 }
@@ -163,7 +163,7 @@ mod tests {
     fn errors(scene: &Gaussians, floor: f32) -> Vec<f64> {
         let mut found = RemovalError::new(scene.len(), floor);
         Renderer::new().removal_error(scene, &camera(), BACKGROUND, &mut found);
-        found.sum.iter().map(|&units| units as f64 * RemovalError::UNIT).collect()
+        found.sum.iter().map(|&units| units as f64 * RemovalError::SUM_UNIT).collect()
     }
 
     #[test]

@@ -111,9 +111,9 @@ fn constant_tile_stores_one_frame_and_minus_zero_breaks_it() {
 #[test]
 fn stats_cover_finite_values_only() {
     let got = stats(&[f32::NAN, -3.5, f32::INFINITY, 7.0, f32::NEG_INFINITY].map(f32::to_bits));
-    assert_eq!(got, Stats { min: -3.5, max: 7.0, non_finite: 3 });
+    assert_eq!(got, TileStats { min: -3.5, max: 7.0, non_finite: 3 });
     let none = stats(&[f32::NAN.to_bits()]);
-    assert_eq!(none, Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite: 1 });
+    assert_eq!(none, TileStats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite: 1 });
     let zero = stats(&[(-0.0f32).to_bits()]);
     assert_eq!((zero.min.to_bits(), zero.max.to_bits()), (0, 0));
 }

@@ -215,7 +215,7 @@ impl Reader {
 
 impl TileFrames {
     /// Returns the bytes of memory that the loaded tile takes.
-    pub fn memory(&self) -> usize {
+    pub fn memory_bytes(&self) -> usize {
         self.decoder.memory()
     }
 

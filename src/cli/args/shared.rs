@@ -8,8 +8,8 @@ use super::values::{parse_bytes, parse_duration, parse_size, parse_times};
 use super::{CACHE, CAMERAS, MACHINE};
 use splatsieve::cache::Shard;
 use splatsieve::files::atomic::Replace;
-use splatsieve::files::cameras::Times;
-use splatsieve::models::Link;
+use splatsieve::files::cameras::TimesSource;
+use splatsieve::models::LinkMode;
 
 /// Input of a command.
 #[derive(Debug, Args)]
@@ -130,7 +130,7 @@ pub(in crate::cli) struct CameraFile {
     /// sees every frame; or a CSV file of name,time [default: names for COLMAP images with numbers and an input in
     /// motion, else none]
     #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
-    pub(in crate::cli) times: Option<Times>,
+    pub(in crate::cli) times: Option<TimesSource>,
 }
 
 /// Cameras and the split that is used.
@@ -156,13 +156,13 @@ pub(in crate::cli) enum LinkArg {
     Never,
 }
 
-impl From<LinkArg> for Link {
-    fn from(given: LinkArg) -> Link {
+impl From<LinkArg> for LinkMode {
+    fn from(given: LinkArg) -> LinkMode {
         match given {
-            LinkArg::Auto => Link::Auto,
-            LinkArg::Always => Link::Always,
-            LinkArg::Apart => Link::Apart,
-            LinkArg::Never => Link::Never,
+            LinkArg::Auto => LinkMode::Auto,
+            LinkArg::Always => LinkMode::Always,
+            LinkArg::Apart => LinkMode::Apart,
+            LinkArg::Never => LinkMode::Never,
         }
     }
 }

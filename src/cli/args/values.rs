@@ -1,7 +1,7 @@
 //! Parsers of option values.
 
 use splatsieve::error::quoted;
-use splatsieve::files::cameras::Times;
+use splatsieve::files::cameras::TimesSource;
 
 use crate::cli::recipe_flags::numbers;
 
@@ -48,8 +48,8 @@ pub(super) fn parse_ratio(text: &str) -> Result<f64, String> {
 }
 
 /// Parses the source of image times: `names`, `none` or the path of a table.
-pub(super) fn parse_times(text: &str) -> Result<Times, String> {
-    Ok(Times::named(text))
+pub(super) fn parse_times(text: &str) -> Result<TimesSource, String> {
+    Ok(TimesSource::parse(text))
 }
 
 /// Parses a number of bytes above 0, with an optional unit.

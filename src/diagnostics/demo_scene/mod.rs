@@ -1,4 +1,4 @@
-//! Two generated dynamic scenes: [`Playground`] for `splatsieve demo`, and [`Scene`] for tests.
+//! Two generated dynamic scenes: [`Playground`] for `splatsieve demo`, and [`DemoScene`] for tests.
 //!
 //! The test scene has one [`DemoBody`] for each property of trained scenes that the program handles, with motion in
 //! closed form: a room with needless Gaussians, rigid and non-rigid motion, fading and flashing, thin structures.
@@ -30,7 +30,7 @@ pub use playground::Playground;
 /// SH degree of both scenes: enough view dependence to exercise the code, few enough coefficients to keep the scenes small.
 const SH_DEGREE: usize = 1;
 
-/// Number of cameras of [`Scene::rig`].
+/// Number of cameras of [`DemoScene::rig`].
 const CAMERAS: u32 = 6;
 /// Index of the camera whose view is the test view. It is an inner one, so that its view lies between training views.
 const HELD_OUT: u32 = 2;
@@ -49,19 +49,19 @@ const HELD_OUT: u32 = 2;
 /// assert!(scene.members(DemoBody::Cloth).len() > 400);
 /// ```
 #[derive(Debug, Clone)]
-pub struct Scene {
+pub struct DemoScene {
     layout: BodyLayout,
     info: SequenceInfo,
 }
 
-impl Scene {
+impl DemoScene {
     /// Default number of Gaussians of the generated scene.
     pub const COUNT: usize = 6000;
     /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
     /// Returns the scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.
-    pub fn new(count: usize, frames: usize) -> Scene {
+    pub fn new(count: usize, frames: usize) -> DemoScene {
         let last = frames.saturating_sub(1).max(1) as f64;
         let info = SequenceInfo {
             count,
@@ -69,11 +69,11 @@ impl Scene {
             sh_degree: SH_DEGREE,
             varying: Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY,
         };
-        Scene { layout: BodyLayout::new(count), info }
+        DemoScene { layout: BodyLayout::new(count), info }
     }
 
     /// Returns the ids of a body's Gaussians. Bodies follow one another in the order of [`DemoBody::ALL`].
-    pub fn members(&self, body: DemoBody) -> Range<usize> {
+    pub fn body_ids(&self, body: DemoBody) -> Range<usize> {
         self.layout.members(body)
     }
 
@@ -100,7 +100,7 @@ impl Scene {
     }
 }
 
-impl FrameSource for Scene {
+impl FrameSource for DemoScene {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }

@@ -5,20 +5,20 @@ use crate::model::AttributeValues;
 
 const ALPHA_MIN: f64 = 0.01;
 
-fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
+fn frame(scene: &DemoScene, ids: Ids<'_>, frame: usize) -> Gaussians {
     let mut out = Gaussians::zeros(0, SH_DEGREE);
     scene.open(ids).unwrap().read(frame, Attributes::all(), &mut out).unwrap();
     out
 }
 
 /// Returns the Gaussians of a body (object of the scene) at every frame.
-fn film(scene: &Scene, body: DemoBody) -> Vec<Gaussians> {
-    let members = scene.members(body);
+fn film(scene: &DemoScene, body: DemoBody) -> Vec<Gaussians> {
+    let members = scene.body_ids(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()
 }
 
-fn usual() -> Scene {
-    Scene::new(Scene::COUNT, Scene::FRAMES)
+fn usual() -> DemoScene {
+    DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES)
 }
 
 fn point(column: &AttributeValues, i: usize) -> DVec3 {
@@ -35,7 +35,7 @@ fn bits(column: &AttributeValues) -> Vec<u32> {
 
 #[test]
 fn gaussian_and_frame_give_the_same_bits_in_any_block() {
-    let scene = Scene::new(503, 5);
+    let scene = DemoScene::new(503, 5);
     for t in [4, 0, 2] {
         let whole = frame(&scene, Ids::Range(0..503), t);
         let some: Vec<u32> = (0..503).rev().step_by(7).collect();
@@ -63,11 +63,11 @@ fn gaussian_and_frame_give_the_same_bits_in_any_block() {
 
 #[test]
 fn scene_of_any_size_is_finite_with_unit_rotations() {
-    for (count, frames) in [(0, 3), (1, 1), (2, 2), (3, 2), (17, 3), (1000, 7), (Scene::COUNT, 3), (5, 0)] {
-        let scene = Scene::new(count, frames);
+    for (count, frames) in [(0, 3), (1, 1), (2, 2), (3, 2), (17, 3), (1000, 7), (DemoScene::COUNT, 3), (5, 0)] {
+        let scene = DemoScene::new(count, frames);
         assert_eq!((scene.info().count, scene.info().times.len()), (count, frames));
         assert!(scene.info().times.is_sorted_by(|a, b| a < b));
-        assert_eq!(DemoBody::ALL.iter().map(|&body| scene.members(body).len()).sum::<usize>(), count);
+        assert_eq!(DemoBody::ALL.iter().map(|&body| scene.body_ids(body).len()).sum::<usize>(), count);
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
             for column in Attributes::all().iter() {
@@ -191,8 +191,8 @@ fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
 #[test]
 fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_color() {
     let scene = usual();
-    let walls = frame(&scene, Ids::Range(scene.members(DemoBody::Wall)), 0);
-    let doubles = frame(&scene, Ids::Range(scene.members(DemoBody::Double)), 0);
+    let walls = frame(&scene, Ids::Range(scene.body_ids(DemoBody::Wall)), 0);
+    let doubles = frame(&scene, Ids::Range(scene.body_ids(DemoBody::Double)), 0);
     for i in 0..doubles.len() {
         let at = point(&doubles.position, i);
         let apart = |j: usize| (point(&walls.position, j) - at).length();
@@ -206,8 +206,8 @@ fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_color() {
 #[test]
 fn wires_are_needles_and_dust_is_tiny() {
     let scene = usual();
-    let wires = frame(&scene, Ids::Range(scene.members(DemoBody::Wire)), 0);
-    let dust = frame(&scene, Ids::Range(scene.members(DemoBody::Dust)), 0);
+    let wires = frame(&scene, Ids::Range(scene.body_ids(DemoBody::Wire)), 0);
+    let dust = frame(&scene, Ids::Range(scene.body_ids(DemoBody::Dust)), 0);
     for i in 0..wires.len() {
         let [long, a, b] = wires.log_scale.row::<3>(i);
         assert!(((long - a).exp() - 25.0).abs() < 1e-3 && a == b);
@@ -219,10 +219,10 @@ fn wires_are_needles_and_dust_is_tiny() {
 fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
     let scene = usual();
     let rig = scene.rig();
-    assert_eq!((rig.cameras.len(), rig.schedule(&scene.info().times, None).unwrap().pairs()), (6, 6 * 48));
-    assert_eq!(rig.schedule(&scene.info().times, Some(Split::Test)).unwrap().pairs(), 48);
+    assert_eq!((rig.cameras.len(), rig.schedule(&scene.info().times, None).unwrap().pair_count()), (6, 6 * 48));
+    assert_eq!(rig.schedule(&scene.info().times, Some(Split::Test)).unwrap().pair_count(), 48);
     for body in [DemoBody::Egg, DemoBody::Cloth, DemoBody::Fading] {
-        let state = frame(&scene, Ids::Range(scene.members(body)), 24);
+        let state = frame(&scene, Ids::Range(scene.body_ids(body)), 24);
         for camera in &rig.cameras {
             for i in 0..state.len() {
                 let p = camera.rotation * point(&state.position, i) + camera.translation;
@@ -231,7 +231,7 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
             }
         }
     }
-    let buried = frame(&scene, Ids::Range(scene.members(DemoBody::Buried)), 0);
+    let buried = frame(&scene, Ids::Range(scene.body_ids(DemoBody::Buried)), 0);
     for camera in &rig.cameras {
         for i in 0..buried.len() {
             let (eye, at) = (camera.center(), point(&buried.position, i));
@@ -244,7 +244,7 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
 
 #[test]
 fn only_wanted_columns_are_written() {
-    let scene = Scene::new(100, 2);
+    let scene = DemoScene::new(100, 2);
     let mut out = Gaussians::zeros(100, SH_DEGREE);
     scene.open(Ids::Range(0..100)).unwrap().read(1, Attributes::OPACITY | Attributes::SH, &mut out).unwrap();
     let whole = frame(&scene, Ids::Range(0..100), 1);
@@ -256,7 +256,7 @@ fn only_wanted_columns_are_written() {
 
 #[test]
 fn what_the_scene_does_not_have_is_refused() {
-    let scene = Scene::new(10, 2);
+    let scene = DemoScene::new(10, 2);
     assert!(scene.open(Ids::Range(5..11)).err().unwrap().to_string().contains("no Gaussian 10"));
     assert!(scene.open(Ids::List(&[3, 99])).err().unwrap().to_string().contains("no Gaussian 99"));
     let mut out = Gaussians::zeros(0, SH_DEGREE);

@@ -6,10 +6,10 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::metrics::psnr;
 use crate::model::{Attributes, Camera, FrameView};
-use crate::passes::{Batch, RenderedSource, show};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch};
 use crate::render::{Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::{ViewSet, pictures};
+use crate::scene::pictures::{ViewSet, select_views};
 use crate::source::Ids;
 
 /// Maximum number of views on which quality is measured.
@@ -39,7 +39,7 @@ impl Judge {
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
     pub(super) fn new(scene: &Scene) -> Result<Judge> {
-        let all = pictures(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
+        let all = select_views(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
         let count = all.len().min(PICTURES);
         let pictures: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
@@ -89,7 +89,7 @@ fn render_views(
     mut take: impl FnMut(Image),
 ) -> Result<()> {
     let cameras: &[Camera] = &scene.schedule.cameras;
-    show([subject], cameras, pictures, Batch::one_frame(&scene.limits), |views| {
+    for_each_view_batch([subject], cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
         let images: Vec<Image> =
             views.par_iter().map(|view| render(view.states[0], view.camera, scene.background)).collect();
         images.into_iter().for_each(&mut take);

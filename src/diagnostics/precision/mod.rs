@@ -21,25 +21,25 @@ use std::path::{Path, PathBuf};
 use super::whole_run::{result_name, with_training_views};
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
-use crate::evaluation::cost::Repeats;
+use crate::evaluation::cost::RepeatLimits;
 use crate::evaluation::precision::{PrecisionDiagram, PrecisionKnob};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
 use crate::model::{Rows, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::planning::InputMeta;
-use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::{Request, RunPlan, Target};
 use crate::progress::{Events, Progress};
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
-use crate::report::precision::{PAGE, page};
+use crate::report::precision::{PAGE_FILE, page};
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::statistics::pass::ScanResult;
 use crate::statistics::score::Scores;
-use crate::statistics::score::sketch::MOST_BITS;
+use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
 use judge::Judge;
 
 /// Group of settings that a diagram varies, called a knob.
@@ -47,7 +47,7 @@ use judge::Judge;
 pub enum Knob {
     /// Settings of the first ranking by renders, before the pruning rounds: the number of views, and the strides of
     /// pixels, views and frames.
-    Look,
+    FirstRanking,
     /// Settings of the pruning rounds (rank, remove the lowest, repeat): views per round, and the fraction of the
     /// Gaussians that a round keeps.
     Rounds,
@@ -66,12 +66,12 @@ pub enum Knob {
 impl Knob {
     /// Every knob (group of settings), in the order of the pipeline.
     pub const ALL: [Knob; 7] =
-        [Knob::Look, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
+        [Knob::FirstRanking, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
 
     /// Returns the name of this knob on the command line and in the results.
     pub fn name(self) -> &'static str {
         match self {
-            Knob::Look => "look",
+            Knob::FirstRanking => "look",
             Knob::Rounds => "rounds",
             Knob::Percentiles => "percentiles",
             Knob::Sums => "sums",
@@ -125,7 +125,7 @@ const MAX_SETTING_SECONDS: f64 = 10.0;
 const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
 /// Bytes of memory of the histogram for percentiles with the largest number of bits.
-const SKETCH_BYTES: u64 = 4 << (9 + MOST_BITS);
+const SKETCH_BYTES: u64 = 4 << (9 + MAX_MANTISSA_BITS);
 
 /// Bytes per Gaussian that are kept in memory between settings: statistics twice, two contributions and two scores, and
 /// sets of kept Gaussians.
@@ -144,7 +144,7 @@ struct Bench<'a> {
     judge: Judge,
     /// Number of Gaussians that every setting keeps.
     kept: usize,
-    repeats: Repeats,
+    repeats: RepeatLimits,
     /// Path of the folder for the results of complete runs; `name` is the file name of a result in it.
     scratch: &'a Path,
     name: &'a str,
@@ -170,21 +170,21 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_folder_name(&options.output, "precision")?;
-    check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
+    check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
 
     let input = with_training_views(&options.input);
     let mut scene = open_with_cameras(&input)?;
     let info = scene.source().info();
     let (gaussians, frames) = (info.count, info.times.len());
-    let kept = options.target.count(gaussians)?;
+    let kept = options.target.resolve_count(gaussians)?;
     let name = result_name(&scene)?;
     let request = Request {
         target: Some(options.target),
         ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())
     };
     let plan = RunPlan::within_memory(&request, InputMeta::from_scene(&scene), &scene.workload())?;
-    scene.keep_to(input.memory, |work, limits| {
+    scene.plan_memory(input.memory, |work, limits| {
         let mut needs = plan.estimates(work, limits);
         for need in &mut needs {
             need.per_gaussian.push(("settings", HELD_BYTES));
@@ -194,8 +194,9 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         needs
     })?;
     let work = scene.workload();
-    let reserved =
-        work.count() as u64 * (HELD_BYTES + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
+    let reserved = work.gaussian_count() as u64 * (HELD_BYTES + work.input.per_gaussian)
+        + work.input.fixed
+        + Judge::bytes(work.pixels);
     let remaining = input.memory.bytes.map(|bytes| bytes.saturating_sub(reserved));
     let memory = Budget { bytes: remaining, tell: Verbosity::Nothing };
     let input = InputOptions { memory, events: Events::IGNORED, ..input };
@@ -207,7 +208,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     }
     let chosen = chosen_knobs(options, gaussians, frames, &mut notes);
 
-    let measure = Measure::new(&options.recipe, true, UserOverrides::default());
+    let measure = MeasureStages::new(&options.recipe, true, UserOverrides::default());
     let scanned = measure.scan(&scene, &mut Journal::default())?;
     let judge = Judge::new(&scene)?;
     // The progress of hundreds of stages would hide which setting is being measured.
@@ -220,7 +221,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         work,
         recipe: &options.recipe,
         kept,
-        repeats: Repeats { most: options.runs, enough: MAX_SETTING_SECONDS },
+        repeats: RepeatLimits { most: options.runs, enough: MAX_SETTING_SECONDS },
         scratch: &staged.path().join("run"),
         name,
         progress: options.input.events.counting_task("precision", "settings"),
@@ -231,14 +232,14 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         digest: scene.input.digest()?,
         gaussians,
         frames,
-        frames_looked_at: looked_at,
-        pictures: scene.schedule.pairs(),
+        frames_scored: looked_at,
+        pictures: scene.schedule.pair_count(),
         judged: bench.judge.pictures(),
         cameras: scene.rig.origin.clone(),
         kept,
         threads: rayon::current_num_threads(),
         runs: options.runs.max(1),
-        enough: MAX_SETTING_SECONDS,
+        max_setting_seconds: MAX_SETTING_SECONDS,
         knobs: Vec::new(),
         notes,
     };
@@ -292,16 +293,16 @@ fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
     };
     write("precision.csv", found.csv())?;
     write("precision.json", found.json())?;
-    write(PAGE, page(found))?;
+    write(PAGE_FILE, page(found))?;
     // The marker file lets a later run recognize the folder as one that it may replace.
-    write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))
+    write(SUMMARY_FILE, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))
 }
 
 impl Bench<'_> {
     /// Measures all settings of `knob`; returns `None` if the scene or the recipe has none.
     fn measure_knob(&self, knob: Knob) -> Result<Option<PrecisionKnob>> {
         match knob {
-            Knob::Look => self.look(),
+            Knob::FirstRanking => self.look(),
             Knob::Rounds => self.rounds(),
             Knob::Percentiles => self.percentiles().map(Some),
             Knob::Sums => self.sums(),
@@ -324,7 +325,7 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     let (mut place, mut kept) = (0, 0);
     for views in schedule.iter() {
         let wanted = !views.is_empty() && kept < most && place == (2 * kept + 1) * seen / (2 * most);
-        thinned.push(1, if wanted { views } else { &[] });
+        thinned.push_frames(1, if wanted { views } else { &[] });
         kept += usize::from(wanted);
         place += usize::from(!views.is_empty());
     }
@@ -349,7 +350,7 @@ mod tests {
         let frames_kept = |frames: usize, most: usize| -> Vec<usize> {
             let mut schedule = ViewSchedule::default();
             for frame in 0..frames {
-                schedule.push(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
+                schedule.push_frames(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
             }
             let thinned = thin_frames(schedule, most);
             assert_eq!(thinned.frames(), frames);

@@ -7,19 +7,19 @@ use super::Bench;
 use crate::error::Result;
 use crate::evaluation::cost::Cost;
 use crate::evaluation::precision::{
-    ADDED, KEPT, PERCENTILES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, STAYING, Source, added, apart,
-    relative_l2,
+    ADDED_ERROR, COUNT_ERROR, ErrorSource, PERCENTILE_ERROR, PrecisionCurve, PrecisionKnob, PrecisionSetting,
+    RENDER_ERROR, SELECTION_DISTANCE, added_error, jaccard_distance, relative_l2,
 };
 use crate::journal::Journal;
-use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::stages::rounds::Rounds;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::{Scored, UserOverrides};
-use crate::pruning::visible::Visible;
+use crate::pruning::visible::VisibilityStage;
 use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
-use crate::statistics::score::sketch::MOST_BITS;
-use crate::statistics::score::{PercentilePasses, Quantity, Scores, score_with_passes};
+use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
+use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_with_passes};
 
 /// Numbers of views that are tried, in the first ranking and in a pruning round. Numbers above that of the existing
 /// views are skipped.
@@ -31,7 +31,7 @@ const STRIDES: [u32; 4] = [16, 8, 4, 2];
 /// Fractions of the Gaussians kept by a pruning round that are tried.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 /// Numbers of mantissa bits in the histogram for percentiles that are tried.
-const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MOST_BITS];
+const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
 /// Ranking by one setting: its errors, its cost, and the Gaussians that it keeps.
 struct TriedRanking {
@@ -55,7 +55,7 @@ impl Bench<'_> {
     /// Varies the first ranking by renders: the number of views, and the strides of pixels, views and frames. Returns
     /// `None` if the recipe does not rank by renders.
     pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
-        let all = self.scene.schedule.pairs();
+        let all = self.scene.schedule.pair_count();
         let variant = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
             let mut recipe = self.recipe.clone();
             let one = NonZeroU32::MIN;
@@ -93,7 +93,7 @@ impl Bench<'_> {
                 "The first pass over the views: contributions C and W of every Gaussian from some of the views, and \
                     which Gaussians the scores based on these keep, before any pruning round."
                     .to_owned(),
-            source: Source::Discretization,
+            source: ErrorSource::Discretization,
             curves,
         }))
     }
@@ -101,14 +101,15 @@ impl Bench<'_> {
     /// Measures the contributions of all Gaussians to the views, with the settings of `recipe`. Returns `None` if the
     /// recipe does not rank by renders.
     fn contributions(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
-        let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
-        let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
+        let measure = MeasureStages::new(recipe, self.scene.has_cameras, UserOverrides::default());
+        let look =
+            |visible: &VisibilityStage| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
         measure.visible.as_ref().map(look).transpose()
     }
 
     /// Returns the result of `contributions`, and the time and memory it took.
     fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
-        self.repeats.measure(|| self.contributions(recipe), || Ok(()))
+        self.repeats.measure_cost(|| self.contributions(recipe), || Ok(()))
     }
 
     /// Measures the rankings of `variants` as one curve, which ends at the finest setting. `finest`: value and step
@@ -131,8 +132,8 @@ impl Bench<'_> {
                 let scored = self.scored(Some(contributions))?;
                 let staying = relative_error(scored.selection.counts.kept, best.selection.counts.kept);
                 let errors =
-                    [("C", c), ("W", w), (STAYING, staying)].map(|(name, error)| (name.to_owned(), error)).into();
-                Ok(TriedRanking { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
+                    [("C", c), ("W", w), (COUNT_ERROR, staying)].map(|(name, error)| (name.to_owned(), error)).into();
+                Ok(TriedRanking { value, step, cost, errors, kept: scored.ranking().best_ids(self.kept) })
             };
         let mut tried = Vec::with_capacity(variants.len() + 1);
         for RankingVariant { value, step, recipe } in variants {
@@ -146,7 +147,7 @@ impl Bench<'_> {
 
     /// Computes scores and a selection from the statistics of the scan and from `contributions`.
     fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
-        let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
+        let measure = MeasureStages::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())
     }
 
@@ -156,7 +157,7 @@ impl Bench<'_> {
         let Some(contributions) = self.contributions(self.recipe)? else { return Ok(None) };
         let scored = self.scored(Some(contributions))?;
         let own = &self.recipe.select;
-        let most = self.scene.schedule.pairs().min(MOST_IN_ROUNDS);
+        let most = self.scene.schedule.pair_count().min(MOST_IN_ROUNDS);
         let own_pictures = own.round_pictures.min(most);
         let mut by_pictures = Vec::new();
         for count in tried(PICTURES_TRIED.into_iter().filter(|&count| count < most).chain([own_pictures, most])) {
@@ -181,7 +182,7 @@ impl Bench<'_> {
             about:
                 "Pruning rounds, each ranked by removal error: views of each round, and the fraction that each leaves."
                     .to_owned(),
-            source: Source::Discretization,
+            source: ErrorSource::Discretization,
             curves,
         }))
     }
@@ -192,12 +193,14 @@ impl Bench<'_> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
             let order = match &rounds {
-                Some(rounds) => rounds.rank(self.scene, scored, scored.ranked(), self.kept, &mut Journal::default())?,
-                None => scored.ranked(),
+                Some(rounds) => {
+                    rounds.rank(self.scene, scored, scored.ranking(), self.kept, &mut Journal::default())?
+                }
+                None => scored.ranking(),
             };
-            Ok(order.take(self.kept))
+            Ok(order.best_ids(self.kept))
         };
-        let (kept, cost) = self.repeats.measure(rank, || Ok(()))?;
+        let (kept, cost) = self.repeats.measure_cost(rank, || Ok(()))?;
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
@@ -208,33 +211,33 @@ impl Bench<'_> {
         let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
         let by = |passes: PercentilePasses| -> Result<(Scores, Cost)> {
-            self.repeats.measure(|| Ok(score_with_passes(passes, &rows, frames, &self.recipe.score)), || Ok(()))
+            self.repeats.measure_cost(|| Ok(score_with_passes(passes, &rows, frames, &self.recipe.score)), || Ok(()))
         };
         let (exact, cost) = by(PercentilePasses::Two)?;
         let staying = scored.selection.counts.kept;
         let measured = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<TriedRanking> {
             let selection = select(scores, &self.recipe.select, &Overrides::default())?;
             let errors = [
-                (PERCENTILES, worst_percentile_error(scores, &exact)),
-                (STAYING, relative_error(selection.counts.kept, staying)),
+                (PERCENTILE_ERROR, worst_percentile_error(scores, &exact)),
+                (COUNT_ERROR, relative_error(selection.counts.kept, staying)),
             ];
             let errors = errors.map(|(name, error)| (name.to_owned(), error)).into();
-            Ok(TriedRanking { value, step, cost, errors, kept: selection.ranking.take(self.kept) })
+            Ok(TriedRanking { value, step, cost, errors, kept: selection.ranking.best_ids(self.kept) })
         };
         let mut tried = Vec::with_capacity(BITS.len() + 1);
         for bits in BITS {
             let (scores, cost) = by(PercentilePasses::One(bits))?;
             tried.push(measured(f64::from(bits), 0.5f64.powi(bits as i32), &scores, cost)?);
         }
-        let own = f64::from(MOST_BITS + 1);
+        let own = f64::from(MAX_MANTISSA_BITS + 1);
         tried.push(measured(own, 0.0, &exact, cost)?);
         let against = "exact percentiles from two passes, as in every run (the last mark)";
         // The error is at most half a bucket of the histogram, and each bit halves the buckets.
-        let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILES, 1.0)])?;
+        let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILE_ERROR, 1.0)])?;
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
             about: "Percentiles from one pass over the values: mantissa bits of the histogram's keys.".to_owned(),
-            source: Source::Discretization,
+            source: ErrorSource::Discretization,
             curves: vec![curve],
         })
     }
@@ -256,8 +259,12 @@ impl Bench<'_> {
         for TriedRanking { value, step, cost, mut errors, kept } in tried {
             let found = if kept == finest { best } else { self.judge.quality(self.scene, &kept)? };
             errors.extend(
-                [(KEPT, apart(&kept, &finest)), (PICTURES, found.error), (ADDED, added(found.error, best.error))]
-                    .map(|(name, error)| (name.to_owned(), error)),
+                [
+                    (SELECTION_DISTANCE, jaccard_distance(&kept, &finest)),
+                    (RENDER_ERROR, found.error),
+                    (ADDED_ERROR, added_error(found.error, best.error)),
+                ]
+                .map(|(name, error)| (name.to_owned(), error)),
             );
             marks.push(PrecisionSetting { value, step, cost, errors, psnr: Some(found.psnr) });
             self.advance();
@@ -283,7 +290,7 @@ fn relative_error(count: usize, expected: usize) -> f64 {
 /// of combined scores are skipped, because the values themselves differ there.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
-    let pairs = pairs.filter(|(term, _)| !matches!(term.of, Quantity::Static | Quantity::Dynamic));
+    let pairs = pairs.filter(|(term, _)| !matches!(term.of, ScoredQuantity::Static | ScoredQuantity::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {
         [(rough.norm.p1, exact.norm.p1), (rough.norm.p99, exact.norm.p99)]
             .map(|(rough, exact)| if exact == 0.0 { 0.0 } else { (rough / exact - 1.0).abs() })

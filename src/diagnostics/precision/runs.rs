@@ -10,10 +10,12 @@ use crate::diagnostics::whole_run::{WholeRun, with_training_views};
 use crate::error::{Error, Result};
 use crate::evaluation::cost::Cost;
 use crate::evaluation::method::MethodKind;
-use crate::evaluation::precision::{BYTES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, Source};
-use crate::memory_plan::{Budget, Plan};
+use crate::evaluation::precision::{
+    DIFFERENT_BYTES, ErrorSource, PrecisionCurve, PrecisionKnob, PrecisionSetting, RENDER_ERROR,
+};
+use crate::memory_plan::{Budget, MemoryPlan};
 use crate::pipeline::planning::InputMeta;
-use crate::pipeline::{Only, Request, RunPlan, Target};
+use crate::pipeline::{PruneOrMerge, Request, RunPlan, Target};
 use crate::recipe::{MergePass, Recipe};
 use crate::scene::{InputOptions, open_input};
 
@@ -37,7 +39,7 @@ const WHOLE: &str = "renders of the whole model: every held-out view of up to 12
 impl Bench<'_> {
     /// Measures merging after pruning; all settings end at the same number of Gaussians.
     pub(super) fn merging(&self) -> Result<PrecisionKnob> {
-        let plain = self.recipe.unrefined();
+        let plain = self.recipe.without_refinement();
         let pass = plain.merge.passes.first().copied();
         let pass = pass.unwrap_or(MergePass { epsilon: 0.005, d0: 1.0, rho: 0.95, tau_m: 0.9 });
         let merging = |passes: Vec<MergePass>| {
@@ -64,7 +66,7 @@ impl Bench<'_> {
                 "Merging to one count, without choosing between merging and pruning and without refining: radius ε of \
                     one pass (0: pruning alone), and passes of the recipe's own radius."
                     .to_owned(),
-            source: Source::Model,
+            source: ErrorSource::Model,
             curves: vec![
                 PrecisionCurve::new("merge radius", WHOLE, by_radius, Some(pass.epsilon), &[]),
                 PrecisionCurve::new("merge passes", WHOLE, by_passes, Some(plain.merge.passes.len() as f64), &[]),
@@ -79,12 +81,12 @@ impl Bench<'_> {
         if base.refine.0.is_empty() || base.refine_steps == 0 {
             return Ok(None);
         }
-        let mut by_steps = vec![self.measure_quality(&self.recipe.unrefined(), 0.0, 0.0)?];
+        let mut by_steps = vec![self.measure_quality(&self.recipe.without_refinement(), 0.0, 0.0)?];
         let mut steps: Vec<u32> = STEPS.into_iter().chain([base.refine_steps]).collect();
         steps.sort_unstable();
         steps.dedup();
         for steps in steps {
-            let recipe = self.recipe.refining_by(steps);
+            let recipe = self.recipe.with_refinement_steps(steps);
             by_steps.push(self.measure_quality(&recipe, f64::from(steps), 1.0 / f64::from(steps))?);
         }
         let mut by_pictures = Vec::new();
@@ -96,7 +98,7 @@ impl Bench<'_> {
         Ok(Some(PrecisionKnob {
             name: "refining".to_owned(),
             about: "Refining to one count: steps (0: pruning alone), and the number of target views.".to_owned(),
-            source: Source::Model,
+            source: ErrorSource::Model,
             curves: vec![
                 PrecisionCurve::new("refine_steps", WHOLE, by_steps, Some(base.refine_steps.into()), &[]),
                 PrecisionCurve::new("refine_pictures", WHOLE, by_pictures, Some(base.refine_pictures as f64), &[]),
@@ -107,7 +109,7 @@ impl Bench<'_> {
     /// Measures the cost of several numbers of threads and memory limits, and checks that none changes a byte of the
     /// result.
     pub(super) fn machine(&self) -> Result<PrecisionKnob> {
-        let recipe = self.recipe.unrefined();
+        let recipe = self.recipe.without_refinement();
         let mut expected = None;
         let mut by_threads = Vec::new();
         let max_threads = rayon::current_num_threads();
@@ -125,7 +127,7 @@ impl Bench<'_> {
             ..Request::new(with_training_views(self.input), self.scratch.join(self.name), recipe.clone())
         };
         let plan = RunPlan::new(&request, InputMeta::from_scene(self.scene))?;
-        let least = Plan::closest(self.work, 1, |work, limits| plan.estimates(work, limits)).peak();
+        let least = MemoryPlan::closest(self.work, 1, |work, limits| plan.estimates(work, limits)).peak_bytes();
         let mut by_memory = Vec::new();
         for part in BUDGETS {
             let mebibytes = (part * least as f64 / f64::from(1 << 20)).ceil();
@@ -139,7 +141,7 @@ impl Bench<'_> {
             about:
                 "Threads, and memory in MiB from the smallest possible limit on: the result is the same, byte for byte."
                     .to_owned(),
-            source: Source::Rounding,
+            source: ErrorSource::Rounding,
             curves: vec![
                 PrecisionCurve::new("threads", against, by_threads, Some(max_threads as f64), &[]),
                 PrecisionCurve::new("memory, MiB", against, by_memory, None, &[]),
@@ -155,13 +157,13 @@ impl Bench<'_> {
     /// parameter, `step` its step size h (errors grow with a power of h).
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
-        let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
+        let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
         let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&psnr);
         Ok(PrecisionSetting {
             value,
             step,
             cost,
-            errors: BTreeMap::from([(PICTURES.to_owned(), error)]),
+            errors: BTreeMap::from([(RENDER_ERROR.to_owned(), error)]),
             psnr: Some(psnr),
         })
     }
@@ -179,7 +181,7 @@ impl Bench<'_> {
             open_input(&InputOptions { path: result.to_owned(), ..self.input.clone() })?.input.digest()
         })?;
         let differs = *expected.get_or_insert(digest.clone()) != digest;
-        let errors = BTreeMap::from([(BYTES.to_owned(), f64::from(u8::from(differs)))]);
+        let errors = BTreeMap::from([(DIFFERENT_BYTES.to_owned(), f64::from(u8::from(differs)))]);
         Ok(PrecisionSetting { value, step: value, cost, errors, psnr: None })
     }
 
@@ -197,7 +199,7 @@ impl Bench<'_> {
             max_frames: Some(FRAMES_COMPARED),
             background: None,
         };
-        let means = MethodKind::Recipe(Box::new(recipe.clone()), Only::Both);
+        let means = MethodKind::Recipe(Box::new(recipe.clone()), PruneOrMerge::Both);
         let measured = run.run(&means, Some(self.target()), |result| look(&run, result))?;
         self.advance();
         Ok(measured)

@@ -10,12 +10,12 @@ use num_traits::Float;
 
 use super::Bench;
 use crate::error::Result;
-use crate::evaluation::precision::{PrecisionCurve, PrecisionKnob, PrecisionSetting, Source, relative_l2};
+use crate::evaluation::precision::{ErrorSource, PrecisionCurve, PrecisionKnob, PrecisionSetting, relative_l2};
 use crate::model::{Attributes, Flags, Gaussians, ViewSchedule, opacity};
 use crate::passes::FrameReaders;
 use crate::recipe::{self, MotionParams, Recipe};
 use crate::source::{BlockReader, Ids, ReadPlan};
-use crate::statistics::{BlockScan, NEEDED, ScanPlan};
+use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan};
 
 /// Number of Gaussians whose sums are computed, spaced evenly over all Gaussians.
 const GAUSSIANS: usize = 64;
@@ -102,11 +102,12 @@ impl Bench<'_> {
         let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();
         let shown: Vec<usize> = (0..frames).step_by(every).collect();
         let columns = Attributes::POSITION | Attributes::OPACITY;
-        let mut reader = FrameReaders::open(source, Ids::List(&ids), NEEDED, &ReadPlan::new(shown.iter().copied()))?;
+        let mut reader =
+            FrameReaders::open(source, Ids::List(&ids), NEEDED_ATTRIBUTES, &ReadPlan::new(shown.iter().copied()))?;
         let mut states = Vec::with_capacity(shown.len());
         for frame in shown {
             let mut state = Gaussians::zeros(0, 0);
-            reader.read(frame, NEEDED, &mut state)?;
+            reader.read(frame, NEEDED_ATTRIBUTES, &mut state)?;
             states.push(state);
         }
         let decoded: Vec<Decoded> = states.iter().map(Decoded::from_state).collect();
@@ -128,7 +129,7 @@ impl Bench<'_> {
                 "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played forward and \
                  backward. Marks are numbers of frames."
             ),
-            source: Source::Rounding,
+            source: ErrorSource::Rounding,
             curves,
         }))
     }
@@ -140,7 +141,7 @@ impl Bench<'_> {
         sums: impl Fn(usize) -> Result<SummedStatistics>,
     ) -> Result<Vec<PrecisionSetting>> {
         let mark = |(frames_played, expected): (usize, &SummedStatistics)| {
-            let (found, cost) = self.repeats.measure(|| sums(frames_played), || Ok(()))?;
+            let (found, cost) = self.repeats.measure_cost(|| sums(frames_played), || Ok(()))?;
             let errors = ["D", "kappa", "V"].into_iter().zip(found.iter().zip(expected));
             let errors: BTreeMap<String, f64> = errors
                 .map(|(name, (found, expected))| {
@@ -217,12 +218,12 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
 fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = ViewSchedule::default();
-    schedule.push(frames_played, &[]);
+    schedule.push_frames(frames_played, &[]);
     let scan = recipe::ScanParams { alpha_min: 0.0, motion: MotionParams::Runs, ..Recipe::preset("default")?.scan };
     let plan = ScanPlan::new(&scan, &times, &schedule)?;
     let mut block = BlockScan::new(states.first().map_or(0, Gaussians::len), 0, &plan);
     for k in 0..frames_played {
-        block.frame(k, &states[ping_pong_index(k, states.len())], &[], changed);
+        block.add_frame(k, &states[ping_pong_index(k, states.len())], &[], changed);
     }
     let rows = block.finish().rows;
     Ok([rows.d, rows.kappa, rows.v])

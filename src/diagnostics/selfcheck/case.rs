@@ -8,7 +8,7 @@ use crate::error::Result;
 
 /// Result of one case of the self-check.
 #[derive(Debug, Serialize)]
-pub struct Case {
+pub struct CaseResult {
     /// Short name of the self-check case.
     pub name: &'static str,
     /// Description of the values that are compared, and of what they are compared with.
@@ -25,20 +25,20 @@ pub struct Case {
     pub failure: Option<String>,
 }
 
-impl Case {
+impl CaseResult {
     pub(super) fn new(
         name: &'static str,
         what: &'static str,
         bound: f64,
         measure: impl FnOnce() -> Result<LargestError>,
-    ) -> Case {
+    ) -> CaseResult {
         // A panic is caught, so that the other cases still run.
         let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
             Ok(Ok(LargestError(error))) => (error, None),
             Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
             Err(_) => (f64::INFINITY, Some("a panic".to_owned())),
         };
-        Case { name, what, bound, error, pass: error <= bound, failure }
+        CaseResult { name, what, bound, error, pass: error <= bound, failure }
     }
 }
 

@@ -2,30 +2,30 @@
 
 use std::path::Path;
 
-use super::case::{Case, LargestError};
+use super::case::{CaseResult, LargestError};
 use crate::deform::oracle::{Oracle, Parameters};
-use crate::deform::synthetic::{Noise, plain, tensors};
-use crate::deform::{Deltas, Field, FieldConfig, Scratch};
+use crate::deform::synthetic::{Noise, plain_config, random_tensors};
+use crate::deform::{Deltas, Field, FieldConfig, LayerBuffers};
 use crate::model::{Attributes, Gaussians};
 
 /// Compares states computed by the deformation field with its definition in f64. Errors are relative to 1 + |value|;
 /// the bound allows about 60 roundings in f32.
-pub(super) fn states() -> Case {
-    Case::new("deformation field", "states: planes, layers in f64", 5e-6, || {
+pub(super) fn states() -> CaseResult {
+    CaseResult::new("deformation field", "states: planes, layers in f64", 5e-6, || {
         let mut worst = LargestError::default();
         let raw = random_gaussians(40);
         for (config, depth) in [
-            (plain(), 1),
-            (FieldConfig { empty_voxel: true, ..plain() }, 2),
-            (FieldConfig { no_grid: true, ..plain() }, 1),
-            (FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() }, 3),
+            (plain_config(), 1),
+            (FieldConfig { empty_voxel: true, ..plain_config() }, 2),
+            (FieldConfig { no_grid: true, ..plain_config() }, 1),
+            (FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain_config() }, 3),
         ] {
-            let tensors = tensors(&config, depth);
+            let tensors = random_tensors(&config, depth);
             let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
             let prepared = field.prepare(&raw.position);
             for time in [0.0, 0.37, 1.0] {
                 let mut deltas = Deltas::new(3);
-                field.deltas(&prepared, time, Attributes::all(), &mut Scratch::default(), &mut deltas)?;
+                field.deltas(&prepared, time, Attributes::all(), &mut LayerBuffers::default(), &mut deltas)?;
                 let mut state = Gaussians::zeros(0, 3);
                 deltas.apply(&raw, Attributes::all(), &mut state);
                 for i in 0..raw.len() {
@@ -42,10 +42,10 @@ pub(super) fn states() -> Case {
 
 /// Compares the Jacobian of the deformation field with finite differences of its f64 definition over 2e-6. Errors are
 /// relative to 1 + |value|; the bound allows for f32 derivatives of products of six samples.
-pub(super) fn derivative() -> Case {
-    Case::new("field's derivative", "of positions: differences in f64", 1e-5, || {
-        let (config, time, step) = (plain(), 0.37, 1e-6);
-        let tensors = tensors(&config, 2);
+pub(super) fn derivative() -> CaseResult {
+    CaseResult::new("field's derivative", "of positions: differences in f64", 1e-5, || {
+        let (config, time, step) = (plain_config(), 0.37, 1e-6);
+        let tensors = random_tensors(&config, 2);
         let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
         let oracle = Oracle { tensors: &tensors, config: &config };
         let raw = random_gaussians(40);

@@ -2,23 +2,23 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::case::{Case, LargestError};
-use super::made::clouds::{Random, scene};
+use super::case::{CaseResult, LargestError};
+use super::made::clouds::{Random, random_gaussians};
 use crate::error::{Error, Result};
 use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::{Importance, merge_state, weights};
 use crate::merging::{Survivors, run};
 use crate::model::{Attributes, Gaussians};
-use crate::recipe::{MergeParams, Placement, ProxyOpacity, Recipe};
+use crate::recipe::{MergeParams, ProxyOpacity, ProxyPosition, Recipe};
 
 /// Compares the merged mean and covariance Σ of a mixture with Σ formed directly in f64. Errors are relative to the
 /// largest entry of Σ; a dozen Gaussians lose about 1e-15.
-pub(super) fn mixture() -> Case {
-    Case::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
+pub(super) fn mixture() -> CaseResult {
+    CaseResult::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
         let mut worst = LargestError::default();
         for count in [1, 2, 3, 12] {
-            let mut within = |low, high| f64::from(random.within(low, high));
+            let mut within = |low, high| f64::from(random.next_in(low, high));
             let parts: Vec<WeightedGaussian> = (1..=count)
                 .map(|k| WeightedGaussian {
                     weight: 2.0 * f64::from(k) / f64::from(count * (count + 1)),
@@ -36,8 +36,8 @@ pub(super) fn mixture() -> Case {
 
 /// Merges a Gaussian with its copy, which must return the same Gaussian. Its scales have the ratio 1 : 1e12 and must be
 /// exact to 1e-12 each; a covariance formed in f64 would lose the smallest scale entirely.
-pub(super) fn needle() -> Case {
-    Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
+pub(super) fn needle() -> CaseResult {
+    CaseResult::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = LargestError::default();
         let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
         for scales in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
@@ -51,9 +51,9 @@ pub(super) fn needle() -> Case {
 
 /// Compares the mean and covariance of a proxy with those of its members, computed by a slow f64 reference as in [`mixture`].
 /// The Gaussians lie 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Its opacity must be 1 − Π(1 − α), α being the opacities of the members.
-pub(super) fn proxy() -> Case {
-    Case::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
-        let mut states = scene(4, 5, 1);
+pub(super) fn proxy() -> CaseResult {
+    CaseResult::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
+        let mut states = random_gaussians(4, 5, 1);
         states.position.planes_mut().iter_mut().for_each(|x| *x = 1000.0 + 0.1 * *x);
         let (coverage, visibility) = ([1.0, 2.0, 3.0, 4.0, 5.0], [0.5, 1.0, 0.25, 1.0, 0.75]);
         let seen: Vec<f64> = coverage.iter().zip(&visibility).map(|(c, vis)| c * vis).collect();
@@ -61,7 +61,7 @@ pub(super) fn proxy() -> Case {
         let rows = [0, 1, 2, 3, 4];
         let importance = Importance { ids: &rows, coverage: &coverage, visibility: &visibility };
         let members: Vec<(u32, f64)> = rows.into_iter().zip(weights(&rows, &importance, &states)).collect();
-        let recipe = MergeParams { placement: Placement::Mean, ..recipe(ProxyOpacity::Union)? };
+        let recipe = MergeParams { placement: ProxyPosition::Mean, ..recipe(ProxyOpacity::Union)? };
         let found = merge_state(&members, &states, 2, &recipe, Attributes::all());
 
         let mut worst = LargestError::default();
@@ -83,9 +83,9 @@ pub(super) fn proxy() -> Case {
 }
 
 /// Merges exact copies. The proxy must have their parameters to the bit, and the opacity that the rule gives in f32.
-pub(super) fn duplicates() -> Case {
-    Case::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
-        let one = scene(6, 1, 0);
+pub(super) fn duplicates() -> CaseResult {
+    CaseResult::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
+        let one = random_gaussians(6, 1, 0);
         let mut states = one.pick(&[0; 9]);
         states.position.plane_mut(0)[8] += 1e3;
         let opacity = 0.05f64;

@@ -27,10 +27,10 @@ use serde::Serialize;
 use crate::TOOL;
 use crate::error::{Error, Result};
 
-pub use case::Case;
+pub use case::CaseResult;
 
 /// Every case, in the order of the pipeline.
-const CASES: [fn() -> Case; 28] = [
+const CASES: [fn() -> CaseResult; 28] = [
     statistics::motion,
     statistics::motion_far_away,
     statistics::motion_of_any_size,
@@ -71,18 +71,18 @@ pub struct SelfcheckReport {
     /// Time that all cases took, in seconds.
     pub seconds: f64,
     /// Result of each case, in the order of the pipeline.
-    pub cases: Vec<Case>,
+    pub cases: Vec<CaseResult>,
 }
 
 /// Runs all cases of the self-check.
 pub fn run() -> SelfcheckReport {
     let start = Instant::now();
-    let cases: Vec<Case> = CASES.iter().map(|case| case()).collect();
+    let cases: Vec<CaseResult> = CASES.iter().map(|case| case()).collect();
     SelfcheckReport::new(cases, start.elapsed().as_secs_f64())
 }
 
 impl SelfcheckReport {
-    fn new(cases: Vec<Case>, seconds: f64) -> SelfcheckReport {
+    fn new(cases: Vec<CaseResult>, seconds: f64) -> SelfcheckReport {
         SelfcheckReport { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
     }
 
@@ -109,7 +109,7 @@ impl SelfcheckReport {
     ///
     /// # Errors
     /// Returns [`Error::Unsound`] with the names of all failed cases.
-    pub fn verdict(&self) -> Result<()> {
+    pub fn check_passed(&self) -> Result<()> {
         let failed: Vec<&str> = self.cases.iter().filter(|case| !case.pass).map(|case| case.name).collect();
         if failed.is_empty() {
             return Ok(());
@@ -135,7 +135,7 @@ mod tests {
     fn all_cases_pass_and_the_table_fits_a_terminal() {
         let report = run();
         assert!(report.pass, "{}", report.text());
-        report.verdict().unwrap();
+        report.check_passed().unwrap();
         for line in report.text().lines() {
             assert!(line.chars().count() <= 80, "{line}");
         }
@@ -147,16 +147,16 @@ mod tests {
 
     #[test]
     fn large_errors_nan_errors_and_panics_fail_a_case() {
-        let case = |error| Case::new("made up", "nothing", 1e-9, || Ok(error));
+        let case = |error| CaseResult::new("made up", "nothing", 1e-9, || Ok(error));
         let nan = || {
             let mut worst = LargestError::default();
             worst.near(f64::NAN, 0.0, 1.0);
             worst.near(0.0, 0.0, 1.0);
             worst
         };
-        let refused = Case::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
-        let idle = Case::new("idle", "nothing", 1e-9, || Ok(LargestError::default()));
-        let panics = Case::new("panics", "nothing", 1e-9, || panic!("as it should"));
+        let refused = CaseResult::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
+        let idle = CaseResult::new("idle", "nothing", 1e-9, || Ok(LargestError::default()));
+        let panics = CaseResult::new("panics", "nothing", 1e-9, || panic!("as it should"));
         let report = SelfcheckReport::new(
             vec![case(LargestError(1e-9)), case(LargestError(1.1e-9)), case(nan()), refused, panics, idle],
             0.5,
@@ -165,7 +165,7 @@ mod tests {
         assert_eq!((passes, report.pass), (vec![true, false, false, false, false, false], false));
         let text = report.text();
         assert!(text.contains("FAIL") && text.contains("no disk") && text.contains("1 of 6 pass"), "{text}");
-        let error = report.verdict().unwrap_err().to_string();
+        let error = report.check_passed().unwrap_err().to_string();
         assert!(error.contains("made up, made up, refused, panics, idle"), "{error}");
     }
 }

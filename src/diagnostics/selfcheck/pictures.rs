@@ -5,9 +5,9 @@ use std::num::NonZeroU32;
 
 use glam::DVec3;
 
-use super::case::{Case, LargestError};
-use super::made::clouds::{Random, camera, plain_camera, scene, single};
-use super::oracle::picture::{blended, picture, render_blended};
+use super::case::{CaseResult, LargestError};
+use super::made::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
+use super::oracle::picture::{blended_indices, render_blended, render_view};
 use crate::metrics::{psnr, ssim};
 use crate::model::{Attributes, Camera, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};
@@ -17,10 +17,11 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 /// Compares the render of one Gaussian with color c and opacity o, scale s at distance z, with the formula α·c + (1 −
 /// α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)), r px from its center at focal length f. In f32, values of 1 have an
 /// error of 6e-8, and exponentials a little more.
-pub(super) fn one_gaussian() -> Case {
-    Case::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
+pub(super) fn one_gaussian() -> CaseResult {
+    CaseResult::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
-        let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
+        let image =
+            render(&single_gaussian(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
         let variance = (50.0 * scale / depth).powi(2) + 0.3;
         let middle = f64::from(size) / 2.0 - 0.5;
         let mut worst = LargestError::default();
@@ -39,10 +40,10 @@ pub(super) fn one_gaussian() -> Case {
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
 /// per pixel in f32. Pixels in which a comparison is within a fraction of 1e-4 of its threshold are skipped, because
 /// f32 may decide differently; they are few.
-pub(super) fn many_gaussians() -> Case {
-    Case::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
-        let (scene, camera) = (scene(1, 300, 3), camera(67, 45));
-        let expected = picture(&scene, &camera, BACKGROUND, 1);
+pub(super) fn many_gaussians() -> CaseResult {
+    CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
+        let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
+        let expected = render_view(&scene, &camera, BACKGROUND, 1);
         let got = render(&scene, &camera, BACKGROUND);
         let sure = expected.doubtful.iter().filter(|&&doubtful| !doubtful).count();
         let mut worst = LargestError::default();
@@ -56,15 +57,15 @@ pub(super) fn many_gaussians() -> Case {
 
 /// Compares sum and maximum of alpha · transmittance of each Gaussian with f64 values. Errors are relative to 1 +
 /// value; the program sums in f32 over a tile of 256 pixels.
-pub(super) fn weights() -> Case {
-    Case::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
+pub(super) fn weights() -> CaseResult {
+    CaseResult::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
         let (scene, camera) = undoubtful_scene();
-        let expected = picture(&scene, &camera, BACKGROUND, 1);
+        let expected = render_view(&scene, &camera, BACKGROUND, 1);
         let mut seen = Contribution::new(scene.len());
         Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
         let mut worst = LargestError::default();
         for i in 0..scene.len() {
-            worst.near(seen.pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
+            worst.near(seen.in_pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
             worst.near(seen.max[i].into(), expected.max[i], 1.0);
         }
         Ok(worst)
@@ -73,12 +74,12 @@ pub(super) fn weights() -> Case {
 
 /// Compares removal errors with their definition Σ‖render − render without the Gaussian‖², both in f64. In the program,
 /// the color behind a Gaussian is a difference in f32.
-pub(super) fn removal() -> Case {
-    Case::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
+pub(super) fn removal() -> CaseResult {
+    CaseResult::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
         let (scene, camera) = undoubtful_scene();
         let mut found = RemovalError::new(scene.len(), 0.0);
         Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
-        let all = blended(&scene, &camera);
+        let all = blended_indices(&scene, &camera);
         let whole = render_blended(&scene, &camera, BACKGROUND, &all);
         let mut worst = LargestError::default();
         for i in 0..scene.len() {
@@ -87,7 +88,7 @@ pub(super) fn removal() -> Case {
             let without = render_blended(&scene, &camera, BACKGROUND, &others);
             let values = whole.as_flattened().iter().zip(without.as_flattened());
             let expected: f64 = values.map(|(a, b)| (a - b).powi(2)).sum();
-            worst.near(found.sum[i] as f64 * RemovalError::UNIT, expected, 1.0 + expected);
+            worst.near(found.sum[i] as f64 * RemovalError::SUM_UNIT, expected, 1.0 + expected);
         }
         Ok(worst)
     })
@@ -95,8 +96,8 @@ pub(super) fn removal() -> Case {
 
 /// Compares spherical harmonics colors with K·P(cos θ)·cos mφ, the definition by angles, with the Legendre functions P
 /// by recurrence and the factor K. A color of 1 has an error of about 1e-7 in f32.
-pub(super) fn harmonics() -> Case {
-    Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
+pub(super) fn harmonics() -> CaseResult {
+    CaseResult::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();
         for toward in [DVec3::new(0.3, -0.5, 0.8), DVec3::new(-0.7, 0.2, -0.4), DVec3::new(0.1, 0.9, 0.05)] {
             let toward = toward.normalize();
@@ -123,12 +124,12 @@ pub(super) fn harmonics() -> Case {
 
 /// Compares the largest gradients of every attribute with finite differences of f64 renders over 6e-5. Errors are
 /// relative to each gradient; gradients are f32 sums of terms of both signs.
-pub(super) fn gradients() -> Case {
-    Case::new("backward pass", "derivatives: differences in f64", 5e-5, || {
-        let (scene, camera) = (scene(3, 40, 3), camera(33, 100));
-        let doubtful = picture(&scene, &camera, BACKGROUND, 1).doubtful;
+pub(super) fn gradients() -> CaseResult {
+    CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
+        let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
+        let doubtful = render_view(&scene, &camera, BACKGROUND, 1).doubtful;
         let mut random = Random(103);
-        let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.draw().into()).collect();
+        let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.next_f32().into()).collect();
         let residual = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
         let mut found = Gradients::new(scene.len(), Attributes::all(), 3);
         let slope = |image: &Image| {
@@ -138,7 +139,7 @@ pub(super) fn gradients() -> Case {
         Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
 
         // Which Gaussians each pixel blends is fixed beforehand, so that the loss is smooth.
-        let blended = blended(&scene, &camera);
+        let blended = blended_indices(&scene, &camera);
         let loss = |changed: &Gaussians| -> f64 {
             let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
             let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| residual(at, x).powi(2));
@@ -166,11 +167,11 @@ pub(super) fn gradients() -> Case {
 
 /// Compares PSNR in dB with whole numbers, and SSIM with its definition. The f64 sums of 786,432 squares lose at most
 /// 1e-12.
-pub(super) fn comparison() -> Case {
-    Case::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
+pub(super) fn comparison() -> CaseResult {
+    CaseResult::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);
         let mut image = |size: u32| -> (Image, Vec<i64>) {
-            let levels: Vec<i64> = (0..3 * size * size).map(|_| (256.0 * random.draw()) as i64).collect();
+            let levels: Vec<i64> = (0..3 * size * size).map(|_| (256.0 * random.next_f32()) as i64).collect();
             let data = levels.iter().map(|&level| level as f32 / 256.0).collect();
             (Image { width: size, height: size, data }, levels)
         };
@@ -190,9 +191,9 @@ const UNDOUBTFUL_SEED: u64 = 1;
 /// Returns a scene and a camera for which no comparison is so close to its threshold that f32 may decide differently
 /// from f64, and no alpha is clamped.
 fn undoubtful_scene() -> (Gaussians, Camera) {
-    let mut scene = scene(UNDOUBTFUL_SEED, 60, 1);
+    let mut scene = random_gaussians(UNDOUBTFUL_SEED, 60, 1);
     scene.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = logit.min(2.0));
-    (scene, camera(40, 33))
+    (scene, tilted_camera(40, 33))
 }
 
 /// Returns the real spherical harmonics up to degree 3 in the direction `toward`, by angles: √2·K·P(cos θ)·cos mφ, with

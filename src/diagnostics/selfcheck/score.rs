@@ -1,14 +1,14 @@
 //! Self-check cases for percentiles, by which statistics are normalized and the scene extent is measured.
 
-use super::case::{Case, LargestError};
+use super::case::{CaseResult, LargestError};
 use super::made::clouds::Random;
 use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
 /// Compares percentiles with the value at the same rank after sorting, to the bit.
-pub(super) fn percentiles() -> Case {
-    Case::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
+pub(super) fn percentiles() -> CaseResult {
+    CaseResult::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
         for count in [1, 2, 50, 99, 100, 101, 1000, 20_011] {
             let values = values(count);
@@ -23,8 +23,8 @@ pub(super) fn percentiles() -> Case {
 }
 
 /// Compares the box between percentiles of positions with sorted values, to the bit.
-pub(super) fn robust_box() -> Case {
-    Case::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
+pub(super) fn robust_box() -> CaseResult {
+    CaseResult::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
         for count in [1, 100, 1003] {
             let axes = [7, 8, 9].map(|seed| (0..count).map(|i| values(count)[(i * seed) % count] as f32).collect());
@@ -32,7 +32,7 @@ pub(super) fn robust_box() -> Case {
             let found = RobustBox::from_positions(&AttributeValues::from_planes(3, axes.concat()));
             for (axis, values) in axes.iter().enumerate() {
                 let values: Vec<f64> = values.iter().map(|&x| x.into()).collect();
-                for (got, p) in [(found.low, 1), (found.middle, 50), (found.high, 99)] {
+                for (got, p) in [(found.low, 1), (found.median, 50), (found.high, 99)] {
                     worst.same(&got[axis], &sorted_percentile(&values, p));
                 }
             }
@@ -52,8 +52,8 @@ fn sorted_percentile(values: &[f64], p: usize) -> f64 {
 fn values(count: usize) -> Vec<f64> {
     let mut random = Random(count as u64);
     let value = |_| {
-        let sign = if random.draw() < 0.2 { -1.0 } else { 1.0 };
-        sign * f64::from(random.within(0.5, 1.0)) * 10f64.powi(random.within(-42.0, 4.0) as i32)
+        let sign = if random.next_f32() < 0.2 { -1.0 } else { 1.0 };
+        sign * f64::from(random.next_in(0.5, 1.0)) * 10f64.powi(random.next_in(-42.0, 4.0) as i32)
     };
     (0..count).map(value).collect()
 }

@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use glam::{DMat3, DVec3};
 
-use super::case::{Case, LargestError};
-use super::made::clouds::{Random, camera};
+use super::case::{CaseResult, LargestError};
+use super::made::clouds::{Random, tilted_camera};
 use super::oracle::statistics::{OracleRow, row};
 use crate::error::Result;
 use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
@@ -16,8 +16,8 @@ const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Run
 
 /// Compares the statistics of motion and opacity with their definition in f64, for life spans with many gaps. Sums of
 /// 40 terms in f64 lose about 1e-15, and variances a few digits more.
-pub(super) fn motion() -> Case {
-    Case::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
+pub(super) fn motion() -> CaseResult {
+    CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
         let mut worst = LargestError::default();
         for motion in DEFINITIONS {
@@ -37,21 +37,21 @@ pub(super) fn motion() -> Case {
 
 /// Compares statistics of Gaussians far from the origin, whose motion is whole numbers of ulps, with exact values. The
 /// differences are exact; a sum of 2000 squares in f64 loses at most 1e-14.
-pub(super) fn motion_far_away() -> Case {
-    Case::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
+pub(super) fn motion_far_away() -> CaseResult {
+    CaseResult::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
 /// Compares as [`motion_far_away`] does, for subnormal positions and for positions whose squares overflow f32.
-pub(super) fn motion_of_any_size() -> Case {
-    Case::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
+pub(super) fn motion_of_any_size() -> CaseResult {
+    CaseResult::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
         compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
     })
 }
 
 /// Compares motion at unevenly spaced frames with a formula. For x = t² at whole t with mean step m, velocities are
 /// m·(t + t') between t and t', and turns (second differences) are 2m². Sums have 40 terms in f64.
-pub(super) fn uneven_frames() -> Case {
-    Case::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
+pub(super) fn uneven_frames() -> CaseResult {
+    CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
         let frames: Vec<Gaussians> = times
             .iter()
@@ -73,8 +73,8 @@ pub(super) fn uneven_frames() -> Case {
 }
 
 /// Compares the statistics of Gaussians that are alive in 0 to 3 frames with exact values.
-pub(super) fn short_lives() -> Case {
-    Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
+pub(super) fn short_lives() -> CaseResult {
+    CaseResult::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
         for motion in DEFINITIONS {
             // Each case lists in which frames the Gaussian is alive, then how many steps of 3 and turns (second
@@ -110,11 +110,11 @@ pub(super) fn short_lives() -> Case {
 /// Compares the variance V of nearly constant opacities with a computation in two passes in f64. Opacities of 0.9 that
 /// differ by 1e-6 have errors of 1e-16, so V has a relative error below 1e-9. Moments about 0 would leave only 2
 /// correct digits.
-pub(super) fn steady_opacity() -> Case {
-    Case::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
+pub(super) fn steady_opacity() -> CaseResult {
+    CaseResult::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
         let opacity = |x: f32| 1.0 / (1.0 + (-f64::from(x)).exp());
-        let logits: Vec<f32> = (0..1000).map(|_| 2.197_224_6 + random.within(-1e-5, 1e-5)).collect();
+        let logits: Vec<f32> = (0..1000).map(|_| 2.197_224_6 + random.next_in(-1e-5, 1e-5)).collect();
         let frames: Vec<Gaussians> = logits
             .iter()
             .map(|&logit| {
@@ -137,12 +137,12 @@ pub(super) fn steady_opacity() -> Case {
 
 /// Compares projected areas with full matrices in f64. Errors are relative to max(area, 1 px); the contribution C is
 /// summed in units of about 3e-11 px.
-pub(super) fn projected_area() -> Case {
-    Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
+pub(super) fn projected_area() -> CaseResult {
+    CaseResult::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = random_frames(500, 3);
-        let cameras = vec![camera(320, 256), camera(40, 300)];
+        let cameras = vec![tilted_camera(320, 256), tilted_camera(40, 300)];
         let mut schedule = ViewSchedule::new(cameras);
-        schedule.push(frames.len(), &[(0, 0), (1, 1)]);
+        schedule.push_frames(frames.len(), &[(0, 0), (1, 1)]);
         let recipe = recipe(MotionParams::Runs)?;
         let got = scan(&frames, &schedule, &recipe)?;
         let mut worst = LargestError::default();
@@ -158,8 +158,8 @@ pub(super) fn projected_area() -> Case {
 /// Compares the projected area of a needle with a formula: with variances a and b px², rotated about the line of sight,
 /// it has det Σ = (a + 0.3)(b + 0.3). Computed from the entries of Σ, no digit of the determinant would be correct.
 /// Errors are relative to max(area, 1 px), as in [`projected_area`].
-pub(super) fn needle_on_screen() -> Case {
-    Case::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
+pub(super) fn needle_on_screen() -> CaseResult {
+    CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
         let camera = Camera {
             width: size,
@@ -174,7 +174,7 @@ pub(super) fn needle_on_screen() -> Case {
             translation: DVec3::ZERO,
         };
         let mut schedule = ViewSchedule::new(vec![camera]);
-        schedule.push(1, &[(0, 0)]);
+        schedule.push_frames(1, &[(0, 0)]);
         let mut worst = LargestError::default();
         for (turn, length) in [(0.1f32, 1e2f64), (0.4, 1e3), (0.9, 1e4), (1.3, 1e5)] {
             let mut frame = resting(1);
@@ -207,7 +207,7 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
         let places: Vec<i64> = (0..2000)
             .map(|_| {
                 // Steps lead back toward the start, so every position is exact in f32.
-                let step = (1000.0 * random.draw()) as i64;
+                let step = (1000.0 * random.next_f32()) as i64;
                 place += if place > 0 { -step } else { step };
                 place
             })
@@ -252,11 +252,13 @@ fn random_frames(count: usize, frames: usize) -> Vec<Gaussians> {
     let mut frame = |_| {
         let mut frame = Gaussians::zeros(count, 0);
         for i in 0..count {
-            let depth = random.within(-0.5, 6.0);
-            frame.position.set_row(i, [random.within(-3.0, 3.0), random.within(-3.0, 3.0), depth]);
-            frame.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.within(-1.0, 1.0)));
-            frame.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.within(-5.0, -1.0)));
-            frame.opacity_logit.set_row(i, [random.within(-3.0, 3.0) - if random.draw() < 0.33 { 6.0 } else { 0.0 }]);
+            let depth = random.next_in(-0.5, 6.0);
+            frame.position.set_row(i, [random.next_in(-3.0, 3.0), random.next_in(-3.0, 3.0), depth]);
+            frame.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.next_in(-1.0, 1.0)));
+            frame.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.next_in(-5.0, -1.0)));
+            frame
+                .opacity_logit
+                .set_row(i, [random.next_in(-3.0, 3.0) - if random.next_f32() < 0.33 { 6.0 } else { 0.0 }]);
         }
         frame
     };
@@ -269,7 +271,7 @@ fn recipe(motion: MotionParams) -> Result<ScanParams> {
 
 fn without_views(frames: usize) -> ViewSchedule {
     let mut schedule = ViewSchedule::default();
-    schedule.push(frames, &[]);
+    schedule.push_frames(frames, &[]);
     schedule
 }
 
@@ -288,7 +290,7 @@ fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe:
         let cameras: Vec<&Camera> = views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect();
         let stays = t > 0 && frame.opacity_logit == frames[t - 1].opacity_logit;
         let changed = if stays { Attributes::all().difference(Attributes::OPACITY) } else { Attributes::all() };
-        block.frame(t, frame, &cameras, changed);
+        block.add_frame(t, frame, &cameras, changed);
     }
     Ok(block.finish().rows)
 }

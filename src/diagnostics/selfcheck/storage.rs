@@ -6,10 +6,11 @@ use std::path::Path;
 
 use gseq::Compression;
 
-use super::case::{Case, LargestError};
-use super::made::clouds::{Random, scene};
+use super::case::{CaseResult, LargestError};
+use super::made::clouds::{Random, random_gaussians};
 use crate::archive::{
-    ATTRIBUTES, Content, Encoded, FieldSteps, Role, Steps, TensorSteps, attribute, decode, encode, round_cloud, step,
+    ATTRIBUTES, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorRole, TensorSteps,
+    attribute_values, decode, encode, round_cloud, step_size,
 };
 use crate::deform::Tensor;
 use crate::error::{Error, Result};
@@ -17,14 +18,14 @@ use crate::files::atomic::ScratchFolder;
 use crate::files::container::Container;
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
-use crate::outputs::bounds::{Bounds, MaxError};
+use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Compares every bit of a lossless container, including NaN and −0, and including an attribute whose last frame equals
 /// its first.
-pub(super) fn container() -> Case {
-    Case::new("container", "values of 70 frames: the same bits", 0.0, || {
+pub(super) fn container() -> CaseResult {
+    CaseResult::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
         let written = MemoryFrames::new();
         for compression in [Compression::Raw, Compression::Zstd(1)] {
@@ -37,8 +38,8 @@ pub(super) fn container() -> Case {
 }
 
 /// Compares the values of a container with error bounds. The unit of the error is the requested bound.
-pub(super) fn bounded_container() -> Case {
-    Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
+pub(super) fn bounded_container() -> CaseResult {
+    CaseResult::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
         let mut written = MemoryFrames::new();
         for column in written.frames.iter_mut().flat_map(|frame| frame.columns_mut(Attributes::all())) {
@@ -47,9 +48,9 @@ pub(super) fn bounded_container() -> Case {
         let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
         let requested: Vec<MaxError> =
             requested.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
-        let bounds = Bounds::from_errors(&requested, || Ok(1.0))?;
-        compare_round_trip(&written, Packing::within(bounds, 3), |got, expected, column| {
-            worst.near(got.into(), expected.into(), bounds.column(column));
+        let bounds = ErrorBounds::from_errors(&requested, || Ok(1.0))?;
+        compare_round_trip(&written, Packing::with_bounds(bounds, 3), |got, expected, column| {
+            worst.near(got.into(), expected.into(), bounds.max_error(column));
         })?;
         Ok(worst)
     })
@@ -57,21 +58,21 @@ pub(super) fn bounded_container() -> Case {
 
 /// Compares the values of an archive with the originals. The unit of the error is half a quantization step plus a
 /// rounding to f32.
-pub(super) fn archive_grid() -> Case {
-    Case::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
+pub(super) fn archive_grid() -> CaseResult {
+    CaseResult::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
-        let Encoded { bytes, order, .. } = encode(&content, &steps)?;
+        let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
         let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
         let expected = content.cloud.pick(&order);
         let mut worst = LargestError::default();
-        let half = |k: i32, value: f32| 0.5 * step(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
+        let half = |k: i32, value: f32| 0.5 * step_size(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
         for (k, &step) in steps.cloud.iter().enumerate().take(used_attributes(&content)) {
-            for (got, expected) in attribute(&back.cloud, k).zip(attribute(&expected, k)) {
+            for (got, expected) in attribute_values(&back.cloud, k).zip(attribute_values(&expected, k)) {
                 worst.near(got.into(), expected.into(), half(step, expected));
             }
         }
         let matrix =
-            |content: &Content| content.tensors.get("a.matrix").map_or(Vec::new(), |tensor| tensor.data.clone());
+            |content: &ArchiveContent| content.tensors.get("a.matrix").map_or(Vec::new(), |tensor| tensor.data.clone());
         let (got, expected) = (matrix(&back), matrix(&content));
         worst.same(&(back.cloud.len(), got.len()), &(content.cloud.len(), expected.len()));
         got.iter().zip(expected).for_each(|(&got, x)| worst.near(got.into(), x.into(), half(MATRIX_STEP, x)));
@@ -81,10 +82,10 @@ pub(super) fn archive_grid() -> Case {
 
 /// Compares the decoded Gaussians with the originals rounded to the quantization grid, and the other stored data with
 /// the originals, to the bit: prediction and entropy coding of an archive are lossless.
-pub(super) fn archive_codes() -> Case {
-    Case::new("archive's codes", "symbols and bytes: the same", 0.0, || {
+pub(super) fn archive_codes() -> CaseResult {
+    CaseResult::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
-        let Encoded { bytes, order, .. } = encode(&content, &steps)?;
+        let EncodedArchive { bytes, order, .. } = encode(&content, &steps)?;
         let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
         let mut expected = content.cloud.pick(&order);
         let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
@@ -103,14 +104,15 @@ pub(super) fn archive_codes() -> Case {
 const MATRIX_STEP: i32 = -60;
 
 /// Returns a model of 2000 Gaussians of SH degree 2 with two tensors and a file, and the quantization steps for it.
-fn model() -> (Content, Steps) {
+fn model() -> (ArchiveContent, QuantizationSteps) {
     let mut random = Random(12);
     let mut tensor = |shape: &[usize]| Tensor {
         shape: shape.to_vec(),
-        data: (0..shape.iter().product()).map(|_| random.within(-1.0, 1.0)).collect(),
+        data: (0..shape.iter().product()).map(|_| random.next_in(-1.0, 1.0)).collect(),
     };
-    let mut content = Content { cloud: scene(13, 2000, 2), times: [0.0, 1.0], ..Content::default() };
-    for (name, shape, role) in [("a.matrix", [20, 30], Role::Weights), ("a.exact", [5, 8], Role::Exact)] {
+    let mut content =
+        ArchiveContent { cloud: random_gaussians(13, 2000, 2), times: [0.0, 1.0], ..ArchiveContent::default() };
+    for (name, shape, role) in [("a.matrix", [20, 30], TensorRole::Weights), ("a.exact", [5, 8], TensorRole::Exact)] {
         content.tensors.insert(name.to_owned(), tensor(&shape));
         content.field.insert(name.to_owned(), role);
     }
@@ -118,11 +120,11 @@ fn model() -> (Content, Steps) {
     content.beside = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
     let matrix_steps = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
     let field = FieldSteps([("a.matrix".to_owned(), matrix_steps)].into());
-    (content, Steps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
+    (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
 /// Returns how many entries of [`ATTRIBUTES`] the content has: position to opacity, and one per SH degree that exists.
-fn used_attributes(content: &Content) -> usize {
+fn used_attributes(content: &ArchiveContent) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }
 
@@ -164,13 +166,13 @@ impl MemoryFrames {
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);
-        let mut now = scene(15, count, 1);
+        let mut now = random_gaussians(15, count, 1);
         now.opacity_logit.plane_mut(0)[..4].copy_from_slice(&[f32::NAN, f32::INFINITY, -0.0, 1e-40]);
         let rotation = now.rotation.clone();
         let mut frame = |t: usize| {
             if t > 0 {
-                now.position.planes_mut().iter_mut().for_each(|x| *x += random.within(-0.01, 0.01));
-                now.opacity_logit.plane_mut(0)[4..].iter_mut().for_each(|x| *x = random.within(-6.0, 6.0));
+                now.position.planes_mut().iter_mut().for_each(|x| *x += random.next_in(-0.01, 0.01));
+                now.opacity_logit.plane_mut(0)[4..].iter_mut().for_each(|x| *x = random.next_in(-6.0, 6.0));
             }
             now.rotation.clone_from(&rotation);
             // Blocks have 32 frames, or 64 with error bounds.

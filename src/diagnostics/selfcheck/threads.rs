@@ -2,8 +2,8 @@
 
 use std::fs;
 
-use super::case::{Case, LargestError};
-use super::made::clouds::{camera, scene};
+use super::case::{CaseResult, LargestError};
+use super::made::clouds::{random_gaussians, tilted_camera};
 use crate::diagnostics::test_scene;
 use crate::diagnostics::test_scene::TestSceneOptions;
 use crate::error::{Error, Result};
@@ -16,8 +16,8 @@ use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
 /// Compares the bytes of results computed with different numbers of threads; they must be equal.
-pub(super) fn same_bytes() -> Case {
-    Case::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
+pub(super) fn same_bytes() -> CaseResult {
+    CaseResult::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (run_on(1)?, run_on(2)?);
         let mut worst = LargestError::default();
         worst.same(&two, &one);
@@ -48,10 +48,10 @@ fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
         })?;
         let path = output.join("compressed.gseq");
         let bytes = fs::read(&path).map_err(Error::io("read", &path))?;
-        let scene = scene(31, 3000, 1);
+        let scene = random_gaussians(31, 3000, 1);
         let mut gradients = Gradients::new(scene.len(), Attributes::all(), 1);
         let loss = |picture: &Image| (0.0, picture.clone());
-        Renderer::on_all_threads().gradient(&scene, &camera(80, 60), [0.5; 3], loss, &mut gradients);
+        Renderer::on_all_threads().gradient(&scene, &tilted_camera(80, 60), [0.5; 3], loss, &mut gradients);
         Ok((bytes, gradients))
     })
 }

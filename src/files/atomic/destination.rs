@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, is_system_folder};
 
-use super::named::{MARKER, Owner, entries, split_target};
+use super::named::{Owner, SUMMARY_FILE, entries, split_target};
 use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output: file or folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum TargetKind {
     /// A single file.
     File,
     /// A folder with all its content.
@@ -96,38 +96,38 @@ fn leads_through_system_link(target: &Path) -> bool {
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] if the existing one has another kind or `replace` does not allow to replace it.
-pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
+pub(super) fn check_replace(target: &Path, kind: TargetKind, replace: Replace) -> Result<()> {
     let shown = target.shown();
     let found = destination(target)?;
     match (kind, found) {
         (_, Destination::Free) => Ok(()),
-        (Kind::File, Destination::Stream) => {
+        (TargetKind::File, Destination::Stream) => {
             Err(Error::usage(format!("{shown} became a device or FIFO, which is not replaced; give another output")))
         }
-        (Kind::Folder, Destination::Folder) if is_empty_folder(target) => Ok(()),
+        (TargetKind::Folder, Destination::Folder) if is_empty_folder(target) => Ok(()),
         (_, Destination::File | Destination::Folder | Destination::FolderLink) if replace == Replace::Never => {
             Err(Error::usage(format!(
                 "{shown} exists already\n  --overwrite replaces a file, or the files of an earlier result in a folder; or name another output"
             )))
         }
-        (Kind::File, Destination::Folder | Destination::FolderLink) => {
+        (TargetKind::File, Destination::Folder | Destination::FolderLink) => {
             Err(Error::usage(format!("{shown} is a folder; a file cannot replace it")))
         }
-        (Kind::Folder, Destination::File | Destination::FolderLink | Destination::Stream) => {
+        (TargetKind::Folder, Destination::File | Destination::FolderLink | Destination::Stream) => {
             Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
         }
-        (Kind::File, Destination::File) => Ok(()),
-        (Kind::Folder, Destination::Folder) => check_folder(target),
+        (TargetKind::File, Destination::File) => Ok(()),
+        (TargetKind::Folder, Destination::Folder) => check_folder(target),
     }
 }
 
 /// Checks that the folder at `target` is an earlier result of this program whose summary lists its files.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
-    match Owner::read(&target.join(MARKER)) {
+    match Owner::read(&target.join(SUMMARY_FILE)) {
         Owner::Listed(_) => Ok(()),
         Owner::Unknown => Err(Error::usage(format!(
-            "{shown} is not a result of splatsieve (no {MARKER} in it that lists its files), so --overwrite leaves it as it is\n  \
+            "{shown} is not a result of splatsieve (no {SUMMARY_FILE} in it that lists its files), so --overwrite leaves it as it is\n  \
              remove the folder first, or name another output"
         ))),
     }

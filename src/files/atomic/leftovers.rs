@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 use splat_platform::FolderHandle;
 
-use super::destination::{Kind, Replace, check_replace};
-use super::named::{MARKER, move_foreign_entries, split_target};
+use super::destination::{Replace, TargetKind, check_replace};
+use super::named::{SUMMARY_FILE, move_foreign_entries, split_target};
 use super::warnings::warn;
 use super::workspace::{
     DISCARDED, JOURNAL, Leftover, REPLACED, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace, publishing_name,
@@ -179,7 +179,7 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     let Err(refused) = carried else {
         return folder.rename(REPLACED, folder, DISCARDED).map_err(Error::io("discard the earlier folder of", target));
     };
-    let _ = old.remove(MARKER);
+    let _ = old.remove(SUMMARY_FILE);
     let mut kept = name.to_owned();
     kept.push(".kept");
     while parent.has(&kept) {
@@ -208,7 +208,7 @@ fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path)
         if !is_beside || Path::new(published).components().count() != 1 || !folder.has(content) {
             continue;
         }
-        check_replace(&target.with_file_name(published), Kind::File, journal.replace)?;
+        check_replace(&target.with_file_name(published), TargetKind::File, journal.replace)?;
         folder.rename(content, parent, published).map_err(failed)?;
     }
     folder.remove(JOURNAL).map_err(failed)

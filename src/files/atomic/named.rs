@@ -17,7 +17,7 @@ use crate::error::{Error, Result, ShowPath, quoted};
 /// Name of the summary file that identifies a folder as a result of this program: a JSON object whose `tool` names the
 /// program. The list `files` in it names the files of the result; [`super::StagedFolder::commit`] and
 /// [`super::StagedFiles::commit`] add them.
-pub const MARKER: &str = "summary.json";
+pub const SUMMARY_FILE: &str = "summary.json";
 
 /// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
 /// are not summaries of this program and are not read.
@@ -104,7 +104,7 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
 /// Entries that cannot be moved stay in `old`, and the first failure is returned. The function may be called again
 /// after an interruption at any point: every entry is always in exactly one of the two folders.
 pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result<()> {
-    let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
+    let listed = match old.open_file(SUMMARY_FILE, false).map(Owner::read_file) {
         Ok(Owner::Listed(listed)) => listed,
         _ => BTreeSet::new(),
     };

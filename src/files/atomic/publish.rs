@@ -6,7 +6,7 @@ use std::path::Path;
 
 use splat_platform::{FolderHandle, sync_file, sync_folder};
 
-use super::destination::{Kind, Replace, check_replace};
+use super::destination::{Replace, TargetKind, check_replace};
 use super::leftovers::{Journal, PublishLock, finish_publication, repair};
 use super::named::{exists, split_target};
 use super::warnings::warn;
@@ -26,7 +26,7 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     let lock = PublishLock::acquire(target)?;
     repair(target, true);
     for (_, target) in files {
-        check_replace(target, Kind::File, replace)?;
+        check_replace(target, TargetKind::File, replace)?;
     }
     let held = live_workspaces();
     let journal = workspace.folder.join(JOURNAL);
@@ -73,7 +73,7 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
 pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Replace) -> Result<()> {
     let lock = PublishLock::acquire(target)?;
     repair(target, true);
-    check_replace(target, Kind::Folder, replace)?;
+    check_replace(target, TargetKind::Folder, replace)?;
     let held = live_workspaces();
     let aside = workspace.folder.join(REPLACED);
     if exists(target) {

@@ -18,11 +18,11 @@ fn names_in(folder: &Path) -> Vec<String> {
 }
 
 fn result_folder(path: &Path, content: &str) {
-    write_file(&path.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["content", "summary.json"]}"#);
+    write_file(&path.join(SUMMARY_FILE), r#"{"tool": "splatsieve 0.1.0", "files": ["content", "summary.json"]}"#);
     write_file(&path.join("content"), content);
 }
 
-fn refusal(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> String {
+fn refusal(target: &Path, kind: TargetKind, inputs: &[&Path], replace: Replace) -> String {
     let error = check_target(target, kind, inputs, replace).unwrap_err();
     assert!(matches!(error, Error::Usage(_)), "{error}");
     error.to_string()
@@ -61,15 +61,15 @@ fn dropped_output_leaves_the_old_output() {
 fn existing_target_is_refused_at_start_and_at_commit() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out.ply");
-    check_target(&target, Kind::File, &[], Replace::Never).unwrap();
+    check_target(&target, TargetKind::File, &[], Replace::Never).unwrap();
     let staged = StagedFile::new(&target, Replace::Never).unwrap();
     fs::write(staged.path(), "new").unwrap();
     write_file(&target, "somebody else's");
     assert!(staged.commit().unwrap_err().to_string().contains("exists already"));
     assert_eq!(fs::read_to_string(&target).unwrap(), "somebody else's");
-    assert!(refusal(&target, Kind::File, &[], Replace::Never).contains("--overwrite"));
+    assert!(refusal(&target, TargetKind::File, &[], Replace::Never).contains("--overwrite"));
     assert!(StagedFile::new(&target, Replace::Never).is_err());
-    check_target(&target, Kind::File, &[], Replace::Existing).unwrap();
+    check_target(&target, TargetKind::File, &[], Replace::Existing).unwrap();
     assert_eq!(names_in(base.path()), ["out.ply"]);
 }
 
@@ -81,16 +81,18 @@ fn input_its_parents_and_children_are_never_targets() {
     result_folder(&model, "");
     write_file(&cloud, "");
     for replace in [Replace::Never, Replace::Existing] {
-        assert!(refusal(&model, Kind::Folder, &[&model], replace).contains("input itself"));
-        assert!(refusal(&cloud, Kind::File, &[&cloud], replace).contains("input itself"));
-        assert!(refusal(&model, Kind::Folder, &[&cloud], replace).contains("contains the input"));
-        assert!(refusal(&base.path().join("scenes"), Kind::Folder, &[&model], replace).contains("contains"));
+        assert!(refusal(&model, TargetKind::Folder, &[&model], replace).contains("input itself"));
+        assert!(refusal(&cloud, TargetKind::File, &[&cloud], replace).contains("input itself"));
+        assert!(refusal(&model, TargetKind::Folder, &[&cloud], replace).contains("contains the input"));
+        assert!(refusal(&base.path().join("scenes"), TargetKind::Folder, &[&model], replace).contains("contains"));
         let detour = model.join("../../scenes/model");
-        assert!(refusal(&detour, Kind::Folder, &[&model], replace).contains("input itself"));
-        assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], replace).contains("lies inside the input"));
+        assert!(refusal(&detour, TargetKind::Folder, &[&model], replace).contains("input itself"));
+        assert!(
+            refusal(&model.join("smaller"), TargetKind::Folder, &[&model], replace).contains("lies inside the input")
+        );
     }
     // A path whose name only begins with the name of the input is not inside the input.
-    check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], Replace::Never).unwrap();
+    check_target(&base.path().join("scenes/model2"), TargetKind::Folder, &[&model], Replace::Never).unwrap();
 }
 
 #[cfg(unix)]
@@ -100,8 +102,8 @@ fn link_to_the_input_is_refused() {
     let (model, link) = (base.path().join("model"), base.path().join("link"));
     result_folder(&model, "");
     std::os::unix::fs::symlink(&model, &link).unwrap();
-    assert!(refusal(&link, Kind::Folder, &[&model], Replace::Existing).contains("input itself"));
-    assert!(refusal(&model, Kind::Folder, &[&link], Replace::Existing).contains("input itself"));
+    assert!(refusal(&link, TargetKind::Folder, &[&model], Replace::Existing).contains("input itself"));
+    assert!(refusal(&model, TargetKind::Folder, &[&link], Replace::Existing).contains("input itself"));
 }
 
 #[test]
@@ -109,22 +111,22 @@ fn overwrite_deletes_only_folders_this_program_wrote() {
     let base = tempfile::tempdir().unwrap();
     let home = base.path().join("home");
     write_file(&home.join("thesis.txt"), "years of work");
-    assert!(refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"));
+    assert!(refusal(&home, TargetKind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"));
     let unlisted = r#"{"tool": "splatsieve 0.1.0"}"#;
     for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#, unlisted] {
-        write_file(&home.join(MARKER), foreign);
+        write_file(&home.join(SUMMARY_FILE), foreign);
         assert!(
-            refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"),
+            refusal(&home, TargetKind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"),
             "{foreign}"
         );
     }
-    write_file(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
-    check_target(&home, Kind::Folder, &[], Replace::Existing).unwrap();
+    write_file(&home.join(SUMMARY_FILE), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
+    check_target(&home, TargetKind::Folder, &[], Replace::Existing).unwrap();
     let empty = base.path().join("empty");
     fs::create_dir(&empty).unwrap();
-    check_target(&empty, Kind::Folder, &[], Replace::Existing).unwrap();
-    assert!(refusal(&home, Kind::File, &[], Replace::Existing).contains("is a folder"));
-    assert!(refusal(&home.join("thesis.txt"), Kind::Folder, &[], Replace::Existing).contains("is no folder"));
+    check_target(&empty, TargetKind::Folder, &[], Replace::Existing).unwrap();
+    assert!(refusal(&home, TargetKind::File, &[], Replace::Existing).contains("is a folder"));
+    assert!(refusal(&home.join("thesis.txt"), TargetKind::Folder, &[], Replace::Existing).contains("is no folder"));
 }
 
 #[test]
@@ -143,11 +145,13 @@ fn folder_that_becomes_foreign_during_the_run_is_kept() {
 fn impossible_targets_are_refused() {
     let base = tempfile::tempdir().unwrap();
     write_file(&base.path().join("file"), "");
-    assert!(refusal(&base.path().join("no/such/out"), Kind::Folder, &[], Replace::Never).contains("create it first"));
-    assert!(refusal(&base.path().join("file/out"), Kind::File, &[], Replace::Never).contains("is not a folder"));
+    assert!(
+        refusal(&base.path().join("no/such/out"), TargetKind::Folder, &[], Replace::Never).contains("create it first")
+    );
+    assert!(refusal(&base.path().join("file/out"), TargetKind::File, &[], Replace::Never).contains("is not a folder"));
     for nameless in ["", "/", ".."] {
         assert!(
-            refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing)
+            refusal(Path::new(nameless), TargetKind::Folder, &[], Replace::Existing)
                 .contains("cannot be the name of an output"),
             "{nameless}"
         );
@@ -242,7 +246,7 @@ fn foreign_files_in_a_result_are_kept() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     let staged = StagedFolder::new(&target, Replace::Never).unwrap();
-    for name in [MARKER, "a/own", "a/b/own", "only/own"] {
+    for name in [SUMMARY_FILE, "a/own", "a/b/own", "only/own"] {
         write_file(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
     staged.commit().unwrap();
@@ -250,7 +254,7 @@ fn foreign_files_in_a_result_are_kept() {
     foreign.iter().for_each(|name| write_file(&target.join(name), name));
     fs::create_dir(target.join("empty")).unwrap();
     let staged = StagedFolder::new(&target, Replace::Existing).unwrap();
-    for name in [MARKER, "a/own", "file", "folder/own", "file in the new one"] {
+    for name in [SUMMARY_FILE, "a/own", "file", "folder/own", "file in the new one"] {
         write_file(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
     staged.commit().unwrap();
@@ -268,7 +272,7 @@ fn foreign_files_in_a_result_are_kept() {
             "file.kept",
             "folder/own",
             "folder/theirs",
-            MARKER
+            SUMMARY_FILE
         ]
     );
     assert!(target.join("empty").is_dir() && !target.join("only").exists());
@@ -284,14 +288,14 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     let staged = StagedFolder::new(&target, Replace::Never).unwrap();
-    write_file(&staged.path().join(MARKER), "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1]\n}\n");
+    write_file(&staged.path().join(SUMMARY_FILE), "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1]\n}\n");
     write_file(&staged.path().join("b/\"quoted\""), "");
     staged.commit().unwrap();
-    let text = fs::read_to_string(target.join(MARKER)).unwrap();
+    let text = fs::read_to_string(target.join(SUMMARY_FILE)).unwrap();
     let head = "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1],\n  \"files\": [\n";
-    assert_eq!(text, format!("{head}    \"b/\\\"quoted\\\"\",\n    \"{MARKER}\"\n  ]\n}}\n"));
+    assert_eq!(text, format!("{head}    \"b/\\\"quoted\\\"\",\n    \"{SUMMARY_FILE}\"\n  ]\n}}\n"));
     let staged = StagedFolder::new(&base.path().join("broken"), Replace::Never).unwrap();
-    write_file(&staged.path().join(MARKER), "no json");
+    write_file(&staged.path().join(SUMMARY_FILE), "no json");
     assert!(staged.commit().unwrap_err().to_string().contains("expected a JSON object"));
     assert_eq!(names_in(base.path()), ["out"]);
 }
@@ -301,8 +305,8 @@ fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
     let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
     write_file(staged.path(), text);
-    write_file(&staged.companion(0), r#"{"tool": "splatsieve 0.1.0"}"#);
-    write_file(&staged.companion(1), text);
+    write_file(&staged.companion_path(0), r#"{"tool": "splatsieve 0.1.0"}"#);
+    write_file(&staged.companion_path(1), text);
     Ok(staged)
 }
 
@@ -336,7 +340,7 @@ fn a_killed_publication_is_completed_by_the_next_run() {
     for published in 0..=3 {
         let base = tempfile::tempdir().unwrap();
         leave_half_published(base.path(), published, Replace::Never);
-        assert!(refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never).contains("exists already"));
+        assert!(refusal(&base.path().join("x.ply"), TargetKind::File, &[], Replace::Never).contains("exists already"));
         assert_eq!(names_in(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
         for name in names_in(base.path()) {
             assert_eq!(fs::read_to_string(base.path().join(name)).unwrap(), "of the killed run");
@@ -350,7 +354,7 @@ fn a_killed_publication_is_never_completed_over_a_later_one() {
     let staged = stage_set(base.path(), "new", Replace::Existing).unwrap();
     leave_half_published(base.path(), 1, Replace::Existing);
     staged.commit().unwrap();
-    check_target(&base.path().join("x.ply"), Kind::File, &[], Replace::Existing).unwrap();
+    check_target(&base.path().join("x.ply"), TargetKind::File, &[], Replace::Existing).unwrap();
     assert_eq!(names_in(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
     assert_eq!(fs::read_to_string(base.path().join("x.ply.recipe.toml")).unwrap(), "new");
@@ -361,7 +365,7 @@ fn a_killed_publication_does_not_replace_a_file_that_came_later() {
     let base = tempfile::tempdir().unwrap();
     leave_half_published(base.path(), 1, Replace::Never);
     write_file(&base.path().join("x.ply"), "precious");
-    refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never);
+    refusal(&base.path().join("x.ply"), TargetKind::File, &[], Replace::Never);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "precious");
     assert!(take_warnings().iter().any(|warning| warning.contains("could not be repaired")));
 }

@@ -203,9 +203,9 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// Guard that keeps this process from giving outputs their final names and from removing outputs; see [`withdraw_all`].
+/// Guard that keeps this process from giving outputs their final names and from removing outputs; see [`remove_unfinished`].
 #[must_use = "runs go on as soon as this is dropped"]
-pub struct Withdrawn(
+pub struct ExitGuard(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
 );
 
@@ -213,7 +213,7 @@ pub struct Withdrawn(
 ///
 /// First waits until a result that is being moved to its final name is complete. Files outside workspaces (hidden
 /// output folders) stay.
-pub fn withdraw_all() -> Withdrawn {
+pub fn remove_unfinished() -> ExitGuard {
     let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
         if UNFINISHED.iter().any(|name| exists(&folder.join(name))) {
@@ -230,7 +230,7 @@ pub fn withdraw_all() -> Withdrawn {
             std::thread::sleep(Duration::from_millis(1));
         }
     }
-    Withdrawn(live)
+    ExitGuard(live)
 }
 
 /// Creates and locks the lock file in the new folder `folder` and writes the marker line. Returns `None` if another run

@@ -25,7 +25,7 @@ use super::CameraOptions;
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::{CameraFields, place};
 use super::image_list::each_image;
-use super::times::{self, Times};
+use super::times::{self, TimesSource};
 use crate::error::Result;
 use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
@@ -88,7 +88,7 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     assembly.begin(file, count)?;
     let mut origin = shown_name(file);
     let mut times = Vec::new();
-    if options.times != Times::Own {
+    if options.times != TimesSource::Own {
         let mut names: Vec<Box<str>> = Vec::new();
         each_image(file, None, &["img_name"], |index, camera| {
             let name = match camera.get("img_name") {

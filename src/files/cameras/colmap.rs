@@ -16,7 +16,7 @@ use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
 use super::assemble::{Assembly, ListedImage, MemoryCounter};
-use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, Times, frames, times};
+use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, TimesSource, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::open::open_file;
@@ -117,7 +117,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             view: None,
         })
     };
-    if let (Some(first), Times::Own) = (frames::find(&folder), &options.times) {
+    if let (Some(first), TimesSource::Own) = (frames::find(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
         if listed.len().saturating_mul(frames) > MAX_IMAGES {
             return Err(Error::usage(format!(

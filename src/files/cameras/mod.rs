@@ -42,7 +42,7 @@ use crate::limits::ReadLimit;
 use crate::model::Rig;
 
 use image_list::outline;
-pub use times::Times;
+pub use times::TimesSource;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
 /// Largest image side in pixels. Above it, the number of pixels of one image approaches 2³².
@@ -79,16 +79,16 @@ pub struct CameraOptions {
     /// (default: the number of consecutive folders).
     pub frames: Option<usize>,
     /// Source of the times of images whose camera file has none.
-    pub times: Times,
+    pub times: TimesSource,
     /// Meaning of the times in `transforms*.json`.
-    pub clock: Clock,
+    pub clock: TimeConvention,
     /// Maximum memory in bytes that reading the cameras may take.
     pub memory: ReadLimit,
 }
 
 /// Meaning of the times in `transforms*.json`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Clock {
+pub enum TimeConvention {
     /// Times in any unit. They are divided by the largest time, as the loaders of D-NeRF do.
     #[default]
     Normalized,
@@ -115,7 +115,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
         return colmap::load(&file, options);
     }
     let timed = || match options.times {
-        Times::Own => Ok(()),
+        TimesSource::Own => Ok(()),
         _ => Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.shown()))),
     };
     if file.ends_with(NERFIES) {
@@ -147,7 +147,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
 ///
 /// A relative path is tried from the working folder, then from each parent folder of the model folder, the nearest
 /// first. Returns `None` when no camera file is found; never fails.
-pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
+pub fn find_training_cameras(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     if source_path.is_empty() {
         return None;
     }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use serde_json::{Value, json};
 
-use super::{CameraOptions, find, load};
+use super::{CameraOptions, find_training_cameras, load};
 use crate::model::{Camera, Rig, Split};
 
 /// Returns the folders of three trained models, below the folder `SPLATSIEVE_DATA`, else below `../shared/data`. They
@@ -316,7 +316,7 @@ fn cameras_of_a_3dgs_folder_see_every_frame() {
     assert_eq!(rig.cameras[0].center(), DVec3::new(1.0, 0.0, -3.0));
     // The camera-to-world rotation maps forward (z) to the world's x, so world x must map to forward.
     assert_eq!(rig.cameras[0].rotation * DVec3::X, DVec3::Z);
-    assert_eq!(rig.schedule(&[0.0, 1.0, 2.0], None).unwrap().pairs(), 6);
+    assert_eq!(rig.schedule(&[0.0, 1.0, 2.0], None).unwrap().pair_count(), 6);
 }
 
 #[test]
@@ -465,15 +465,19 @@ fn source_path_is_found_from_any_parent_folder() {
     let root = tempfile::tempdir().unwrap();
     let model = root.path().join("output/deep/model");
     fs::create_dir_all(&model).unwrap();
-    assert_eq!(find("data/scene", &model), None);
+    assert_eq!(find_training_cameras("data/scene", &model), None);
     fs::create_dir_all(root.path().join("data/scene")).unwrap();
-    assert_eq!(find("data/scene", &model), None, "a folder without cameras is not it");
+    assert_eq!(find_training_cameras("data/scene", &model), None, "a folder without cameras is not it");
     fs::write(root.path().join("data/scene/transforms.json"), "{}").unwrap();
-    assert_eq!(find("data/scene", &model), Some(root.path().join("data/scene")));
+    assert_eq!(find_training_cameras("data/scene", &model), Some(root.path().join("data/scene")));
     fs::create_dir_all(root.path().join("output/data/scene")).unwrap();
     fs::write(root.path().join("output/data/scene/cameras.json"), "{}").unwrap();
-    assert_eq!(find("data/scene", &model), Some(root.path().join("output/data/scene")), "the nearest wins");
+    assert_eq!(
+        find_training_cameras("data/scene", &model),
+        Some(root.path().join("output/data/scene")),
+        "the nearest wins"
+    );
     let absolute = root.path().join("data/scene");
-    assert_eq!(find(absolute.to_str().unwrap(), &model), Some(absolute));
-    assert_eq!(find("", &model), None);
+    assert_eq!(find_training_cameras(absolute.to_str().unwrap(), &model), Some(absolute));
+    assert_eq!(find_training_cameras("", &model), None);
 }

@@ -21,7 +21,7 @@ const TABLE_ENTRY_BYTES: u64 = 3 * 40 + 32;
 
 /// Source of the times of images.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub enum Times {
+pub enum TimesSource {
     /// Default of the format. COLMAP: the numbers in the image names, if all names have one. Other formats: the times
     /// in the camera file.
     #[default]
@@ -34,23 +34,23 @@ pub enum Times {
     Table(PathBuf),
 }
 
-impl Times {
+impl TimesSource {
     /// Parses the value of `--times`: `names`, `none`, or the path of a table.
-    pub fn named(text: &str) -> Times {
+    pub fn parse(text: &str) -> TimesSource {
         match text {
-            "names" => Times::Names,
-            "none" => Times::None,
-            table => Times::Table(table.into()),
+            "names" => TimesSource::Names,
+            "none" => TimesSource::None,
+            table => TimesSource::Table(table.into()),
         }
     }
 
-    /// Returns the text from which [`Times::named`] parses this value; `None` for [`Times::Own`].
+    /// Returns the text from which [`TimesSource::parse`] parses this value; `None` for [`TimesSource::Own`].
     pub fn name(&self) -> Option<String> {
         match self {
-            Times::Own => None,
-            Times::Names => Some("names".to_owned()),
-            Times::None => Some("none".to_owned()),
-            Times::Table(table) => Some(table.to_string_lossy().into_owned()),
+            TimesSource::Own => None,
+            TimesSource::Names => Some("names".to_owned()),
+            TimesSource::None => Some("none".to_owned()),
+            TimesSource::Table(table) => Some(table.to_string_lossy().into_owned()),
         }
     }
 }
@@ -64,14 +64,14 @@ impl Times {
 pub(super) fn resolve(
     file: &Path,
     names: &[Box<str>],
-    times: &Times,
+    times: &TimesSource,
     counter: &mut MemoryCounter,
 ) -> Result<(Vec<Option<f64>>, String)> {
     counter.take(file, "", "the times of its images", 40 * names.len() as u64)?;
     let none = || Ok((Vec::new(), String::new()));
     match times {
-        Times::None => none(),
-        Times::Table(table) => {
+        TimesSource::None => none(),
+        TimesSource::Table(table) => {
             let known = read_table(table, counter)?;
             let time = |name: &str| {
                 let time = keys(name).find_map(|key| known.get(key)).copied();
@@ -83,10 +83,10 @@ pub(super) fn resolve(
             let given = names.iter().map(|name| time(name)).collect::<Result<Vec<_>>>()?;
             Ok((given, format!("times from {}", shown_name(table))))
         }
-        Times::Own | Times::Names => {
+        TimesSource::Own | TimesSource::Names => {
             let numbers: Vec<Option<u64>> = names.iter().map(|name| number(name)).collect();
             if let Some(at) = numbers.iter().position(Option::is_none) {
-                if *times == Times::Own {
+                if *times == TimesSource::Own {
                     return none();
                 }
                 return Err(Error::input(

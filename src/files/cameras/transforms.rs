@@ -8,7 +8,7 @@
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
-//! that reach 1 give the same times. For models whose time has another unit, times are used as they are ([`Clock`]).
+//! that reach 1 give the same times. For models whose time has another unit, times are used as they are ([`TimeConvention`]).
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ use glam::{DMat3, DVec3};
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
 use super::image_list::{each_image, outline};
-use super::{CameraOptions, Clock};
+use super::{CameraOptions, TimeConvention};
 use crate::error::{Result, ShowPath};
 use crate::files::image::measure;
 use crate::files::json::small::SmallValue;
@@ -49,7 +49,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
         add(&mut assembly, file, options)?;
     }
     let latest = assembly.latest(latest);
-    if latest > 0.0 && options.clock == Clock::Normalized {
+    if latest > 0.0 && options.clock == TimeConvention::Normalized {
         assembly.divide_times(latest);
     }
     let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();

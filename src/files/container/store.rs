@@ -11,7 +11,7 @@ use super::held::HeldTiles;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficients};
-use crate::source::Count;
+use crate::source::SharedCounter;
 
 /// Open container file whose columns are all attributes of Gaussians.
 pub struct Container {
@@ -25,7 +25,7 @@ pub struct Container {
     /// Decoded tiles kept in memory; created when the first tile may be kept.
     pub(super) held: OnceLock<HeldTiles>,
     /// Number of states (one Gaussian at one frame) read so far.
-    pub(super) states: Count,
+    pub(super) states: SharedCounter,
 }
 
 /// Buffers in which a tile is decoded.
@@ -106,7 +106,7 @@ impl Container {
             places,
             scratch: Mutex::default(),
             held: OnceLock::new(),
-            states: Count::default(),
+            states: SharedCounter::default(),
         })
     }
 

@@ -57,7 +57,7 @@ impl FrameValues {
 /// Reader of some Gaussians of a container.
 ///
 /// Memory in bytes per Gaussian, for each column that varies over time: 4 × width × frames kept. The frames kept are
-/// those of a frame block that will be read, but at most the number given by [`ReadPlan::holding`]. If this is a whole
+/// those of a frame block that will be read, but at most the number given by [`ReadPlan::keeping_at_most`]. If this is a whole
 /// frame block, add 8 × width. Raw (uncompressed) tiles that are read whole take the same amount of mapped memory if a
 /// whole frame block may be kept, else none. No memory is used if only one frame is kept, for columns that do not vary,
 /// and for tiles that the container keeps in memory.
@@ -107,7 +107,7 @@ impl<'a> TileReader<'a> {
             len: ids.len(),
             runs,
             whole,
-            plan: ReadPlan::every(),
+            plan: ReadPlan::all_frames(),
             announced_block: None,
             kept: source.places.iter().map(|_| KeptColumn::Nothing).collect(),
             entered: 0,
@@ -160,14 +160,14 @@ impl<'a> TileReader<'a> {
         let reader = &self.source.reader;
         let block = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64);
         let block = block.start as usize..block.end as usize;
-        let mut frames = self.plan.between(frame, block.end);
+        let mut frames = self.plan.frames_between(frame, block.end);
         if frames.len() == 1 {
             return Ok(false);
         }
         if self.whole {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
             let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
-            let all = self.plan.held() >= block.len();
+            let all = self.plan.max_kept_frames() >= block.len();
             // A decompressed tile takes the memory of all its frames, so keep one only if more than half of its frames
             // are needed.
             if raw || all && 2 * frames.len() > block.len() {
@@ -187,14 +187,14 @@ impl<'a> TileReader<'a> {
                 return Ok(true);
             }
         }
-        if self.plan.held() == 1 {
+        if self.plan.max_kept_frames() == 1 {
             return Ok(false);
         }
         let mut kept = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
             KeptColumn::Values(kept) => kept,
             _ => FrameValues::default(),
         };
-        frames.truncate(self.plan.held());
+        frames.truncate(self.plan.max_kept_frames());
         let constant = self.is_constant(place, frame_block)?;
         if constant {
             frames.truncate(1);
@@ -302,16 +302,20 @@ impl<'a> TileReader<'a> {
     fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);
-        if self.announced_block == Some(frame_block) || self.plan.held() < reader.layout().frame_block as usize {
+        if self.announced_block == Some(frame_block)
+            || self.plan.max_kept_frames() < reader.layout().frame_block as usize
+        {
             return;
         }
         let now = self.announced_block.is_none().then_some((frame_block, want));
         self.announced_block = Some(frame_block);
         let end = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64).end as usize;
-        let next = self.plan.next(end).map(|next| (self.frame_block(next), want & source.info.varying));
+        let next = self.plan.next_planned(end).map(|next| (self.frame_block(next), want & source.info.varying));
         for (frame_block, columns) in now.into_iter().chain(next) {
             let runs = self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block);
-            reader.expect(runs.flat_map(|runs| source.unheld(columns, runs[0].gaussian_block, frame_block)));
+            reader.prefetch_in_background(
+                runs.flat_map(|runs| source.unheld(columns, runs[0].gaussian_block, frame_block)),
+            );
         }
     }
 

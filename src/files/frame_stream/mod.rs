@@ -76,17 +76,17 @@ impl<R: Read> FrameStream<R> {
     }
 
     /// Returns the attributes that are constant over all frames. The varying attributes in it are empty.
-    pub fn constant(&self) -> &Gaussians {
+    pub fn constant_attributes(&self) -> &Gaussians {
         &self.constant
     }
 
-    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant`] is empty.
-    pub fn take_constant(&mut self) -> Gaussians {
+    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant_attributes`] is empty.
+    pub fn take_constant_attributes(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }
 
     /// Returns the number of bytes received so far.
-    pub fn received(&self) -> u64 {
+    pub fn received_bytes(&self) -> u64 {
         self.bytes.received
     }
 

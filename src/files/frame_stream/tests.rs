@@ -1,5 +1,5 @@
 use super::*;
-use crate::diagnostics::demo_scene::Scene;
+use crate::diagnostics::demo_scene::DemoScene;
 use crate::outputs::frame_stream::StreamWriter;
 use crate::source::{FrameSource, Ids};
 
@@ -8,15 +8,15 @@ const T: usize = 4;
 
 /// Returns a small scene, the bytes of its frame stream, and the offset of the mark before each frame and of the end
 /// mark.
-fn written() -> (Scene, Vec<u8>, Vec<usize>) {
-    let scene = Scene::new(N, T);
+fn written() -> (DemoScene, Vec<u8>, Vec<usize>) {
+    let scene = DemoScene::new(N, T);
     let info = scene.info();
     let header = StreamHeader { count: N, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
     let states = states(&scene);
     let mut bytes = Vec::new();
     let mut stream = StreamWriter::new(&mut bytes, Path::new("test"), header, &states[0]).unwrap();
     for (&time, state) in info.times.iter().zip(&states) {
-        stream.frame(time, state).unwrap();
+        stream.write_frame(time, state).unwrap();
     }
     stream.finish().unwrap();
     let frame = FrameMark::BYTES + header.frame_bytes() as usize;
@@ -25,7 +25,7 @@ fn written() -> (Scene, Vec<u8>, Vec<usize>) {
 }
 
 /// Returns the attributes of all Gaussians of the scene at each frame.
-fn states(scene: &Scene) -> Vec<Gaussians> {
+fn states(scene: &DemoScene) -> Vec<Gaussians> {
     let mut reader = scene.open(Ids::Range(0..N)).unwrap();
     (0..T)
         .map(|t| {
@@ -39,7 +39,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
 /// Reads a frame stream. Returns the time and all attributes of each frame.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
-    let mut state = stream.constant().clone();
+    let mut state = stream.constant_attributes().clone();
     let mut frames = Vec::new();
     while let Some(time) = stream.next_frame(&mut state)? {
         frames.push((time, state.clone()));
@@ -87,7 +87,7 @@ fn nan_bits_and_any_set_of_varying_attributes_survive() {
         let header = StreamHeader { count: 2, sh_degree: 0, varying, is_unlinked: false };
         let mut bytes = Vec::new();
         let mut stream = StreamWriter::new(&mut bytes, Path::new("test"), header, &state).unwrap();
-        stream.frame(-1.5, &state).unwrap();
+        stream.write_frame(-1.5, &state).unwrap();
         stream.finish().unwrap();
         let frames = read(&bytes[..]).unwrap();
         let found: Vec<u32> = frames[0].1.rotation.planes().iter().map(|value| value.to_bits()).collect();
@@ -103,7 +103,7 @@ fn a_stream_may_have_no_gaussians_or_no_frames() {
         let state = Gaussians::zeros(0, 3);
         let mut bytes = Vec::new();
         let mut stream = StreamWriter::new(&mut bytes, Path::new("test"), header, &state).unwrap();
-        (0..frames).for_each(|t| stream.frame(f64::from(t), &state).unwrap());
+        (0..frames).for_each(|t| stream.write_frame(f64::from(t), &state).unwrap());
         stream.finish().unwrap();
         assert_eq!(bytes.len(), 32 + 24 * (frames as usize + 1));
         assert_eq!(read(&bytes[..]).unwrap().len(), frames as usize);
@@ -211,9 +211,9 @@ fn the_writer_refuses_illegal_frames() {
     let header = StreamHeader { count: 3, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
     let state = Gaussians::zeros(3, 0);
     let mut stream = StreamWriter::new(Vec::new(), Path::new("test"), header, &state).unwrap();
-    stream.frame(1.0, &state).unwrap();
+    stream.write_frame(1.0, &state).unwrap();
     for time in [1.0, 0.5, f64::NAN, f64::INFINITY] {
-        assert!(stream.frame(time, &state).is_err(), "{time}");
+        assert!(stream.write_frame(time, &state).is_err(), "{time}");
     }
-    assert!(stream.frame(2.0, &Gaussians::zeros(4, 0)).is_err());
+    assert!(stream.write_frame(2.0, &Gaussians::zeros(4, 0)).is_err());
 }

@@ -10,7 +10,7 @@ use super::{AXIS_SIGNS, BINARY, EXTENSION, JSON, MAGIC, VERSION, sh_attribute};
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::check_positions;
-use crate::model::{Gaussians, color, opacity};
+use crate::model::{Gaussians, color_from_sh, opacity};
 
 /// Component types of glTF accessors.
 const F32: u32 = 5126;
@@ -152,7 +152,7 @@ fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
         component: U8,
         bytes: 4,
         write: Box::new(move |row, out| {
-            let rgb = state.sh.row::<3>(row).map(|dc| byte(linear(color(dc).clamp(0.0, 1.0))));
+            let rgb = state.sh.row::<3>(row).map(|dc| byte(linear(color_from_sh(dc).clamp(0.0, 1.0))));
             out.extend(rgb);
             out.push(byte(opacity(state.opacity_logit.row::<1>(row)[0])));
         }),

@@ -17,7 +17,7 @@ use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// One row (Gaussian) of a compressed PLY file.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct OutRow {
+pub struct OutputRow {
     /// Index of the Gaussian in the original file (template) whose row is copied: the Gaussian itself, or the leader
     /// (most important Gaussian) of its merged cluster.
     pub source: u32,
@@ -27,8 +27,8 @@ pub struct OutRow {
 }
 
 /// Returns the rows of the PLY file to be written for the compressed model `reduction`.
-pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
-    let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
+pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
+    let mut rows: Vec<OutputRow> = reduction.kept.iter().map(|&source| OutputRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
     }
@@ -53,9 +53,9 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
 /// # Errors
 /// Fails if a source or proxy does not exist, if the proxies have another SH degree, if `change` has another number of
 /// rows, if the template was truncated since it was opened, or if the file cannot be written.
-pub fn write_like(
+pub fn write_like_template(
     template: &Ply,
-    rows: &[OutRow],
+    rows: &[OutputRow],
     proxies: &Gaussians,
     change: &ParamDelta,
     sh_degree: usize,
@@ -257,8 +257,8 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
 }
 
 /// Checks that all rows and proxies named in `rows` exist, and that the shapes of `proxies` and `change` match them.
-fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
-    for column in change.columns().iter() {
+fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
+    for column in change.attributes().iter() {
         let changes = change.0.column(column).len();
         if changes != rows.len() {
             let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
@@ -298,7 +298,7 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
 /// Adds the parameter delta (change of the stored values) of output row `place` to the bytes `row` of this row.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
-    for column in change.columns().iter() {
+    for column in change.attributes().iter() {
         let by = change.0.column(column);
         for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
             let by = by.plane(c)[place];

@@ -61,9 +61,10 @@ fn any_ids_read_the_same_bits() {
 #[test]
 fn a_single_file_is_one_constant_frame() {
     let folder = folder(1);
-    for sequence in
-        [PlySequence::single(&folder.path().join("f_0.ply"), &PlyOptions::default()), PlySequence::open(folder.path())]
-    {
+    for sequence in [
+        PlySequence::open_single(&folder.path().join("f_0.ply"), &PlyOptions::default()),
+        PlySequence::open(folder.path()),
+    ] {
         let sequence = sequence.unwrap();
         assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Attributes::empty(), &[0.0][..]));
         let mut out = Gaussians::zeros(0, 1);

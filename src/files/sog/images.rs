@@ -184,7 +184,7 @@ pub fn decode_by_codebook(codebook: &Codebook, pixel: [u8; 4]) -> Option<[f32; 3
 }
 
 /// Returns the byte of an opacity in [0, 1].
-pub fn opacity_code(opacity: f64) -> u8 {
+pub fn encode_opacity(opacity: f64) -> u8 {
     (255.0 * opacity).round() as u8
 }
 
@@ -284,7 +284,7 @@ mod tests {
 
         #[test]
         fn opacities_are_within_half_a_step(opacity in 0.0f64..1.0) {
-            let found = crate::model::opacity(decode_opacity(opacity_code(opacity)));
+            let found = crate::model::opacity(decode_opacity(encode_opacity(opacity)));
             prop_assert!((found - opacity).abs() <= 0.5 / 255.0 + 1e-7);
         }
     }

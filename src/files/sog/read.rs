@@ -12,7 +12,7 @@ use super::codebook::Codebook;
 use super::images::{
     Range3, decode_by_codebook, decode_label, decode_opacity, decode_position, decode_rotation, palette_entry,
 };
-use super::{META, Meta, PaletteEntry, VERSION};
+use super::{META_FILE, Meta, PaletteEntry, VERSION};
 use crate::error::{Error, Result, quoted};
 use crate::files::json::{ParseAbort, read_from};
 use crate::files::open::{open_file, read_small};
@@ -44,7 +44,7 @@ const MAX_CODEBOOK_VALUE: f32 = 1e30;
 /// Fails if the file is damaged, has another version than 2, or needs more memory than `memory`.
 pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let mut files = if path.is_dir() { Files::Folder(path.to_owned()) } else { Files::open_archive(path)? };
-    let text = files.read(path, META, ReadLimit::new(MAX_META_BYTES))?;
+    let text = files.read(path, META_FILE, ReadLimit::new(MAX_META_BYTES))?;
     decode(&parse(&text, path)?, &mut files, path, memory)
 }
 
@@ -174,7 +174,7 @@ impl Files {
             }
             Files::Folder(folder) => {
                 if name.is_empty() || name.contains(['/', '\\', ':']) || name.starts_with('.') {
-                    return Err(Error::input(path, META, "names of files in this folder", quoted(name)));
+                    return Err(Error::input(path, META_FILE, "names of files in this folder", quoted(name)));
                 }
                 read_small(&folder.join(name), memory.bytes(), "an image")
             }
@@ -184,7 +184,7 @@ impl Files {
 
 /// Parses `meta.json`, whose text is `text`.
 fn parse(text: &[u8], path: &Path) -> Result<Meta> {
-    let value = read_from(text, &path.join(META), &ParseAbort::default(), PhantomData::<Value>)?;
+    let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
     if value["version"] != VERSION {
         let found = match &value["version"] {
             Value::Null => "none, as in version 1".to_owned(),
@@ -193,8 +193,9 @@ fn parse(text: &[u8], path: &Path) -> Result<Meta> {
         return Err(Error::input(path, "meta.json, version", VERSION.to_string(), found)
             .hint("splat-transform of PlayCanvas converts other versions: splat-transform OLD.sog NEW.ply"));
     }
-    serde_json::from_value(value)
-        .map_err(|error| Error::input(path, META, "the members of version 2 of the format", quoted(&error.to_string())))
+    serde_json::from_value(value).map_err(|error| {
+        Error::input(path, META_FILE, "the members of version 2 of the format", quoted(&error.to_string()))
+    })
 }
 
 /// Returns the range of the logarithmic coordinates.

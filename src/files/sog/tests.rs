@@ -8,21 +8,21 @@ use serde_json::{Value, json};
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use super::META;
+use super::META_FILE;
 use super::images::{log_coordinate, morton_order};
 use super::read::read_sog;
 use super::write::write_sog;
-use crate::diagnostics::demo_scene::Scene;
+use crate::diagnostics::demo_scene::DemoScene;
 use crate::error::Error;
 use crate::files::tests::gaussians_with_sh;
 use crate::limits::ReadLimit;
-use crate::model::{Attributes, Gaussians, color, opacity};
+use crate::model::{Attributes, Gaussians, color_from_sh, opacity};
 use crate::passes::gather_all;
 
 /// Returns `count` Gaussians without any symmetry, with SH degree `degree`.
 fn gaussians(count: usize, degree: usize) -> Gaussians {
     let mut state = gaussians_with_sh(count, degree);
-    let plain = gather_all(&Scene::new(count, 1), 0, Attributes::SH).unwrap();
+    let plain = gather_all(&DemoScene::new(count, 1), 0, Attributes::SH).unwrap();
     state.sh.planes_mut()[..3 * count].copy_from_slice(&plain.sh.planes()[..3 * count]);
     state.position.plane_mut(0).iter_mut().for_each(|x| *x = 40.0 * *x + 100.0);
     state
@@ -55,7 +55,7 @@ fn assert_near(found: &Gaussians, state: &Gaussians) {
     near(found.log_scale.planes(), scales, range(scales) / 200.0, "scale");
     near(&found.sh.planes()[3 * state.len()..], more, range(more) / 200.0, "SH coefficient");
     for i in 0..state.len() {
-        let [a, b] = [found, state].map(|state| state.sh.row::<3>(i).map(color));
+        let [a, b] = [found, state].map(|state| state.sh.row::<3>(i).map(color_from_sh));
         assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1.0 / 255.0), "color {i}: {a:?}, expected {b:?}");
         let [a, b] = [found, state].map(|state| opacity(state.opacity_logit.row::<1>(i)[0]));
         assert!((a - b).abs() <= 0.5 / 255.0 + 1e-7, "opacity {i}: {a}, expected {b}");
@@ -108,7 +108,7 @@ fn archive_is_the_one_that_strict_players_read() {
         assert_eq!(file.compression(), CompressionMethod::Stored, "{}", file.name());
         names.push(file.name().to_owned());
     }
-    assert_eq!(names.last().unwrap(), META);
+    assert_eq!(names.last().unwrap(), META_FILE);
     let meta = meta_of(&bytes);
     assert_eq!((&meta["version"], &meta["count"], &meta["shN"]["bands"]), (&json!(2), &json!(50), &json!(1)));
     for entry in ["scales", "sh0", "shN"] {
@@ -119,7 +119,7 @@ fn archive_is_the_one_that_strict_players_read() {
 /// Returns the `meta.json` of an archive.
 fn meta_of(bytes: &[u8]) -> Value {
     let mut archive = ZipArchive::new(Cursor::new(bytes)).unwrap();
-    serde_json::from_reader(archive.by_name(META).unwrap()).unwrap()
+    serde_json::from_reader(archive.by_name(META_FILE).unwrap()).unwrap()
 }
 
 /// Returns a copy of an archive with another `meta.json`; `edit_file` may change the other files.
@@ -133,7 +133,7 @@ fn with_meta(bytes: &[u8], meta: &[u8], edit_file: impl Fn(&str, &mut Vec<u8>)) 
         let name = file.name().to_owned();
         edit_file(&name, &mut content);
         out.start_file(&name, FileOptions::default().compression_method(CompressionMethod::Deflated)).unwrap();
-        out.write_all(if name == META { meta } else { &content }).unwrap();
+        out.write_all(if name == META_FILE { meta } else { &content }).unwrap();
     }
     out.finish().unwrap().into_inner()
 }

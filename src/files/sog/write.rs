@@ -11,17 +11,17 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use super::codebook::Codebook;
 use super::images::{
-    ImageSize, decode_by_codebook, decode_opacity, decode_position, encode_by_codebook, encode_labels, encode_palette,
-    encode_positions, encode_rotation, morton_order, opacity_code, palette_entry,
+    ImageSize, decode_by_codebook, decode_opacity, decode_position, encode_by_codebook, encode_labels, encode_opacity,
+    encode_palette, encode_positions, encode_rotation, morton_order, palette_entry,
 };
 use super::palette::Palette;
-use super::{Asset, CodebookEntry, ImageEntry, META, MeansEntry, Meta, PaletteEntry, VERSION};
+use super::{Asset, CodebookEntry, ImageEntry, META_FILE, MeansEntry, Meta, PaletteEntry, VERSION};
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::accuracy::{Accuracy, RenderedAttributes, check_positions};
+use crate::files::accuracy::{CodingErrors, RenderedAttributes, check_positions};
 use crate::files::webp::RgbaImage;
 use crate::files::zip_output::ZipOutput;
-use crate::model::{Gaussians, color, opacity};
+use crate::model::{Gaussians, color_from_sh, opacity};
 
 /// Largest magnitude of ln s that is stored: beyond, a Gaussian is smaller than any pixel or larger than any scene.
 const MAX_LOG_SCALE: f32 = 20.0;
@@ -84,14 +84,14 @@ pub(crate) fn write_archive(path: &Path, images: NamedImages, meta: &impl Serial
     for (name, image) in images {
         add(&name, &image.to_webp().map_err(failed)?)?;
     }
-    let text = serde_json::to_vec(meta).map_err(|error| Error::internal(format!("{META}: {error}")))?;
-    add(META, &text)?;
+    let text = serde_json::to_vec(meta).map_err(|error| Error::internal(format!("{META_FILE}: {error}")))?;
+    add(META_FILE, &text)?;
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
 /// Returns the Gaussians of `state` whose opacity is not stored as 0, in the same order.
-pub fn drawn(state: &Gaussians) -> Cow<'_, Gaussians> {
-    let is_drawn = |row: u32| opacity_code(opacity(state.opacity_logit.plane(0)[row as usize])) > 0;
+pub fn visible_only(state: &Gaussians) -> Cow<'_, Gaussians> {
+    let is_drawn = |row: u32| encode_opacity(opacity(state.opacity_logit.plane(0)[row as usize])) > 0;
     let rows: Vec<u32> = (0..state.len() as u32).filter(|&row| is_drawn(row)).collect();
     if rows.len() == state.len() { Cow::Borrowed(state) } else { Cow::Owned(state.pick(&rows)) }
 }
@@ -119,9 +119,9 @@ pub(crate) fn encode(
     let scales = encode_by_codebook(&log_scale, &scale_book, size, order, |_| 255);
     drop(log_scale);
     let quats = size.image(order, |row| encode_rotation(state.rotation.row(row)));
-    let alpha = |row: usize| opacity_code(opacity(state.opacity_logit.row::<1>(row)[0]));
+    let alpha = |row: usize| encode_opacity(opacity(state.opacity_logit.row::<1>(row)[0]));
     let sh0 = encode_by_codebook(&state.sh, &dc_book, size, order, alpha);
-    let mut accuracy = Accuracy::new(&state.position);
+    let mut accuracy = CodingErrors::new(&state.position);
     for (place, &row) in order.iter().enumerate() {
         let row = row as usize;
         let values =
@@ -130,7 +130,7 @@ pub(crate) fn encode(
             position: decode_position(&range, low.pixels[place], high.pixels[place]).map(f64::from),
             scale: values(&scale_book, &scales).map(|log| f64::from(log).exp()),
             opacity: opacity(decode_opacity(sh0.pixels[place][3])),
-            color: values(&dc_book, &sh0).map(color),
+            color: values(&dc_book, &sh0).map(color_from_sh),
         };
         accuracy.add(row, &RenderedAttributes::from_state(state, row), &found);
         if let Some(plane) = (0..state.sh.width()).find(|&plane| !state.sh.plane(plane)[row].is_finite()) {

@@ -8,7 +8,7 @@
 use half::f16;
 use serde::{Deserialize, Serialize};
 
-use super::{Splatv, SplatvGaussian, WORDS};
+use super::{Splatv, SplatvGaussian, WORDS_PER_GAUSSIAN};
 use crate::error::{Error, Result};
 use crate::files::defects::Defects;
 
@@ -65,7 +65,7 @@ pub(crate) fn has_zero_quaternion(row: &SplatvGaussian) -> bool {
 ///
 /// # Errors
 /// Fails if all rows of the file would be left out.
-pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, Option<Vec<u32>>)> {
+pub fn check_rows(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, Option<Vec<u32>>)> {
     let count = file.count();
     let mut found = Defects::new(count);
     let mut rows: Option<Vec<u32>> = None;
@@ -93,7 +93,7 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
 
 /// Repairs the words that store a row (Gaussian) that is kept: an infinite width becomes the largest finite
 /// half-precision value, and a quaternion that is 0 at every time becomes the identity.
-pub fn repair(words: &mut [u32; WORDS]) {
+pub fn repair_words(words: &mut [u32; WORDS_PER_GAUSSIAN]) {
     let row = SplatvGaussian::from_words(words);
     if row.width == f32::INFINITY {
         words[15] = (words[15] & 0xffff) | u32::from(f16::MAX.to_bits()) << 16;
@@ -108,7 +108,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::files::splatv::write::{words, write};
+    use crate::files::splatv::write::{encode_words, write_splatv};
 
     /// Returns a row (Gaussian) without defects.
     fn sound(x: f32) -> SplatvGaussian {
@@ -126,18 +126,18 @@ mod tests {
 
     /// Returns a file with one row (Gaussian) for each of `edits`. An edit may set half-precision values that only
     /// other programs write.
-    fn file(folder: &std::path::Path, edits: &[fn(&mut [u32; WORDS])]) -> Splatv {
+    fn file(folder: &std::path::Path, edits: &[fn(&mut [u32; WORDS_PER_GAUSSIAN])]) -> Splatv {
         let path = folder.join("rows.splatv");
-        let rows: Vec<[u32; WORDS]> = edits
+        let rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = edits
             .iter()
             .enumerate()
             .map(|(k, edit)| {
-                let mut row = words(&sound(k as f32));
+                let mut row = encode_words(&sound(k as f32));
                 edit(&mut row);
                 row
             })
             .collect();
-        write(&path, rows.len(), rows.into_iter(), &json!([])).unwrap();
+        write_splatv(&path, rows.len(), rows.into_iter(), &json!([])).unwrap();
         Splatv::open(&path).unwrap()
     }
 
@@ -147,11 +147,11 @@ mod tests {
         *word = (*word & 0xffff) | half << 16;
     }
 
-    const EDITS: [fn(&mut [u32; WORDS]); 12] = [
+    const EDITS: [fn(&mut [u32; WORDS_PER_GAUSSIAN]); 12] = [
         |_| (),
         |row| row[1] = f32::NAN.to_bits(),
         |row| row[2] = f32::NEG_INFINITY.to_bits(),
-        |row| *row = [0; WORDS],
+        |row| *row = [0; WORDS_PER_GAUSSIAN],
         |row| set_high(&mut row[15], 0xbc00),
         |row| set_high(&mut row[15], NAN),
         |row| set_high(&mut row[9], INFINITE),
@@ -176,11 +176,11 @@ mod tests {
                 |defect: Defect| found.kinds.iter().find(|kind| kind.what == defect.0).map_or(0, |kind| kind.rows);
             [NON_FINITE_POSITION, INVALID_WIDTH, NON_FINITE_VALUE, ZERO_QUATERNION, INFINITE_WIDTH].map(rows_with)
         };
-        let (found, rows) = inspect(&file, ZeroRotation::Drop).unwrap();
+        let (found, rows) = check_rows(&file, ZeroRotation::Drop).unwrap();
         // A row of zeros has the defects `INVALID_WIDTH` and `ZERO_QUATERNION`.
         assert_eq!((counts(&found), found.defective, found.dropped), ([3, 3, 2, 3, 2], 10, 9));
         assert_eq!(rows.unwrap(), [0, 9, 10]);
-        let (found, rows) = inspect(&file, ZeroRotation::Identity).unwrap();
+        let (found, rows) = check_rows(&file, ZeroRotation::Identity).unwrap();
         assert_eq!((counts(&found), found.defective, found.dropped), ([3, 3, 2, 3, 2], 10, 8));
         assert_eq!(rows.unwrap(), [0, 8, 9, 10]);
     }
@@ -188,15 +188,15 @@ mod tests {
     #[test]
     fn a_valid_file_has_no_defects_and_keeps_all_rows() {
         let folder = tempfile::tempdir().unwrap();
-        let (found, rows) = inspect(&file(folder.path(), &[EDITS[0]; 5]), ZeroRotation::Drop).unwrap();
+        let (found, rows) = check_rows(&file(folder.path(), &[EDITS[0]; 5]), ZeroRotation::Drop).unwrap();
         assert_eq!((found.is_empty(), rows), (true, None));
     }
 
     #[test]
     fn a_file_without_drawable_rows_is_refused_with_a_hint() {
         let folder = tempfile::tempdir().unwrap();
-        let refusal = |edits: &[fn(&mut [u32; WORDS])]| {
-            inspect(&file(folder.path(), edits), ZeroRotation::Drop).unwrap_err().to_string()
+        let refusal = |edits: &[fn(&mut [u32; WORDS_PER_GAUSSIAN])]| {
+            check_rows(&file(folder.path(), edits), ZeroRotation::Drop).unwrap_err().to_string()
         };
         let message = refusal(&[EDITS[8]; 3]);
         assert!(message.contains("zero quaternion in 3") && message.contains("--zero-rotation identity"), "{message}");
@@ -207,10 +207,10 @@ mod tests {
     #[test]
     fn repair_changes_only_width_and_rotation() {
         for (edit, expected) in [(8, [1.0, 0.0, 0.0, 0.0]), (9, [1.0, 0.0, 0.0, 0.0]), (10, [0.0; 4])] {
-            let mut row = words(&sound(1.0));
+            let mut row = encode_words(&sound(1.0));
             EDITS[edit](&mut row);
             let before = SplatvGaussian::from_words(&row);
-            repair(&mut row);
+            repair_words(&mut row);
             let after = SplatvGaussian::from_words(&row);
             let width = if before.width.is_finite() { before.width } else { 65504.0 };
             assert_eq!(after, SplatvGaussian { rotation: expected, width, ..before }, "edit {edit}");

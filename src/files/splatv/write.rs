@@ -11,9 +11,9 @@ use half::f16;
 use serde_json::{Value, json};
 
 use crate::error::{Error, Result};
-use crate::files::accuracy::{Accuracy, RenderedAttributes};
+use crate::files::accuracy::{CodingErrors, RenderedAttributes};
 use crate::files::cameras::virtual_rig;
-use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS, WORDS};
+use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS_PER_ROW, WORDS_PER_GAUSSIAN};
 use crate::model::RobustBox;
 use crate::model::{AttributeValues, Camera};
 
@@ -30,7 +30,7 @@ const TEXELS_PER_GAUSSIAN: usize = 4;
 /// precision become the largest finite value; NaN becomes 0. If half precision would turn the quaternion and its rate
 /// of change into 0, both are scaled so that the quaternion has length 1, or the quaternion becomes the identity,
 /// because players divide by the length of the quaternion.
-pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
+pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
         let held = if value.is_nan() { 0.0 } else { value.clamp(-most, most) };
@@ -72,8 +72,8 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
 
 /// Adds the errors between `row` and the values stored for it to `to`, as Gaussian `id`. The error of the path is
 /// measured over the times around its center at which the Gaussian is visible.
-pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
-    let held = SplatvGaussian::from_words(&words(row));
+pub fn add_errors(row: &SplatvGaussian, id: usize, to: &mut CodingErrors) {
+    let held = SplatvGaussian::from_words(&encode_words(row));
     let drawn = |row: &SplatvGaussian| RenderedAttributes {
         position: row.position.map(f64::from),
         scale: row.scale.map(f64::from),
@@ -91,7 +91,7 @@ pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
 
 /// Returns the JSON of a camera as it is listed in the file. The rows of `rotation` are those of the camera-to-world
 /// matrix.
-pub fn camera(camera: &Camera) -> Value {
+pub fn camera_json(camera: &Camera) -> Value {
     let to_world = camera.rotation.transpose();
     let position = -(to_world * camera.translation);
     let rotation: Vec<[f64; 3]> = (0..3).map(|row| to_world.row(row).to_array()).collect();
@@ -104,21 +104,26 @@ pub fn camera(camera: &Camera) -> Value {
 /// Returns the list of cameras for a model without cameras: one camera that sees most of the Gaussians at `positions`.
 pub fn default_cameras(positions: &AttributeValues) -> Value {
     let found = RobustBox::from_positions(positions);
-    virtual_rig(found.middle, found.extent())
+    virtual_rig(found.median, found.extent())
         .cameras
         .get(DEFAULT_CAMERA)
-        .map_or(json!([]), |camera| json!([self::camera(camera)]))
+        .map_or(json!([]), |camera| json!([self::camera_json(camera)]))
 }
 
 /// Writes `count` rows (Gaussians, as words) to a `.splatv` file at `path`. Viewers begin at the first of `cameras`.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
-pub fn write(path: &Path, count: usize, rows: impl Iterator<Item = [u32; WORDS]>, cameras: &Value) -> Result<()> {
-    let height = (TEXELS_PER_GAUSSIAN * count).div_ceil(TEXELS).max(1);
-    let size = TEXELS * height * ROW_BYTES / TEXELS_PER_GAUSSIAN;
+pub fn write_splatv(
+    path: &Path,
+    count: usize,
+    rows: impl Iterator<Item = [u32; WORDS_PER_GAUSSIAN]>,
+    cameras: &Value,
+) -> Result<()> {
+    let height = (TEXELS_PER_GAUSSIAN * count).div_ceil(TEXELS_PER_ROW).max(1);
+    let size = TEXELS_PER_ROW * height * ROW_BYTES / TEXELS_PER_GAUSSIAN;
     let text = json!([{
-        "type": "splat", "size": size, "texwidth": TEXELS, "texheight": height, "cameras": cameras,
+        "type": "splat", "size": size, "texwidth": TEXELS_PER_ROW, "texheight": height, "cameras": cameras,
     }]);
     let text = text.to_string();
     let write = |out: &mut dyn Write| {
@@ -166,7 +171,7 @@ mod tests {
         let path = folder.path().join("some.splatv");
         for count in [1, 1024, 1025] {
             let rows: Vec<SplatvGaussian> = (0..count).map(row).collect();
-            write(&path, rows.len(), rows.iter().map(words), &json!([{"id": 0}])).unwrap();
+            write_splatv(&path, rows.len(), rows.iter().map(encode_words), &json!([{"id": 0}])).unwrap();
             let read = Splatv::open(&path).unwrap();
             assert_eq!((read.count(), read.cameras()[0]["id"].as_u64()), (count as usize, Some(0)));
             let bytes = std::fs::metadata(&path).unwrap().len();
@@ -183,7 +188,7 @@ mod tests {
                 );
                 assert_eq!(SplatvGaussian { rgb: expected.rgb, opacity: expected.opacity, ..found }, *expected);
                 assert_eq!(
-                    words(&SplatvGaussian { rgb: expected.rgb, opacity: expected.opacity, ..found }),
+                    encode_words(&SplatvGaussian { rgb: expected.rgb, opacity: expected.opacity, ..found }),
                     read.words(i)
                 );
             }
@@ -193,7 +198,7 @@ mod tests {
     #[test]
     fn zero_quaternions_are_never_written() {
         let rotation = |rotation| {
-            SplatvGaussian::from_words(&words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
+            SplatvGaussian::from_words(&encode_words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
         };
         assert_eq!(rotation([0.0; 4]), [1.0, 0.0, 0.0, 0.0]);
         assert_eq!(rotation([0.0, 3e-9, 0.0, -4e-9]).map(|x| (100.0 * x).round()), [0.0, 60.0, 0.0, -80.0]);
@@ -203,15 +208,15 @@ mod tests {
     #[test]
     fn values_beyond_half_precision_are_clamped() {
         let wild = SplatvGaussian { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
-        let found = SplatvGaussian::from_words(&words(&wild));
+        let found = SplatvGaussian::from_words(&encode_words(&wild));
         assert_eq!((&found.motion[..3], found.width), (&[65504.0, -65504.0, 0.0][..], 65504.0));
-        assert_eq!(words(&SplatvGaussian { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
+        assert_eq!(encode_words(&SplatvGaussian { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
     }
 
     #[test]
     fn a_camera_has_its_position_and_view_direction() {
         let from = glam::DVec3::new(1.0, -4.0, 2.0);
-        let made = camera(&Camera::look_at(from, glam::DVec3::ZERO, 1.0, (8, 6)));
+        let made = camera_json(&Camera::look_at(from, glam::DVec3::ZERO, 1.0, (8, 6)));
         for (c, expected) in from.to_array().into_iter().enumerate() {
             assert!((made["position"][c].as_f64().unwrap() - expected).abs() < 1e-12, "{made}");
             // The third column of the rotation is the view direction.
@@ -224,7 +229,7 @@ mod tests {
     fn truncated_or_malformed_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("some.splatv");
-        write(&path, 3, (0..3).map(|k| words(&row(k))), &json!([])).unwrap();
+        write_splatv(&path, 3, (0..3).map(|k| encode_words(&row(k))), &json!([])).unwrap();
         let whole = std::fs::read(&path).unwrap();
         let header = 8 + u32::from_le_bytes(whole[4..8].try_into().unwrap()) as usize;
         for length in (0..200).chain((200..whole.len()).step_by(997)) {

@@ -10,7 +10,7 @@ use super::{DEFAULT_FRAMES, TimedGaussians, Timeline, TimelineEntry, TsogMeta, V
 use crate::error::{Error, Result, quoted};
 use crate::files::ftgs::{CENTER, ClipTimes, FRAME_RATE, LOG_DEVIATION, VELOCITY};
 use crate::files::json::{ParseAbort, read_from};
-use crate::files::sog::META;
+use crate::files::sog::META_FILE;
 use crate::files::sog::images::{Range3, decode_16_bit};
 use crate::files::sog::read::{Files, decode};
 use crate::limits::ReadLimit;
@@ -28,7 +28,7 @@ const MAX_PLAYBACK: f64 = 1e6;
 /// Returns whether the file at `path` is a ZIP archive with a `meta.json` of version 4.
 pub fn is_tsog(path: &Path) -> bool {
     let meta = || -> Result<Value> {
-        let text = Files::open_archive(path)?.read(path, META, ReadLimit::new(MAX_META_BYTES))?;
+        let text = Files::open_archive(path)?.read(path, META_FILE, ReadLimit::new(MAX_META_BYTES))?;
         read_from(&text[..], path, &ParseAbort::default(), PhantomData::<Value>)
     };
     meta().is_ok_and(|meta| meta["version"] == VERSION)
@@ -40,7 +40,7 @@ pub fn is_tsog(path: &Path) -> bool {
 /// Fails if the file is damaged, has another version than 4, or needs more memory than `memory`.
 pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
     let mut files = Files::open_archive(path)?;
-    let text = files.read(path, META, ReadLimit::new(memory.bytes().min(MAX_META_BYTES)))?;
+    let text = files.read(path, META_FILE, ReadLimit::new(memory.bytes().min(MAX_META_BYTES)))?;
     let meta = parse(&text, path)?;
     if !(1..=u64::from(u32::MAX)).contains(&meta.sog.count) {
         let expected = "a number from 1 to 4294967295";
@@ -55,7 +55,7 @@ pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
         Some(TimelineEntry { kind: 1, .. }) => Timeline::Windows,
         Some(entry) => Timeline::Frames(frame_count(entry, path)?),
     };
-    let mut own = AttributeValues::zeros(timeline.width(), count);
+    let mut own = AttributeValues::zeros(timeline.param_count(), count);
     if let Some(entry) = &meta.timeline {
         read_timeline(entry, timeline, &mut files, (path, memory), &mut own)?;
     }
@@ -70,12 +70,12 @@ pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
         }
     }
     let clip = clip_times(&meta, timeline, path)?;
-    Ok(TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip })
+    Ok(TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip })
 }
 
 /// Parses `meta.json`, whose text is `text`.
 fn parse(text: &[u8], path: &Path) -> Result<TsogMeta> {
-    let value = read_from(text, &path.join(META), &ParseAbort::default(), PhantomData::<Value>)?;
+    let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
     if value["version"] != VERSION {
         let found = quoted(&value["version"].to_string()).to_string();
         return Err(Error::input(path, "meta.json, version", VERSION.to_string(), found));
@@ -83,8 +83,9 @@ fn parse(text: &[u8], path: &Path) -> Result<TsogMeta> {
     if let Some(name) = OPTIONAL.into_iter().find(|name| value.get(name).is_some_and(Value::is_null)) {
         return Err(Error::input(path, format!("meta.json, {name}"), "a value, or no such member", "null"));
     }
-    serde_json::from_value(value)
-        .map_err(|error| Error::input(path, META, "the members of version 4 of the format", quoted(&error.to_string())))
+    serde_json::from_value(value).map_err(|error| {
+        Error::input(path, META_FILE, "the members of version 4 of the format", quoted(&error.to_string()))
+    })
 }
 
 /// Returns the number of frames of a timeline of type 0.
@@ -210,7 +211,7 @@ fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTi
         },
     };
     let clip = match &meta.splatsieve {
-        None => ClipTimes::UNIT,
+        None => ClipTimes::UNIT_INTERVAL,
         Some(original) => ClipTimes::from_range(original.times[0], original.times[1]).ok_or_else(|| {
             let found = format!("{}, {}", original.times[0], original.times[1]);
             Error::input(path, "meta.json, splatsieve, times", "two increasing numbers", found)

@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::read::{is_tsog, read_tsog};
 use super::write::write_tsog;
 use super::{TimedGaussians, Timeline, codes_per_frame};
-use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, VELOCITY, WIDTH};
+use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY};
 use crate::files::webp::RgbaImage;
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
@@ -24,7 +24,7 @@ fn noise(seed: usize, i: usize) -> f32 {
 /// Returns Gaussians with the visibility `timeline`.
 fn timed(timeline: Timeline, sh_degree: usize) -> TimedGaussians {
     let mut gaussians = Gaussians::zeros(COUNT, sh_degree);
-    let mut own = AttributeValues::zeros(timeline.width(), COUNT);
+    let mut own = AttributeValues::zeros(timeline.param_count(), COUNT);
     for i in 0..COUNT {
         gaussians.position.set_row(i, [0, 1, 2].map(|c| 20.0 * noise(c, i)));
         gaussians.rotation.set_row(i, [3, 4, 5, 6].map(|c| noise(c, i)));
@@ -41,8 +41,8 @@ fn timed(timeline: Timeline, sh_degree: usize) -> TimedGaussians {
             }
         }
     }
-    let clip = ClipTimes { frames: Some(25), ..ClipTimes::UNIT };
-    TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip }
+    let clip = ClipTimes { frames: Some(25), ..ClipTimes::UNIT_INTERVAL };
+    TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip }
 }
 
 fn path(folder: &tempfile::TempDir) -> std::path::PathBuf {
@@ -116,7 +116,8 @@ fn windows_and_velocities_are_within_half_a_step() {
     let steps = if meta["temporal"]["means"]["files"].as_array().unwrap().len() == 1 { 255.0 } else { 65535.0 };
     let rows = matched(&written, &found);
     for (row, &other) in rows.iter().enumerate() {
-        let own = |from: &TimedGaussians, plane: usize, row: usize| f64::from(from.params.own.plane(plane)[row]);
+        let own =
+            |from: &TimedGaussians, plane: usize, row: usize| f64::from(from.params.format_specific.plane(plane)[row]);
         let pair = |plane: usize| (own(&written, plane, row), own(&found, plane, other as usize));
         let near = |a: f64, b: f64, within: f64, what: &str| {
             assert!((a - b).abs() <= 1.001 * within + 1e-6, "{what} of {row}: {a}, found {b}");
@@ -147,12 +148,15 @@ fn single_frames_are_exact_for_any_number_of_them() {
     let folder = tempfile::tempdir().unwrap();
     for frames in [1, 2, 7, 300, 65_536] {
         let mut written = timed(Timeline::Frames(frames), 0);
-        written.params.own.plane_mut(0)[3] = (frames - 1) as f32;
+        written.params.format_specific.plane_mut(0)[3] = (frames - 1) as f32;
         write_tsog(&written, &path(&folder)).unwrap();
         let found = read_tsog(&path(&folder), ReadLimit::NONE).unwrap();
         assert_eq!((found.timeline, found.clip.frames), (Timeline::Frames(frames), Some(frames)));
         for (row, other) in matched(&written, &found).into_iter().enumerate() {
-            assert_eq!(found.params.own.plane(0)[other as usize], written.params.own.plane(0)[row]);
+            assert_eq!(
+                found.params.format_specific.plane(0)[other as usize],
+                written.params.format_specific.plane(0)[row]
+            );
         }
     }
     assert_eq!([1, 2, 3, 300, 65_536].map(codes_per_frame), [65_536, 32_768, 21_845, 218, 1]);
@@ -211,13 +215,13 @@ fn wide_windows_keep_their_opacity_within_the_sequence() {
     let folder = tempfile::tempdir().unwrap();
     let mut written = timed(Timeline::Windows, 0);
     for i in 0..COUNT {
-        written.params.own.plane_mut(CENTER)[i] = 60.0 * noise(5, i);
-        written.params.own.plane_mut(LOG_DEVIATION)[i] = 3.0 + noise(6, i);
+        written.params.format_specific.plane_mut(CENTER)[i] = 60.0 * noise(5, i);
+        written.params.format_specific.plane_mut(LOG_DEVIATION)[i] = 3.0 + noise(6, i);
     }
     write_tsog(&written, &path(&folder)).unwrap();
     let found = read_tsog(&path(&folder), ReadLimit::NONE).unwrap();
     let state = |from: &TimedGaussians, row: usize, time: f64| {
-        let own = |plane: usize| f64::from(from.params.own.plane(plane)[row]);
+        let own = |plane: usize| f64::from(from.params.format_specific.plane(plane)[row]);
         let alpha = opacity(from.params.gaussians.opacity_logit.plane(0)[row]);
         let dt = time - own(CENTER);
         let at = from.params.gaussians.position.row::<3>(row);
@@ -321,7 +325,10 @@ fn memory_is_checked_before_it_is_taken() {
 #[test]
 fn empty_models_and_too_many_frames_are_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let empty = StoredParams { gaussians: Gaussians::zeros(0, 0), own: AttributeValues::zeros(WIDTH, 0) };
+    let empty = StoredParams {
+        gaussians: Gaussians::zeros(0, 0),
+        format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, 0),
+    };
     let empty = TimedGaussians { params: empty, ..timed(Timeline::Windows, 0) };
     assert!(write_tsog(&empty, &path(&folder)).unwrap_err().to_string().contains("at least one"));
     let many = TimedGaussians { timeline: Timeline::Frames(70_000), ..timed(Timeline::Frames(9), 0) };

@@ -75,7 +75,7 @@ pub fn write_tsog(content: &TimedGaussians, path: &Path) -> Result<SogErrors> {
 fn narrowed(params: &StoredParams) -> StoredParams {
     let mut params = params.clone();
     for row in 0..params.len() {
-        let own = |plane: usize| f64::from(params.own.plane(plane)[row]);
+        let own = |plane: usize| f64::from(params.format_specific.plane(plane)[row]);
         let (center, deviation) = (own(CENTER), own(LOG_DEVIATION).exp());
         if deviation <= MAX_DEVIATION {
             continue;
@@ -89,8 +89,8 @@ fn narrowed(params: &StoredParams) -> StoredParams {
         let place = [0, 1, 2].map(|c| (f64::from(at[c]) + velocity[c] * (moved - center)) as f32);
         params.gaussians.position.set_row(row, place);
         params.gaussians.opacity_logit.set_row(row, [logit(alpha) as f32]);
-        params.own.plane_mut(CENTER)[row] = moved as f32;
-        params.own.plane_mut(LOG_DEVIATION)[row] = MAX_DEVIATION.ln() as f32;
+        params.format_specific.plane_mut(CENTER)[row] = moved as f32;
+        params.format_specific.plane_mut(LOG_DEVIATION)[row] = MAX_DEVIATION.ln() as f32;
     }
     params
 }
@@ -105,7 +105,7 @@ fn encode_frames(
 ) -> TimelineEntry {
     let delta = codes_per_frame(frames);
     let pair = encode_16_bit(size, order, |row| {
-        let frame = params.own.plane(0)[row] as usize;
+        let frame = params.format_specific.plane(0)[row] as usize;
         // The middle of the codes of a frame, so that rounding in a player cannot reach another frame.
         [(frame * delta + delta / 2) as u16, 0, 0]
     });
@@ -116,8 +116,9 @@ fn encode_frames(
 /// Adds the images of the time windows to `images`, and returns their entry in `meta.json`.
 fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images: &mut NamedImages) -> TimelineEntry {
     let window = |row: usize| {
-        let deviation = f64::from(params.own.plane(LOG_DEVIATION)[row]).exp().max(f64::from(f32::MIN_POSITIVE));
-        [f64::from(params.own.plane(CENTER)[row]), deviation, 0.0]
+        let deviation =
+            f64::from(params.format_specific.plane(LOG_DEVIATION)[row]).exp().max(f64::from(f32::MIN_POSITIVE));
+        [f64::from(params.format_specific.plane(CENTER)[row]), deviation, 0.0]
     };
     let range = Range3::from_rows((0..params.len()).map(window));
     let pair = encode_16_bit(size, order, |row| {
@@ -137,7 +138,7 @@ fn encode_velocities(
     order: &[u32],
     images: &mut NamedImages,
 ) -> Option<Temporal> {
-    let velocity = |row: usize| [0, 1, 2].map(|c| f64::from(params.own.plane(VELOCITY + c)[row]));
+    let velocity = |row: usize| [0, 1, 2].map(|c| f64::from(params.format_specific.plane(VELOCITY + c)[row]));
     let range = Range3::from_rows((0..params.len()).map(velocity));
     if range.mins == [0.0; 3] && range.maxs == [0.0; 3] {
         return None;
@@ -173,7 +174,7 @@ fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     let half_step = (0..3).map(|axis| ((range.maxs[axis] - range.mins[axis]) / 510.0).powi(2)).sum::<f64>().sqrt();
     let (mut squares, mut most) = (0.0, 0.0f64);
     for row in 0..params.len() {
-        let own = |plane: usize| f64::from(params.own.plane(plane)[row]);
+        let own = |plane: usize| f64::from(params.format_specific.plane(plane)[row]);
         let center = own(CENTER);
         let reach = center.abs().max((1.0 - center).abs()).min(2.0 * own(LOG_DEVIATION).exp());
         let mut scales = params.gaussians.log_scale.row::<3>(row);

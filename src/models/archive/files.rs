@@ -4,7 +4,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use crate::archive::Content;
+use crate::archive::ArchiveContent;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{beside, extra_bytes_per_row, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
@@ -26,7 +26,7 @@ pub(crate) const ITERATION: &str = "iteration";
 ///
 /// # Errors
 /// Fails if the template was cut short since it was opened, or if its data need more memory than allowed.
-pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
+pub(crate) fn add_cloud(content: &mut ArchiveContent, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     let [lead, tail] = template.bytes_around();
     let what = "the data that the archive keeps beside the attributes of Gaussians";
@@ -49,7 +49,7 @@ pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterat
 }
 
 /// Writes the PLY file that `content` describes to the path `to`. The content was read from the archive at `path`.
-pub(super) fn write_cloud(content: &Content, path: &Path, to: &Path) -> Result<()> {
+pub(super) fn write_cloud(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
     let part = |name: &str| {
         let missing = || Error::input(path, "blobs", format!("a part named {name}"), "none");
         content.files.get(name).ok_or_else(missing)

@@ -14,16 +14,16 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use files::{CFG_ARGS, ITERATION, write_cloud};
 
-use super::size::Size;
+use super::size::ModelSize;
 use super::{four_d_gaussians, ply_sequence};
-use crate::archive::{self, ArchiveSize, Content};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::archive::{self, ArchiveContent, ArchiveSize};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::open::open_file;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
-use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
@@ -39,7 +39,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`.
-pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
+pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(ArchiveContent, ArchiveSize)> {
     archive::decode(&load(path, memory)?, path, memory)
 }
 
@@ -49,8 +49,8 @@ fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let mut file = open_file(path)?;
     let length = file.metadata().map_err(failed)?.len();
     let mut bytes = Vec::new();
-    file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
-    archive::check_head(&bytes, length, path, memory)?;
+    file.by_ref().take(archive::HEADER_BYTES as u64).read_to_end(&mut bytes).map_err(failed)?;
+    archive::check_header(&bytes, length, path, memory)?;
     // `check_head` compared the length of the file with the header, so the length is safe to allocate.
     bytes.reserve_exact((length - bytes.len() as u64) as usize);
     file.take(length - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
@@ -62,7 +62,7 @@ fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// Fails if the content is not a complete model or a write fails.
-pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
+pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
     let Some(cfg_args) = content.files.get(CFG_ARGS) else { return write_cloud(content, path, to) };
     let number = content.files.get(ITERATION).and_then(|text| std::str::from_utf8(text).ok()?.parse::<u32>().ok());
     let Some(iteration) = number else {
@@ -77,7 +77,7 @@ pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
 }
 
 /// Returns whether the archive holds a model folder rather than a single PLY.
-pub fn is_folder(content: &Content) -> bool {
+pub fn is_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
@@ -87,7 +87,7 @@ struct OpenArchive {
     inner: Box<dyn InputModel>,
     scratch: ScratchFolder,
     digest: String,
-    size: Size,
+    size: ModelSize,
 }
 
 impl OpenArchive {
@@ -128,14 +128,14 @@ impl InputModel for OpenArchive {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size.whole())
+        Ok(self.size.total())
     }
 
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         Ok(self.size)
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         self.inner.size_written(kind, path)
     }
 
@@ -143,11 +143,11 @@ impl InputModel for OpenArchive {
         self.inner.stored_bytes()
     }
 
-    fn residence(&self) -> MemoryProfile {
-        self.inner.residence()
+    fn memory_profile(&self) -> MemoryProfile {
+        self.inner.memory_profile()
     }
 
-    fn timing(&self) -> Timing {
+    fn timing(&self) -> TimeOrigin {
         self.inner.timing()
     }
 
@@ -180,7 +180,7 @@ impl InputModel for OpenArchive {
         self.inner.check_output(kind, path)
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         self.inner.solve(clusters, reference, rule)
     }
 
@@ -207,11 +207,11 @@ impl InputModel for OpenArchive {
         self.inner.needs_all_bands()
     }
 
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
-        self.inner.content(reduction)
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.inner.archive_content(reduction)
     }
 
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         self.inner.decode_frames(content)
     }
 }

@@ -21,18 +21,18 @@ pub(super) use paths::{has_network, network_tensor_names};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
-use crate::files::cameras::Clock;
-use crate::files::ply::write::{rows_of_model, write_like};
+use crate::files::cameras::TimeConvention;
+use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
-use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, Timing};
-use crate::models::motion_model::{MotionModel, MotionModelFrames, solve};
+use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, TimeOrigin};
+use crate::models::motion_model::{MotionModel, MotionModelFrames, propose_proxies};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -100,7 +100,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         let tensors = paths.tensors(options.memory)?;
         let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
-        let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);
+        let (features, file, cloud) = (raw.format_specific.width(), &*paths.network, &*paths.point_cloud);
         let parts = ModelParts { arguments: &arguments, tensors: &tensors, file, features, cloud };
         let (motion_model, notes) = make(&parts)?;
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
@@ -143,7 +143,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
             rows[cluster.output as usize].source = heaviest(cluster);
         }
         let template = Ply::open(&self.paths.point_cloud)?;
-        write_like(&template, &rows, proxies, &reduction.change, reduction.sh_degree, &to.point_cloud)
+        write_like_template(&template, &rows, proxies, &reduction.delta, reduction.sh_degree, &to.point_cloud)
     }
 }
 
@@ -154,7 +154,7 @@ fn heaviest(cluster: &Cluster) -> u32 {
 }
 
 /// Reads the stored parameters of all Gaussians; the properties `fea_0`, `fea_1`, … become format-specific parameters
-/// ([`StoredParams::own`]). Fails if a value is not finite that the network reads or that is needed for the covariance.
+/// ([`StoredParams::format_specific`]). Fails if a value is not finite that the network reads or that is needed for the covariance.
 fn raw(ply: &Ply) -> Result<StoredParams> {
     let count = ply.count();
     let gaussians = ply.whole()?;
@@ -182,13 +182,13 @@ fn raw(ply: &Ply) -> Result<StoredParams> {
             .hint("remove this Gaussian from the model, or train and save it again"));
         }
     }
-    Ok(StoredParams { gaussians, own })
+    Ok(StoredParams { gaussians, format_specific: own })
 }
 
 /// Returns the size in bytes of the files that a renderer opens, divided into parts.
-fn size_of(paths: &Paths) -> Result<Size> {
+fn size_of(paths: &Paths) -> Result<ModelSize> {
     let (cloud, field) = (bytes_read_for([&*paths.point_cloud])?, bytes_read_for([&*paths.network])?);
-    Ok(Size { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..Size::default() })
+    Ok(ModelSize { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..ModelSize::default() })
 }
 
 impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
@@ -205,23 +205,23 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.whole())
+        Ok(self.size()?.total())
     }
 
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         size_of(&self.paths)
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
             OutputKind::Model => size_of(&Paths::new(path, self.paths.iteration)),
-            _ => Ok(Size::from_frames(bytes_below(path)?)),
+            _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let motion_model = self.model.motion_model();
-        let features = 4 * self.model.raw().own.width() as u64;
+        let features = 4 * self.model.raw().format_specific.width() as u64;
         let whole = state_bytes(self.model.info().sh_degree, Attributes::all()) + features;
         MemoryProfile {
             per_gaussian: whole,
@@ -243,13 +243,13 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         }
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Continuous
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Continuous
     }
 
-    /// Returns [`Clock::Given`]: camera times are used unchanged, because the network was trained with them.
-    fn clock(&self) -> Clock {
-        Clock::Given
+    /// Returns [`TimeConvention::Given`]: camera times are used unchanged, because the network was trained with them.
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -284,12 +284,14 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        solve(&self.model, clusters, reference, rule, |clusters| proxies::propose(&self.model, clusters, rule))
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        propose_proxies(&self.model, clusters, reference, rule, |clusters| {
+            proxies::propose(&self.model, clusters, rule)
+        })
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.reduced(reduction)))
+        Ok(Box::new(self.model.compressed_frames(reduction)))
     }
 
     fn write(
@@ -302,10 +304,10 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     ) -> Result<Vec<String>> {
         let mut notes = match kind {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?,
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events)?,
         };
         let left = Attributes::all().difference(self.model.motion_model().movable());
-        if !reduction.change.is_empty() && !left.is_empty() {
+        if !reduction.delta.is_empty() && !left.is_empty() {
             notes.push(
                 "scales and rotations were not refined: the covariances of this model do not follow from its \
                  quaternions alone"

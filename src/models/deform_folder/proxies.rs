@@ -68,7 +68,7 @@ pub(super) fn propose<L: NetworkMotionModel>(
         features.resize(candidates.len(), heaviest(cluster));
     }
     let mut candidate_params = model.raw().pick(&candidates);
-    candidate_params.own = model.raw().own.pick(&features);
+    candidate_params.format_specific = model.raw().format_specific.pick(&features);
     for (cluster, rows) in clusters.iter().zip(&candidate_rows) {
         let mut mean = DVec3::ZERO;
         for &(id, weight) in &cluster.members {

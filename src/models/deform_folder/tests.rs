@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use tempfile::TempDir;
 
-use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, ReferenceFrame};
 use crate::deform::synthetic::Noise;
-use crate::deform::synthetic::deep::{DeepVariant, KINDS, tensors};
+use crate::deform::synthetic::deep::{ALL_VARIANTS, DeepVariant, random_tensors};
 use crate::deform::{Network, PredictedMotion, Tensor, Tensors};
 use crate::error::Result;
 use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
@@ -46,7 +46,7 @@ impl TestModel {
                 if kind.screws { "True" } else { "False" },
                 if kind.time_network { "True" } else { "False" }
             ),
-            tensors: tensors(kind).into_iter().map(stripped).collect(),
+            tensors: random_tensors(kind).into_iter().map(stripped).collect(),
             cloud: cloud(0),
         }
     }
@@ -58,7 +58,7 @@ impl TestModel {
             shape: shape.to_vec(),
             data: (0..shape.iter().product()).map(|_| noise.next()).collect(),
         };
-        let mut made: Tensors = tensors(kind).into_iter().map(|(name, tensor)| (name, small(tensor))).collect();
+        let mut made: Tensors = random_tensors(kind).into_iter().map(|(name, tensor)| (name, small(tensor))).collect();
         made.insert("nodes".into(), add(&[12, 5]));
         made.insert("_node_radius".into(), add(&[12]));
         made.insert("_node_weight".into(), add(&[12, 1]));
@@ -193,7 +193,7 @@ fn row<const W: usize>(column: &AttributeValues, i: usize) -> [f64; W] {
 
 #[test]
 fn states_of_deformable_3d_gaussians_follow_the_formulas() {
-    for kind in &KINDS[..2] {
+    for kind in &ALL_VARIANTS[..2] {
         let made = TestModel::deformable(*kind);
         let model = made.open();
         assert_eq!(model.kind(), "Deformable-3D-Gaussians model");
@@ -221,7 +221,7 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
 
 #[test]
 fn states_of_sc_gs_follow_the_formulas() {
-    for kind in [KINDS[0], KINDS[2]] {
+    for kind in [ALL_VARIANTS[0], ALL_VARIANTS[2]] {
         let made = TestModel::sc_gs(kind);
         let model = made.open();
         assert_eq!((model.kind(), model.notes()), ("SC-GS model", vec![]));
@@ -275,7 +275,7 @@ fn states_of_sc_gs_follow_the_formulas() {
 fn sc_gs_without_nodes_uses_the_network_directly() {
     let made = TestModel {
         cfg_args: "Namespace(deform_type='mlp', sh_degree=1)".into(),
-        ..TestModel::deformable(DeepVariant { screws: false, ..KINDS[0] })
+        ..TestModel::deformable(DeepVariant { screws: false, ..ALL_VARIANTS[0] })
     };
     let model = made.open();
     assert_eq!(model.kind(), "SC-GS model");
@@ -292,10 +292,10 @@ fn sc_gs_without_nodes_uses_the_network_directly() {
 #[test]
 fn jacobian_agrees_with_finite_differences() {
     let models = [
-        TestModel::deformable(KINDS[0]),
-        TestModel::deformable(KINDS[1]),
-        TestModel::sc_gs(KINDS[0]),
-        TestModel::sc_gs(KINDS[2]),
+        TestModel::deformable(ALL_VARIANTS[0]),
+        TestModel::deformable(ALL_VARIANTS[1]),
+        TestModel::sc_gs(ALL_VARIANTS[0]),
+        TestModel::sc_gs(ALL_VARIANTS[2]),
     ]
     .map(|made| {
         let model = made.open();
@@ -353,19 +353,19 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
     ];
     // Random motion exceeds any drift limit, so the limit is lifted to test how proposed proxies are written.
     let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
-    let reference = Reference { frame: 0, extent: 1.0 };
+    let reference = ReferenceFrame { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
     let mut by = Gaussians::zeros(5, 0);
     by.rotation = AttributeValues::default();
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(0, [0.1, 0.0, 0.2]);
-    reduction.change = ParamDelta(by);
+    reduction.delta = ParamDelta(by);
     reduction
 }
 
 #[test]
 fn kept_rows_and_network_keep_their_bytes() {
-    for made in [TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[0])] {
+    for made in [TestModel::deformable(ALL_VARIANTS[1]), TestModel::sc_gs(ALL_VARIANTS[0])] {
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
         let path = made.folder.path().join("result");
@@ -401,7 +401,11 @@ fn kept_rows_and_network_keep_their_bytes() {
 
 #[test]
 fn written_proxies_and_deltas_read_back() {
-    for made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
+    for made in [
+        TestModel::deformable(ALL_VARIANTS[0]),
+        TestModel::deformable(ALL_VARIANTS[1]),
+        TestModel::sc_gs(ALL_VARIANTS[2]),
+    ] {
         let model = made.open();
         let mut reduction = reduction(&*model);
         for sh_degree in [1, 0] {
@@ -419,13 +423,17 @@ fn written_proxies_and_deltas_read_back() {
 
 #[test]
 fn proxy_of_equal_members_equals_them() {
-    for mut made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
+    for mut made in [
+        TestModel::deformable(ALL_VARIANTS[0]),
+        TestModel::deformable(ALL_VARIANTS[1]),
+        TestModel::sc_gs(ALL_VARIANTS[2]),
+    ] {
         // Gaussian 1 equals Gaussian 0 except for its normals.
         made.cloud.iter_mut().filter(|(name, _)| !name.starts_with('n')).for_each(|(_, of)| of[1] = of[0]);
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
         let clusters = [Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] }];
-        let proxies = model.solve(&clusters, Reference { frame: 0, extent: 1.0 }, &rule).unwrap();
+        let proxies = model.solve(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
         let mut reduction = CompressedModel::pruned(vec![0], &rule);
         (reduction.clusters, reduction.proxies) = (clusters.to_vec(), proxies);
         assert!(reduction.proxies.deviation.unwrap() < 1e-6, "{:?}", reduction.proxies);
@@ -441,7 +449,7 @@ fn proxy_of_equal_members_equals_them() {
 
 #[test]
 fn iterations_need_both_folders() {
-    let made = TestModel::deformable(KINDS[0]);
+    let made = TestModel::deformable(ALL_VARIANTS[0]);
     made.write(7);
     made.write(100);
     fs::remove_file(made.file("deform", 100)).unwrap();
@@ -455,7 +463,7 @@ fn iterations_need_both_folders() {
 
 #[test]
 fn weights_take_precedence_over_cfg_args() {
-    let mut made = TestModel::deformable(KINDS[1]);
+    let mut made = TestModel::deformable(ALL_VARIANTS[1]);
     made.cfg_args = "Namespace(is_6dof=False, is_blender=False)".into();
     let notes = made.open().notes();
     assert!(
@@ -469,16 +477,16 @@ fn models_that_are_not_read_are_refused_by_name() {
     for key in
         ["skinning=True", "use_hash=True", "local_frame=True", "progressive_brand_time=True", "d_rot_as_res=False"]
     {
-        let mut made = TestModel::sc_gs(KINDS[0]);
+        let mut made = TestModel::sc_gs(ALL_VARIANTS[0]);
         made.cfg_args = made.cfg_args.replace("K=3", &format!("K=3, {key}"));
         let message = made.message();
         assert!(message.contains(key.split('=').next().unwrap()) && message.contains("cfg_args"), "{message}");
     }
-    let mut made = TestModel::sc_gs(KINDS[0]);
+    let mut made = TestModel::sc_gs(ALL_VARIANTS[0]);
     made.cfg_args = made.cfg_args.replace("K=3", "max_d_scale=1.5");
     assert!(made.message().contains("max_d_scale"));
     // A file that contains two state dicts.
-    let made = TestModel::deformable(KINDS[0]);
+    let made = TestModel::deformable(ALL_VARIANTS[0]);
     made.write(7);
     let mut archive = zip::ZipWriter::new(fs::File::create(made.file("deform", 7)).unwrap());
     let stored = zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored);
@@ -494,34 +502,42 @@ fn errors_name_the_damaged_file_and_the_problem() {
     type Damage = fn(&mut TestModel);
     let cases: [(TestModel, Damage, &[&str]); 9] = [
         (
-            TestModel::deformable(KINDS[0]),
+            TestModel::deformable(ALL_VARIANTS[0]),
             |made| drop(made.tensors.remove("linear.0.weight")),
             &["deform.pth", "linear.0.weight"],
         ),
         (
-            TestModel::deformable(KINDS[0]),
+            TestModel::deformable(ALL_VARIANTS[0]),
             |made| made.cloud[0].1[5] = f32::NAN,
             &["point_cloud.ply", "Gaussian 5, x y z", "NaN"],
         ),
-        (TestModel::deformable(KINDS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
-        (TestModel::deformable(KINDS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
-        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("_node_radius")), &["deform.pth", "_node_radius"]),
+        (TestModel::deformable(ALL_VARIANTS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
+        (TestModel::deformable(ALL_VARIANTS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
         (
-            TestModel::sc_gs(KINDS[0]),
+            TestModel::sc_gs(ALL_VARIANTS[0]),
+            |made| drop(made.tensors.remove("_node_radius")),
+            &["deform.pth", "_node_radius"],
+        ),
+        (
+            TestModel::sc_gs(ALL_VARIANTS[0]),
             |made| made.tensors.get_mut("_node_weight").unwrap().shape = vec![6, 2],
             &["_node_weight", "12 nodes", "[6, 2]"],
         ),
         (
-            TestModel::sc_gs(KINDS[0]),
+            TestModel::sc_gs(ALL_VARIANTS[0]),
             |made| made.tensors.get_mut("nodes").unwrap().data[7] = f32::INFINITY,
             &["nodes", "finite", "element 7"],
         ),
         (
-            TestModel::sc_gs(KINDS[0]),
+            TestModel::sc_gs(ALL_VARIANTS[0]),
             |made| made.cloud.retain(|(name, _)| !name.starts_with("fea_1") && !name.starts_with("fea_2")),
             &["point_cloud.ply", "2 properties fea_*", "1"],
         ),
-        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("nodes")), &["deform.pth", "nodes", "'node'"]),
+        (
+            TestModel::sc_gs(ALL_VARIANTS[0]),
+            |made| drop(made.tensors.remove("nodes")),
+            &["deform.pth", "nodes", "'node'"],
+        ),
     ];
     for (mut made, damage, parts) in cases {
         damage(&mut made);
@@ -534,7 +550,7 @@ fn errors_name_the_damaged_file_and_the_problem() {
 
 #[test]
 fn truncated_network_is_refused() {
-    let made = TestModel::deformable(KINDS[0]);
+    let made = TestModel::deformable(ALL_VARIANTS[0]);
     made.write(7);
     let path = made.file("deform", 7);
     let whole = fs::read(&path).unwrap();

@@ -12,7 +12,7 @@ mod screw;
 use glam::{DMat3, DVec3};
 
 use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network};
-use crate::deform::{Encoded, Network, PredictedMotion};
+use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::input_model::ModelFormat;
@@ -62,7 +62,7 @@ impl DeformableMotion {
 
 impl DeformableMotion {
     /// Returns the network's outputs at `time` that are needed for the attributes `want` of a block of Gaussians.
-    fn motion(&self, time: f64, encoded: &Encoded, want: Attributes) -> Result<PredictedMotion> {
+    fn motion(&self, time: f64, encoded: &EncodedPositions, want: Attributes) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Attributes::empty() } else { SHAPE };
         let want = want & Attributes::POSITION | shape;
@@ -74,9 +74,9 @@ impl DeformableMotion {
 }
 
 impl MotionModel for DeformableMotion {
-    type Prepared = Encoded;
+    type Prepared = EncodedPositions;
 
-    fn prepare(&self, raw: &StoredParams) -> Encoded {
+    fn prepare(&self, raw: &StoredParams) -> EncodedPositions {
         self.network.encode(&raw.gaussians.position)
     }
 
@@ -92,7 +92,7 @@ impl MotionModel for DeformableMotion {
         &self,
         time: f64,
         raw: &StoredParams,
-        encoded: &Encoded,
+        encoded: &EncodedPositions,
         want: Attributes,
         out: &mut Gaussians,
     ) -> Result<()> {
@@ -134,11 +134,17 @@ impl MotionModel for DeformableMotion {
 
     /// Returns the derivative of positions only. The covariance depends on scales and rotations too, but its
     /// decomposition into scales and rotation is not continuous from frame to frame.
-    fn jacobian(&self, time: f64, raw: &StoredParams, encoded: &Encoded, want: Attributes) -> Result<Jacobian> {
+    fn jacobian(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        encoded: &EncodedPositions,
+        want: Attributes,
+    ) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Attributes::POSITION) {
             let position = &raw.gaussians.position;
-            let slopes = self.network.slopes(position, time)?;
+            let slopes = self.network.warp_jacobian(position, time)?;
             let motion = match self.network.predicts_screw_motion() {
                 true => self.motion(time, encoded, Attributes::POSITION)?,
                 false => PredictedMotion::default(),

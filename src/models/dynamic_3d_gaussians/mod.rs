@@ -10,13 +10,13 @@ use std::path::{Path, PathBuf};
 
 use super::size::bytes_read_for;
 use super::trajectories::{check_output, state_bytes, write_sequence};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::Result;
 use crate::files::digest::digest_of_files;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
-use crate::model::{Attributes, Gaussians, SH_C0, color};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::model::{Attributes, Gaussians, SH_C0, color_from_sh};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, TimeOrigin};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -62,7 +62,7 @@ impl InputModel for Params {
         bytes_read_for([&*self.path()])
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
             opening: 0,
@@ -80,8 +80,8 @@ impl InputModel for Params {
         }
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Numbered
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Numbered
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -108,7 +108,7 @@ impl InputModel for Params {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], _: Reference, rule: &MergeParams) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], _: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         proxies::solve(self, clusters, rule)
     }
 
@@ -126,7 +126,7 @@ impl InputModel for Params {
     ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events),
         }
     }
 }
@@ -137,7 +137,7 @@ impl Params {
         let merged = MergedSource::new(self, reduction);
         let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         let (mut proxies, mut state) = (merged.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
-        let by = &reduction.change.0;
+        let by = &reduction.delta.0;
         write_like(
             self.npz(),
             &reduction.kept,
@@ -160,7 +160,7 @@ impl Params {
                 for (proxy, &place) in places.iter().enumerate() {
                     for c in 0..width {
                         let value = state.column(column).plane(c)[proxy];
-                        values[place as usize * width + c] = if is_color { color(value) as f32 } else { value };
+                        values[place as usize * width + c] = if is_color { color_from_sh(value) as f32 } else { value };
                     }
                 }
                 let by = by.column(column);

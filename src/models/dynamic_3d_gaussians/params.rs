@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use crate::error::{Error, Result};
 use crate::files::npz::write::GaussianAxis;
 use crate::files::npz::{Floats, Npz, NpzArray};
-use crate::model::{Attributes, Gaussians, SequenceInfo, harmonic};
-use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
+use crate::model::{Attributes, Gaussians, SequenceInfo, sh_from_color};
+use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
 
 /// Name of the array of positions.
 pub(super) const MEANS: &str = "means3D";
@@ -41,7 +41,7 @@ pub(super) struct Params {
     log_scales: Floats,
     opacities: Floats,
     segments: Option<Floats>,
-    states: Count,
+    states: SharedCounter,
 }
 
 impl Params {
@@ -102,7 +102,7 @@ impl Params {
             segments,
             npz,
             info,
-            states: Count::default(),
+            states: SharedCounter::default(),
         })
     }
 
@@ -181,7 +181,7 @@ impl BlockReader for TrajectoryBlock<'_> {
                     Attributes::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
                     Attributes::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
                     Attributes::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
-                    _ => out.sh.set_row(row, colors.row::<3>(3 * at).map(|color| harmonic(color.into()))),
+                    _ => out.sh.set_row(row, colors.row::<3>(3 * at).map(|color| sh_from_color(color.into()))),
                 }
             }
         }

@@ -10,7 +10,7 @@ use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
-use crate::passes::{WithDelta, gather_all};
+use crate::passes::{SourceWithDeltas, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
@@ -50,10 +50,10 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
 
 /// Returns the frames of the compressed model that `reduction` describes.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
-    Box::new(WithDelta::new(
+    Box::new(SourceWithDeltas::new(
         Box::new(MergedSource::new(params, reduction)),
-        &reduction.change,
-        &reduction.course,
+        &reduction.delta,
+        &reduction.trajectory_delta,
         reduction.sh_degree,
     ))
 }

@@ -72,7 +72,7 @@ fn states_are_the_array_values_compressed_or_not() {
             assert_eq!(state.rotation.row::<4>(id), arrays[3].2[4 * at..][..4]);
             assert_eq!(state.opacity_logit.row::<1>(id), arrays[4].2[id..][..1]);
             assert_eq!(state.log_scale.row::<3>(id), arrays[5].2[3 * id..][..3]);
-            let colors = state.sh.row::<3>(id).map(color);
+            let colors = state.sh.row::<3>(id).map(color_from_sh);
             colors
                 .iter()
                 .zip(&arrays[1].2[3 * at..])
@@ -135,12 +135,12 @@ fn written_proxies_and_deltas_read_back() {
     let model = open(&path).unwrap();
     let rule = Recipe::preset("default").unwrap().merge;
     let cluster = Cluster { output: 1, leader: 3, members: vec![(3, 0.75), (4, 0.25)] };
-    let proxies = model.solve(std::slice::from_ref(&cluster), Reference::default(), &rule).unwrap();
+    let proxies = model.solve(std::slice::from_ref(&cluster), ReferenceFrame::default(), &rule).unwrap();
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(0, [0.5, 0.0, -0.25]);
     by.sh.set_row(2, [0.1, 0.2, 0.0]);
     let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule);
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, change: ParamDelta(by), ..pruned };
+    let reduction = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
     let shown = model.reduced(&reduction).unwrap();
     let result = folder.path().join("result");
     fs::create_dir(&result).unwrap();

@@ -162,7 +162,10 @@ impl ModelConfig {
             (self.no_dshs, Attributes::SH),
         ];
         FieldConfig {
-            active: off.iter().filter(|(off, _)| !off).fold(Attributes::empty(), |set, &(_, column)| set | column),
+            deformed_attributes: off
+                .iter()
+                .filter(|(off, _)| !off)
+                .fold(Attributes::empty(), |set, &(_, column)| set | column),
             static_mlp: self.static_mlp,
             empty_voxel: self.empty_voxel,
             grid_pe: self.grid_pe,
@@ -385,14 +388,17 @@ mod tests {
                 apply_rotation: true,
             }
         );
-        assert_eq!(config.field().active, Attributes::all());
+        assert_eq!(config.field().deformed_attributes, Attributes::all());
     }
 
     #[test]
     fn missing_keys_take_the_defaults_of_the_original() {
         let config = parse("Namespace()").unwrap();
         assert_eq!((config.net_width, config.defor_depth, config.sh_degree), (64, 1, 3));
-        assert_eq!(config.field().active, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::ROTATION);
+        assert_eq!(
+            config.field().deformed_attributes,
+            Attributes::POSITION | Attributes::LOG_SCALE | Attributes::ROTATION
+        );
         assert_eq!(config, parse("Namespace(source_path=None, unknown=3)\n").unwrap());
     }
 

@@ -14,23 +14,23 @@ use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
 use super::files::copy;
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{state_bytes, write_sequence};
-use crate::archive::{Content, Role};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::archive::{ArchiveContent, TensorRole};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::Ply;
-use crate::files::ply::write::{rows_of_model, write_like};
+use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_state_dict, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{Attributes, Gaussians, Jacobian};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, TimeOrigin};
 use crate::models::motion_model::compressed_raw;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
-use crate::recipe::{MergeParams, Precision};
+use crate::recipe::{FieldPrecision, MergeParams};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
@@ -54,29 +54,29 @@ impl InputModel for ModelFolder {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.whole())
+        Ok(self.size()?.total())
     }
 
     /// Returns the size in bytes of the files that a renderer opens, divided into parts. Does not count
     /// `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has them.
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         let paths = self.paths();
         size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
             OutputKind::Model => {
                 let folder = iteration_folder(path, self.paths().iteration);
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
-            OutputKind::Ply => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
+            OutputKind::Ply => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
             // Other functions write archives and `.splatv` files.
-            _ => Ok(Size::from_frames(bytes_below(path)?)),
+            _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let whole = state_bytes(self.info().sh_degree, Attributes::all());
         MemoryProfile {
             per_gaussian: whole,
@@ -99,8 +99,8 @@ impl InputModel for ModelFolder {
         }
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Continuous
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Continuous
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -131,11 +131,11 @@ impl InputModel for ModelFolder {
         Ok(())
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         proxies::solve(self, clusters, reference, rule)
     }
 
-    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
         let paths = self.paths();
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
@@ -148,7 +148,9 @@ impl InputModel for ModelFolder {
         let role = |(name, tensor): (&String, &Tensor)| {
             let role = match role(self.config().field(), name) {
                 // The field does not read the tensor as a feature plane, because its shape is not that of one.
-                Role::Plane(_) | Role::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => Role::Exact,
+                TensorRole::Plane(_) | TensorRole::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => {
+                    TensorRole::Exact
+                }
                 role => role,
             };
             (name.clone(), role)
@@ -158,12 +160,12 @@ impl InputModel for ModelFolder {
         let cloud = compressed_raw(self.stored(), reduction).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
-        let mut content = Content {
+        let mut content = ArchiveContent {
             cloud,
             field: tensors.iter().map(role).collect(),
             tensors,
             times: [first as f32, last as f32],
-            ..Content::default()
+            ..ArchiveContent::default()
         };
         add_cloud(&mut content, &Ply::open(&paths.point_cloud)?, reduction.kept.iter().copied())?;
         content.files.insert(CFG_ARGS.to_owned(), cfg_args);
@@ -171,7 +173,7 @@ impl InputModel for ModelFolder {
         Ok(content)
     }
 
-    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
         let field =
             Field::new(&content.tensors, self.config().field(), self.info().sh_degree, &self.paths().deformation)?;
         Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))
@@ -180,8 +182,8 @@ impl InputModel for ModelFolder {
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         let model = self.with_canonical(compressed_raw(self.stored(), reduction).gaussians);
         Ok(Box::new(match reduction.field {
-            Precision::Exact => model,
-            Precision::Half => model.rounded()?,
+            FieldPrecision::Exact => model,
+            FieldPrecision::Half => model.rounded()?,
         }))
     }
 
@@ -190,7 +192,7 @@ impl InputModel for ModelFolder {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.field().active().contains(Attributes::SH).then_some(
+        self.field().deformed_attributes().contains(Attributes::SH).then_some(
             "the SH head of the deformation field adds to \
                                                                coefficients of every degree",
         )
@@ -230,7 +232,7 @@ impl InputModel for ModelFolder {
                                                                model",
                 ));
             }
-            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?),
+            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events)?),
         }
         Ok(notes)
     }
@@ -243,11 +245,11 @@ impl ModelFolder {
     }
 
     /// Writes the tensors of the deformation field as a state dict with the given precision to `path`.
-    fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
+    fn write_field(&self, precision: FieldPrecision, path: &Path) -> Result<()> {
         let own = &self.paths().deformation;
         match precision {
-            Precision::Exact => copy(own, path),
-            Precision::Half => {
+            FieldPrecision::Exact => copy(own, path),
+            FieldPrecision::Half => {
                 let from_zero = self.info().times.iter().all(|&time| time >= 0.0);
                 write_state_dict(path, &small_field::stored(&read_state_dict(own, self.memory())?, from_zero))
             }
@@ -260,7 +262,7 @@ impl ModelFolder {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let template = Ply::open(&self.paths().point_cloud)?;
-        write_like(&template, &rows_of_model(reduction), proxies, &reduction.change, reduction.sh_degree, path)
+        write_like_template(&template, &rows_of_model(reduction), proxies, &reduction.delta, reduction.sh_degree, path)
     }
 }
 
@@ -270,37 +272,37 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
 }
 
 /// Returns the size in bytes of the three files of a model, divided into parts.
-fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
+fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize> {
     let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
-    Ok(Size { cloud, field, rest, ..Size::default() })
+    Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })
 }
 
 /// Returns how the deformation field uses the tensor called `name`.
-fn role(config: FieldConfig, name: &str) -> Role {
-    let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
+fn role(config: FieldConfig, name: &str) -> TensorRole {
+    let Some(name) = name.strip_prefix("deformation_net.") else { return TensorRole::Unread };
     let part = name.split('.').next().unwrap_or_default();
-    let reads = |is_read: bool, role_if_read: Role| if is_read { role_if_read } else { Role::Unread };
+    let reads = |is_read: bool, role_if_read: TensorRole| if is_read { role_if_read } else { TensorRole::Unread };
     match part {
-        "grid" if config.no_grid => Role::Unread,
+        "grid" if config.no_grid => TensorRole::Unread,
         "grid" => match name.rsplit('.').next() {
-            Some("0") => Role::Plane([0, 1]),
-            Some("1") => Role::Plane([0, 2]),
-            Some("2") => Role::TimePlane(0),
-            Some("3") => Role::Plane([1, 2]),
-            Some("4") => Role::TimePlane(1),
-            Some("5") => Role::TimePlane(2),
-            _ => Role::Exact,
+            Some("0") => TensorRole::Plane([0, 1]),
+            Some("1") => TensorRole::Plane([0, 2]),
+            Some("2") => TensorRole::TimePlane(0),
+            Some("3") => TensorRole::Plane([1, 2]),
+            Some("4") => TensorRole::TimePlane(1),
+            Some("5") => TensorRole::TimePlane(2),
+            _ => TensorRole::Exact,
         },
-        "feature_out" => Role::Weights,
-        "pos_deform" => reads(config.active.contains(Attributes::POSITION), Role::Weights),
-        "scales_deform" => reads(config.active.contains(Attributes::LOG_SCALE), Role::Weights),
-        "rotations_deform" => reads(config.active.contains(Attributes::ROTATION), Role::Weights),
-        "opacity_deform" => reads(config.active.contains(Attributes::OPACITY), Role::Weights),
-        "shs_deform" => reads(config.active.contains(Attributes::SH), Role::Weights),
-        "static_mlp" => reads(config.static_mlp, Role::Weights),
-        "empty_voxel" => reads(config.empty_voxel, Role::Exact),
+        "feature_out" => TensorRole::Weights,
+        "pos_deform" => reads(config.deformed_attributes.contains(Attributes::POSITION), TensorRole::Weights),
+        "scales_deform" => reads(config.deformed_attributes.contains(Attributes::LOG_SCALE), TensorRole::Weights),
+        "rotations_deform" => reads(config.deformed_attributes.contains(Attributes::ROTATION), TensorRole::Weights),
+        "opacity_deform" => reads(config.deformed_attributes.contains(Attributes::OPACITY), TensorRole::Weights),
+        "shs_deform" => reads(config.deformed_attributes.contains(Attributes::SH), TensorRole::Weights),
+        "static_mlp" => reads(config.static_mlp, TensorRole::Weights),
+        "empty_voxel" => reads(config.empty_voxel, TensorRole::Exact),
         // The tensor belongs to an unknown version of the trainer.
-        _ => Role::Exact,
+        _ => TensorRole::Exact,
     }
 }
 

@@ -3,13 +3,13 @@
 //! 5.6).
 
 use super::ModelFolder;
-use crate::compressed_model::{Cluster, Proxies, Reference};
+use crate::compressed_model::{Cluster, Proxies, ReferenceFrame};
 use crate::deform::Deltas;
 use crate::error::Result;
 use crate::merging::proxy::merge_state;
 use crate::model::{Attributes, Gaussians};
-use crate::passes::{BLOCK, gather};
-use crate::recipe::{MergeParams, Placement};
+use crate::passes::{GAUSSIANS_PER_BLOCK, gather};
+use crate::recipe::{MergeParams, ProxyPosition};
 use crate::source::FrameSource;
 
 /// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
@@ -27,7 +27,7 @@ const SAMPLED_FRAMES: usize = 16;
 pub(super) fn solve(
     model: &ModelFolder,
     all: &[Cluster],
-    reference: Reference,
+    reference: ReferenceFrame,
     merge: &MergeParams,
 ) -> Result<Proxies> {
     let leaders: Vec<u32> = all.iter().map(|cluster| cluster.leader).collect();
@@ -39,15 +39,15 @@ pub(super) fn solve(
     }
     // A proxy placed at its leader has exactly the canonical position of the leader, and so the same path.
     let solved = match merge.placement {
-        Placement::Mean => Attributes::all(),
-        Placement::Leader => Attributes::all().difference(Attributes::POSITION),
+        ProxyPosition::Mean => Attributes::all(),
+        ProxyPosition::Leader => Attributes::all().difference(Attributes::POSITION),
     };
-    for (clusters, first) in all.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+    for (clusters, first) in all.chunks(GAUSSIANS_PER_BLOCK).zip((0..).step_by(GAUSSIANS_PER_BLOCK)) {
         let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
         let deltas = model.deltas_at(&of_leaders.position, model.info().times[reference.frame])?;
         let states = merged_states(model, reference, clusters, merge)?;
         let mut of_block = of_leaders.clone();
-        deltas.solve(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
+        deltas.invert(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
         raw.write_rows(first, &of_block);
     }
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
@@ -61,10 +61,10 @@ pub(super) fn solve(
     let mut deviations = deviations(model, reference, all, &raw, &placements)?;
     let tolerance = merge.max_drift * merge.length_unit.in_scene_units(reference.extent);
     let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
-    if merge.placement == Placement::Mean && !strayed.is_empty() {
+    if merge.placement == ProxyPosition::Mean && !strayed.is_empty() {
         for &proxy in &strayed {
             raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
-            placements[proxy] = Placement::Leader;
+            placements[proxy] = ProxyPosition::Leader;
         }
         notes.push(format!(
             "{} proxies drifted too far from their members and were placed at their leaders",
@@ -79,7 +79,7 @@ pub(super) fn solve(
 /// Returns the states of the proxies of `clusters` at the reference frame, merged from the states of their members.
 fn merged_states(
     model: &ModelFolder,
-    reference: Reference,
+    reference: ReferenceFrame,
     clusters: &[Cluster],
     merge: &MergeParams,
 ) -> Result<Gaussians> {
@@ -144,10 +144,10 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 /// the cluster (its most important member), the offset that the leader has from the mean at the reference frame is added.
 fn deviations(
     model: &ModelFolder,
-    reference: Reference,
+    reference: ReferenceFrame,
     clusters: &[Cluster],
     raw: &Gaussians,
-    placements: &[Placement],
+    placements: &[ProxyPosition],
 ) -> Result<Vec<f64>> {
     let frames = model.info().times.len();
     let proxies = model.with_canonical(raw.clone());
@@ -172,7 +172,7 @@ fn deviations(
             .collect())
     };
     let mut wanted = offsets(reference.frame)?;
-    for (offset, _) in wanted.iter_mut().zip(placements).filter(|(_, placement)| **placement == Placement::Mean) {
+    for (offset, _) in wanted.iter_mut().zip(placements).filter(|(_, placement)| **placement == ProxyPosition::Mean) {
         *offset = [0.0; 3];
     }
     let mut largest = vec![0.0f64; raw.len()];

@@ -21,7 +21,7 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
 /// Motion model of FreeTimeGS: straight lines and a temporal window. The further parameters of a Gaussian
-/// ([`StoredParams::own`]) are those of [`crate::files::ftgs`].
+/// ([`StoredParams::format_specific`]) are those of [`crate::files::ftgs`].
 #[derive(Debug, Clone)]
 pub(in crate::models) struct FreeTime {
     /// Frames. Stored times, durations and velocities are in the unit of time of [`ClipTimes`], from 0 to 1.
@@ -44,7 +44,7 @@ pub(in crate::models) struct Windows {
 impl FreeTime {
     /// Motion model of the trainer FreeTimeGsVanilla.
     pub(in crate::models) const TRAINED: FreeTime =
-        FreeTime { clip: ClipTimes::UNIT, deviation_floor: [0.02, 1e-8], min_opacity: 1e-4 };
+        FreeTime { clip: ClipTimes::UNIT_INTERVAL, deviation_floor: [0.02, 1e-8], min_opacity: 1e-4 };
 
     /// Returns the standard deviation s in time that belongs to a stored duration (its logarithm).
     fn deviation(&self, duration: f32) -> f64 {
@@ -64,7 +64,7 @@ impl FreeTime {
     /// Returns the stored parameters `raw` with durations that need no minimum.
     pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
         let mut raw = raw.clone();
-        let durations = raw.own.plane_mut(LOG_DEVIATION).iter_mut();
+        let durations = raw.format_specific.plane_mut(LOG_DEVIATION).iter_mut();
         durations.for_each(|duration| *duration = self.deviation(*duration).ln() as f32);
         raw
     }
@@ -74,7 +74,7 @@ impl MotionModel for FreeTime {
     type Prepared = Windows;
 
     fn prepare(&self, raw: &StoredParams) -> Windows {
-        let rates = raw.own.plane(LOG_DEVIATION).iter().map(|&duration| self.rate(duration)).collect();
+        let rates = raw.format_specific.plane(LOG_DEVIATION).iter().map(|&duration| self.rate(duration)).collect();
         Windows {
             rates,
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
@@ -99,10 +99,10 @@ impl MotionModel for FreeTime {
         out: &mut Gaussians,
     ) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
-        let (time, centers) = (self.clip.to_unit(time), raw.own.plane(CENTER));
+        let (time, centers) = (self.clip.to_unit(time), raw.format_specific.plane(CENTER));
         if want.contains(Attributes::POSITION) {
             for c in 0..3 {
-                let (from, velocity) = (raw.gaussians.position.plane(c), raw.own.plane(VELOCITY + c));
+                let (from, velocity) = (raw.gaussians.position.plane(c), raw.format_specific.plane(VELOCITY + c));
                 let to = out.position.plane_mut(c).iter_mut().zip(from).zip(velocity).zip(centers);
                 to.for_each(|(((to, &x), &v), &center)| {
                     *to = (f64::from(x) + f64::from(v) * (time - f64::from(center))) as f32;
@@ -126,7 +126,7 @@ impl MotionModel for FreeTime {
         if want.contains(Attributes::OPACITY) {
             let min_logit = self.min_logit();
             let time = self.clip.to_unit(time);
-            let centers = raw.own.plane(CENTER).iter().zip(&windows.rates).zip(&windows.inverse_odds);
+            let centers = raw.format_specific.plane(CENTER).iter().zip(&windows.rates).zip(&windows.inverse_odds);
             let slopes = centers.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = -rate * (time - f64::from(center)).powi(2);
                 if exponent < min_logit || faded_logit(inverse_odds, exponent) <= min_logit {
@@ -151,9 +151,9 @@ impl ProxyRule for FreeTime {
             let id = id as usize;
             LinearPath {
                 position: raw.gaussians.position.row::<3>(id).map(f64::from),
-                velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id]) / span),
-                center: first + span * f64::from(raw.own.plane(CENTER)[id]),
-                deviation: span * motion.deviation(raw.own.plane(LOG_DEVIATION)[id]),
+                velocity: [0, 1, 2].map(|c| f64::from(raw.format_specific.plane(VELOCITY + c)[id]) / span),
+                center: first + span * f64::from(raw.format_specific.plane(CENTER)[id]),
+                deviation: span * motion.deviation(raw.format_specific.plane(LOG_DEVIATION)[id]),
             }
         };
         let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
@@ -169,7 +169,7 @@ impl ProxyRule for FreeTime {
         let mut proxies = raw.pick(&leaders);
         for (row, (matched, sh)) in matched.iter().zip(&sh).enumerate() {
             let line = matched.line;
-            let StoredParams { gaussians, own } = &mut proxies;
+            let StoredParams { gaussians, format_specific: own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
             own.plane_mut(CENTER)[row] = motion.clip.to_unit(line.center) as f32;
             own.plane_mut(LOG_DEVIATION)[row] = (line.deviation / span - floor[1]).max(floor[0]).ln() as f32;

@@ -16,7 +16,7 @@ use super::in_checkpoint::{
 };
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
-use crate::files::ftgs::{CENTER, LOG_DEVIATION, VELOCITY, WIDTH};
+use crate::files::ftgs::{CENTER, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
@@ -137,7 +137,8 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         ));
     };
     let bands = sh_coefficients(degree);
-    let mut reader = CheckpointReader::new(checkpoint, count, degree, if has_motion { WIDTH } else { 0 })?;
+    let mut reader =
+        CheckpointReader::new(checkpoint, count, degree, if has_motion { PARAMS_PER_GAUSSIAN } else { 0 })?;
     let planes = [
         (Attributes::POSITION, &[3][..], 0, 3),
         (Attributes::LOG_SCALE, &[3], 0, 3),

@@ -1,7 +1,7 @@
 use std::fs;
 
 use super::*;
-use crate::compressed_model::{Cluster, CompressedModel, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, ReferenceFrame};
 use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
@@ -161,7 +161,7 @@ fn proxy_moves_as_the_mean_of_its_members() {
     let folder = ResultFolder::put(&made);
     let model = open(&folder.path("result")).unwrap();
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.25), (2, 0.75)] };
-    let reference = Reference { frame: 2, extent: 10.0 };
+    let reference = ReferenceFrame { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-6), "{proxies:?}");
     let pruned = CompressedModel::pruned(vec![0, 1], &rule());

@@ -10,7 +10,7 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Attributes, Gaussians, logit, opacity};
-use crate::passes::{BLOCK, gather_all};
+use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
@@ -103,7 +103,7 @@ pub(in crate::models) fn match_proxies(
     let frames: Vec<usize> = (0..sampled).map(|k| (2 * k + 1) * times.len() / (2 * sampled)).collect();
     let wanted = wanted | Attributes::ROTATION | Attributes::LOG_SCALE | Attributes::OPACITY;
     let mut matched = Vec::with_capacity(clusters.len());
-    for (chunk, first) in clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+    for (chunk, first) in clusters.chunks(GAUSSIANS_PER_BLOCK).zip((0..).step_by(GAUSSIANS_PER_BLOCK)) {
         let leaders: Vec<u32> = chunk.iter().map(|cluster| cluster.leader).collect();
         let members = chunk.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
         let merged = MergedSequence::new(source, &leaders, members, rule);

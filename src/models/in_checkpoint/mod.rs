@@ -13,21 +13,21 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::files::copy;
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
-use crate::files::cameras::Clock;
+use crate::files::cameras::TimeConvention;
 use crate::files::digest::hash_file;
 use crate::files::tsog::TimedGaussians;
 use crate::limits::Limits;
 use crate::model::{Attributes, Jacobian, StoredParams};
-use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::outputs::windows::{can_store, is_windowed, write_timed};
+use crate::outputs::time_windows::{can_store, is_windowed, write_timed};
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -164,27 +164,27 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.whole())
+        Ok(self.size()?.total())
     }
 
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         let rest = bytes_read_for(self.copied_files().iter().map(PathBuf::as_path))?;
-        Ok(Size { cloud: bytes_read_for([&*self.description.file])?, rest, ..Size::default() })
+        Ok(ModelSize { cloud: bytes_read_for([&*self.description.file])?, rest, ..ModelSize::default() })
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
             OutputKind::Model => {
                 let cloud = bytes_read_for([&*path.join(self.relative_path())])?;
-                Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
+                Ok(ModelSize { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..ModelSize::default() })
             }
-            _ => Ok(Size::from_frames(bytes_below(path)?)),
+            _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let raw = self.model.raw();
-        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.own.width() as u64;
+        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.format_specific.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
             // The widest tensor, both as stored and as f32.
@@ -204,12 +204,12 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         }
     }
 
-    fn timing(&self) -> Timing {
-        if self.model.motion_model().varying().is_empty() { Timing::Numbered } else { Timing::Continuous }
+    fn timing(&self) -> TimeOrigin {
+        if self.model.motion_model().varying().is_empty() { TimeOrigin::Numbered } else { TimeOrigin::Continuous }
     }
 
-    fn clock(&self) -> Clock {
-        Clock::Given
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Given
     }
 
     fn span(&self) -> f64 {
@@ -256,12 +256,14 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         Some("loaders of the checkpoint expect coefficients of every degree")
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        motion_model::solve(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        motion_model::propose_proxies(&self.model, clusters, reference, rule, |clusters| {
+            L::propose(&self.model, clusters, rule)
+        })
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.reduced(reduction)))
+        Ok(Box::new(self.model.compressed_frames(reduction)))
     }
 
     fn write(
@@ -275,7 +277,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         if kind == OutputKind::Model {
             return self.write_model(reduction, path).map(|()| Vec::new());
         }
-        write_frames(&self.model, reduction, kind, path, limits.frames_held, events)
+        write_frames(&self.model, reduction, kind, path, limits.max_kept_frames, events)
     }
 }
 
@@ -294,7 +296,7 @@ pub(super) fn write_frames<L: ProxyRule>(
 ) -> Result<Vec<String>> {
     match write_windowed(model, reduction, kind, path)? {
         Some(notes) => Ok(notes),
-        None => write_sequence(&model.reduced(reduction), kind, path, held, events),
+        None => write_sequence(&model.compressed_frames(reduction), kind, path, held, events),
     }
 }
 

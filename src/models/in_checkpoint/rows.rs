@@ -17,7 +17,7 @@ use crate::models::trajectories::state_bytes;
 pub(in crate::models) enum RowElement {
     /// Component of an attribute.
     Of(Attributes, usize),
-    /// Parameter with this index in [`StoredParams::own`], which only this model format has.
+    /// Parameter with this index in [`StoredParams::format_specific`], which only this model format has.
     Own(usize),
     /// Value that the states of Gaussians do not depend on.
     Unread,
@@ -30,7 +30,7 @@ impl RowElement {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Returns the meaning of `count` consecutive values in a tensor's row: the parameters in [`StoredParams::own`],
+    /// Returns the meaning of `count` consecutive values in a tensor's row: the parameters in [`StoredParams::format_specific`],
     /// from index `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
@@ -40,7 +40,7 @@ impl RowElement {
     fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
-            RowElement::Own(c) => Some(raw.own.plane(c)),
+            RowElement::Own(c) => Some(raw.format_specific.plane(c)),
             RowElement::Unread => None,
         }
     }
@@ -88,8 +88,10 @@ impl CheckpointReader {
     ) -> Result<CheckpointReader> {
         let row = state_bytes(sh_degree, Attributes::all()) + 4 * own as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
-        let raw =
-            StoredParams { gaussians: Gaussians::zeros(count, sh_degree), own: AttributeValues::zeros(own, count) };
+        let raw = StoredParams {
+            gaussians: Gaussians::zeros(count, sh_degree),
+            format_specific: AttributeValues::zeros(own, count),
+        };
         Ok(CheckpointReader {
             tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },
             raw,
@@ -119,7 +121,7 @@ impl CheckpointReader {
         for (c, plane) in planes.iter().enumerate() {
             let to = match *plane {
                 RowElement::Of(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
-                RowElement::Own(plane) => self.raw.own.plane_mut(plane),
+                RowElement::Own(plane) => self.raw.format_specific.plane_mut(plane),
                 RowElement::Unread => continue,
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);

@@ -81,7 +81,7 @@ impl LinkedFrames {
     ///
     /// # Errors
     /// Fails if the stream is damaged or has no frames, or if a write fails.
-    pub fn receive(
+    pub fn receive_and_link(
         mut stream: FrameStream<impl Read>,
         name: &Path,
         joins: bool,
@@ -99,7 +99,7 @@ impl LinkedFrames {
             return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
         }
         let why = "the stream does not say which Gaussian is which";
-        received.link("linked frame stream", name, stream.received(), why, joins, options)
+        received.link("linked frame stream", name, stream.received_bytes(), why, joins, options)
     }
 
     /// Links the Gaussians of the frames of `input` anew into tracks, ignoring which Gaussian is which in the input.
@@ -117,7 +117,7 @@ impl LinkedFrames {
         let (source, info) = (input.source(), input.source().info());
         let visible_rows = count_visible_rows(source)?;
         let state = state_bytes(info.sh_degree, Attributes::all());
-        let residence = input.residence();
+        let residence = input.memory_profile();
         let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
         let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Attributes::SH));
         let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());

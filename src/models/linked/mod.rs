@@ -34,7 +34,7 @@ use crate::files::ply::PlyOptions;
 use crate::files::ply_frames::PlyFrames;
 use crate::limits::Limits;
 use crate::model::SequenceInfo;
-use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
@@ -150,14 +150,14 @@ impl InputModel for LinkedFrames {
         true
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
         let receiving = self.origin.as_ref().map_or(0, |origin| origin.memory);
         MemoryProfile {
             per_gaussian: sizes.open().div_ceil(count),
             opening: sizes.opening().max(receiving).div_ceil(count),
             file: sizes.frame_file().div_ceil(count),
-            ..self.container.residence()
+            ..self.container.memory_profile()
         }
     }
 
@@ -165,10 +165,10 @@ impl InputModel for LinkedFrames {
         InputModel::hold_decoded(&self.container);
     }
 
-    fn timing(&self) -> Timing {
+    fn timing(&self) -> TimeOrigin {
         match self.origin {
-            None => Timing::Numbered,
-            Some(_) => Timing::Stamped,
+            None => TimeOrigin::Numbered,
+            Some(_) => TimeOrigin::Stamped,
         }
     }
 

@@ -135,7 +135,7 @@ fn mean_psnr(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     let mut found = Vec::new();
     for (a, b) in a.iter().zip(b) {
         let around = RobustBox::from_positions(&a.position);
-        let rig = virtual_rig(around.middle, around.extent());
+        let rig = virtual_rig(around.median, around.extent());
         for view in 0..VIEWS {
             let camera = &rig.cameras[view * rig.cameras.len() / VIEWS];
             let [a, b] = [a, b].map(|state| renderer.render(state, camera, [0.0; 3]));

@@ -17,7 +17,7 @@ use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{BlockChange, ContainerWriter, GAUSSIAN_BLOCK};
 use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
-use crate::tracking::{Joiner, Linker, blend};
+use crate::tracking::{Joiner, Linker, blend_rows};
 
 /// Opacity logit of a track in frames where it is absent; the opacity is then 4·10⁻¹⁸.
 const ABSENT_LOGIT: f32 = -40.0;
@@ -124,7 +124,7 @@ impl LinkedTracks {
         options: &PlyOptions,
     ) -> Result<(LinkedTracks, LinkingResult, Linker)> {
         let scratch = &*options.scratch;
-        let of_frame = frames.counts().iter().copied().max().unwrap_or(0);
+        let of_frame = frames.gaussian_counts().iter().copied().max().unwrap_or(0);
         let (mut linker, mut live_tracks) = (Linker::default(), 0);
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
         let (mut track_writer, mut starts, mut end) = (SpillWriter::new(scratch)?, vec![0], 0);
@@ -145,7 +145,7 @@ impl LinkedTracks {
             let linked = linker.link(&state);
             live_tracks = live_tracks.max(linker.open_track_count());
             if let Some(joiner) = &mut joiner {
-                joiner.see(&linker);
+                joiner.add_frame(&linker);
             }
             if linked.is_cut {
                 cuts.push(frame);
@@ -247,7 +247,7 @@ impl LinkedTracks {
     /// Returns the counts of Gaussians and tracks from which memory is estimated.
     pub(super) fn sizes(&self) -> Sizes {
         Sizes {
-            frame_gaussians: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
+            frame_gaussians: self.frames.gaussian_counts().iter().copied().max().unwrap_or(0).into(),
             sh_degree: self.frames.sh_degree(),
             linked: self.births.len() as u64,
             live_tracks: self.live_tracks as u64,
@@ -285,7 +285,7 @@ impl LinkedTracks {
         let mut at = 0;
         for of_track in rows.chunk_by(|a, b| a.track == b.track) {
             if of_track.len() > 1 {
-                blend(state, &Vec::from_iter(at..at + of_track.len()));
+                blend_rows(state, &Vec::from_iter(at..at + of_track.len()));
             }
             firsts.push(at);
             at += of_track.len();

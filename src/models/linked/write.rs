@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::LinkedFrames;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
-use crate::files::ply::write::{OutRow, rows_of_model, write_like};
+use crate::files::ply::write::{OutputRow, rows_of_model, write_like_template};
 use crate::model::{Attributes, Gaussians};
 use crate::models::trajectories::merged;
 use crate::progress::Events;
@@ -50,7 +50,7 @@ impl LinkedFrames {
                     } else if is_computed(row.source) {
                         computed.push(rows.len());
                     }
-                    rows.push(OutRow { source, proxy: None });
+                    rows.push(OutputRow { source, proxy: None });
                     written.push(place as u32);
                 }
             }
@@ -69,7 +69,7 @@ impl LinkedFrames {
             }
             let change = reduction.delta_at(frame, frames.paths().len()).pick(&written);
             let name = template.path().file_name().unwrap_or_default();
-            write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
+            write_like_template(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
             progress.advance(1);
             Ok(())
         };

@@ -16,10 +16,10 @@ use rayon::prelude::*;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
-use crate::passes::{BLOCK, BlockSlices, BlockwiseReader};
-use crate::source::{BlockReader, Count, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads};
+use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
 
-pub(super) use proxies::solve;
+pub(super) use proxies::propose_proxies;
 
 /// Computes the states of Gaussians at any time from their stored parameters. States are in stored encoding (see
 /// [`Gaussians`]).
@@ -38,7 +38,7 @@ pub(super) trait MotionModel: Debug + Send + Sync {
     fn movable(&self) -> Attributes;
 
     /// Computes the attributes `want` of the states at `time` and writes them to `out`, whose attributes already have
-    /// the right length. Called with at most [`BLOCK`] Gaussians at once, from many threads.
+    /// the right length. Called with at most [`GAUSSIANS_PER_BLOCK`] Gaussians at once, from many threads.
     ///
     /// Implementations are always inlined, so that loops over Gaussians are compiled for wider registers. No operation
     /// is fused, so the bits are the same on every machine.
@@ -86,13 +86,13 @@ pub(super) struct MotionModelFrames<L> {
     motion_model: Arc<L>,
     raw: Arc<StoredParams>,
     info: SequenceInfo,
-    states: Count,
+    states: SharedCounter,
 }
 
 impl<L> Clone for MotionModelFrames<L> {
     fn clone(&self) -> Self {
         let (motion_model, raw) = (Arc::clone(&self.motion_model), Arc::clone(&self.raw));
-        MotionModelFrames { motion_model, raw, info: self.info.clone(), states: Count::default() }
+        MotionModelFrames { motion_model, raw, info: self.info.clone(), states: SharedCounter::default() }
     }
 }
 
@@ -100,7 +100,12 @@ impl<L: MotionModel> MotionModelFrames<L> {
     /// Creates a model that has no frames yet. `sh_degree` is the SH degree of its states.
     pub(super) fn new(motion_model: L, raw: StoredParams, sh_degree: usize) -> MotionModelFrames<L> {
         let info = SequenceInfo { count: raw.len(), times: Vec::new(), sh_degree, varying: motion_model.varying() };
-        MotionModelFrames { motion_model: Arc::new(motion_model), raw: Arc::new(raw), info, states: Count::default() }
+        MotionModelFrames {
+            motion_model: Arc::new(motion_model),
+            raw: Arc::new(raw),
+            info,
+            states: SharedCounter::default(),
+        }
     }
 
     /// Returns the motion model, which computes states from stored parameters.
@@ -118,7 +123,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
     /// # Errors
     /// Fails if times are not finite or do not increase; the message names the frames.
     pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<MotionModelFrames<L>> {
-        self.info = self.info.at(times)?;
+        self.info = self.info.with_frames_at(times)?;
         Ok(self)
     }
 
@@ -130,12 +135,12 @@ impl<L: MotionModel> MotionModelFrames<L> {
             motion_model: Arc::clone(&self.motion_model),
             raw: Arc::new(raw),
             info,
-            states: Count::default(),
+            states: SharedCounter::default(),
         }
     }
 
     /// Returns the frames of the compressed model that `reduction` describes.
-    pub(super) fn reduced(&self, reduction: &CompressedModel) -> MotionModelFrames<L> {
+    pub(super) fn compressed_frames(&self, reduction: &CompressedModel) -> MotionModelFrames<L> {
         self.with_raw(compressed_raw(&self.raw, reduction))
     }
 
@@ -158,7 +163,7 @@ pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) ->
         }
     }
     raw_left.gaussians.truncate_sh(reduction.sh_degree);
-    reduction.change.add_to(&mut raw_left.gaussians, Attributes::all());
+    reduction.delta.add_to(&mut raw_left.gaussians, Attributes::all());
     raw_left
 }
 
@@ -181,8 +186,10 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
             return Err(Error::internal(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let rows: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        let blocks =
-            rows.chunks(BLOCK).map(|rows| PreparedBlock::new(self.motion_model(), self.raw.pick(rows))).collect();
+        let blocks = rows
+            .chunks(GAUSSIANS_PER_BLOCK)
+            .map(|rows| PreparedBlock::new(self.motion_model(), self.raw.pick(rows)))
+            .collect();
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
@@ -218,7 +225,7 @@ impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
     }
 }
 
-/// Up to [`BLOCK`] Gaussians, with the values that do not depend on time.
+/// Up to [`GAUSSIANS_PER_BLOCK`] Gaussians, with the values that do not depend on time.
 struct PreparedBlock<L: MotionModel> {
     raw: StoredParams,
     prepared: L::Prepared,
@@ -289,7 +296,7 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
         let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let parts = BlockSlices::split(out, want, ids.len());
-        ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
+        ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
             || Gaussians::zeros(0, self.info.sh_degree),
             |state, (ids, parts)| {
                 PreparedBlock::new(self.motion_model(), stored.pick(ids)).state(
@@ -311,7 +318,7 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
             let PreparedBlock { raw, prepared } = PreparedBlock::<L>::new(self.motion_model(), stored.pick(ids));
             self.motion_model.jacobian(time, &raw, &prepared, want)
         };
-        let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;
+        let blocks: Vec<Jacobian> = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect::<Result<_>>()?;
         Ok(Jacobian::joined(&blocks, ids.len()))
     }
 }

@@ -2,7 +2,7 @@
 //! them with the moment match of their members.
 
 use super::{MotionModel, MotionModelFrames};
-use crate::compressed_model::{Cluster, Proxies, Reference};
+use crate::compressed_model::{Cluster, Proxies, ReferenceFrame};
 use crate::error::Result;
 use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::merging::merged::MergedSequence;
@@ -20,10 +20,10 @@ const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 ///
 /// # Errors
 /// Fails if `propose` fails or frames cannot be evaluated.
-pub(in crate::models) fn solve<L: MotionModel>(
+pub(in crate::models) fn propose_proxies<L: MotionModel>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
-    reference: Reference,
+    reference: ReferenceFrame,
     rule: &MergeParams,
     propose: impl FnOnce(&[Cluster]) -> Result<StoredParams>,
 ) -> Result<Proxies> {

@@ -21,13 +21,13 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::motion_model::window::{MAX_LOGIT, faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Index in [`StoredParams::own`] of the center μ in time.
+/// Index in [`StoredParams::format_specific`] of the center μ in time.
 pub(super) const TIME: usize = 0;
-/// Index in [`StoredParams::own`] of the logarithm of the scale along time.
+/// Index in [`StoredParams::format_specific`] of the logarithm of the scale along time.
 pub(super) const SCALING_T: usize = 1;
-/// First of four indices in [`StoredParams::own`] of the right quaternion of the 4D rotation.
+/// First of four indices in [`StoredParams::format_specific`] of the right quaternion of the 4D rotation.
 pub(super) const ROTATION_R: usize = 2;
-/// First index in [`StoredParams::own`] of the time-dependent SH coefficients, term by term.
+/// First index in [`StoredParams::format_specific`] of the time-dependent SH coefficients, term by term.
 pub(super) const TERMS: usize = 6;
 /// Number of SH coefficients (three channels, degree 3) of one time-dependent term.
 pub(super) const TERM_WIDTH: usize = 48;
@@ -79,11 +79,12 @@ pub(super) struct Slice {
 impl Native {
     /// Computes velocity, variance in time and spatial covariance of Gaussian `i` from its stored parameters.
     pub(super) fn slice(&self, raw: &StoredParams, i: usize) -> Slice {
-        let log_scale_t = f64::from(raw.own.plane(SCALING_T)[i]);
+        let log_scale_t = f64::from(raw.format_specific.plane(SCALING_T)[i]);
         if !self.has_4d_rotation {
             return Slice { velocity: [0.0; 3], variance: log_scale_t.exp(), covariance: None };
         }
-        let [l, r] = [raw.gaussians.rotation.row::<4>(i), [0, 1, 2, 3].map(|c| raw.own.plane(ROTATION_R + c)[i])];
+        let [l, r] =
+            [raw.gaussians.rotation.row::<4>(i), [0, 1, 2, 3].map(|c| raw.format_specific.plane(ROTATION_R + c)[i])];
         let [x, y, z] = raw.gaussians.log_scale.row::<3>(i).map(f64::from);
         let covariance_4d = covariance(
             &rotation([l.map(f64::from), r.map(f64::from)], self.flipped),
@@ -163,7 +164,7 @@ impl MotionModel for Native {
         want: Attributes,
         out: &mut Gaussians,
     ) -> Result<()> {
-        let centers = raw.own.plane(TIME);
+        let centers = raw.format_specific.plane(TIME);
         let mixed =
             if self.has_4d_rotation { Attributes::ROTATION | Attributes::LOG_SCALE } else { Attributes::empty() };
         copy_stored(raw, want.difference(Attributes::POSITION | Attributes::OPACITY | mixed), out);
@@ -195,7 +196,7 @@ impl MotionModel for Native {
             let waves: (Vec<f64>, Vec<f64>) = waves.map(|[first, second]| (first, second)).unzip();
             for (term, waves) in [waves.0, waves.1].iter().enumerate().take(self.terms) {
                 for c in 0..out.sh.width() {
-                    let by = raw.own.plane(TERMS + term * TERM_WIDTH + c).iter().zip(waves);
+                    let by = raw.format_specific.plane(TERMS + term * TERM_WIDTH + c).iter().zip(waves);
                     out.sh.plane_mut(c).iter_mut().zip(by).for_each(|(to, (&by, &wave))| {
                         *to += (wave * f64::from(by)) as f32;
                     });
@@ -209,7 +210,7 @@ impl MotionModel for Native {
         let mut jacobian = Jacobian::default();
         if want.contains(Attributes::OPACITY) {
             let log_cutoff = MIN_MARGINAL.ln();
-            let windows = raw.own.plane(TIME).iter().zip(&slices.rates).zip(&slices.inverse_odds);
+            let windows = raw.format_specific.plane(TIME).iter().zip(&slices.rates).zip(&slices.inverse_odds);
             let slopes = windows.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = rate * (time - f64::from(center)).powi(2);
                 if exponent > log_cutoff { slope(inverse_odds, exponent) as f32 } else { 0.0 }

@@ -4,7 +4,7 @@
 //! Input: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file. It holds `(capture, iteration)`, where
 //! the capture is a tuple of 19 values (4D model) or 12 values (static model). Output: the same checkpoint with fewer
 //! Gaussians, including optimizer state, `cfg_args`, and the training configuration if it exists. Settings of the
-//! training that the files do not record can be given as [`Conventions`].
+//! training that the files do not record can be given as [`TrainingConventions`].
 
 mod configuration;
 mod frame_state;
@@ -24,7 +24,7 @@ use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, Node, NodeId, Pickle};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, StoredParams, sh_coefficients};
-use crate::models::input_model::{Conventions, InputModel, ModelFormat, OpenOptions};
+use crate::models::input_model::{InputModel, ModelFormat, OpenOptions, TrainingConventions};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
@@ -125,7 +125,7 @@ fn motion_model(
     checkpoint: &Checkpoint,
     parts: &[NodeId],
     config: &TrainingConfig,
-    conventions: &Conventions,
+    conventions: &TrainingConventions,
     stored_terms: usize,
 ) -> Result<Native> {
     let pickle = checkpoint.pickle();

@@ -34,7 +34,7 @@ pub(super) fn propose(
         LinearPath {
             position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
             velocity: slice.velocity,
-            center: raw.own.plane(TIME)[id as usize].into(),
+            center: raw.format_specific.plane(TIME)[id as usize].into(),
             deviation: slice.variance.sqrt(),
         }
     };
@@ -50,7 +50,7 @@ pub(super) fn propose(
     let mut proxies = raw.pick(&leaders);
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
         let Some((opacity, covariance)) = matched.shape else { continue };
-        let StoredParams { gaussians, own } = &mut proxies;
+        let StoredParams { gaussians, format_specific: own } = &mut proxies;
         let LinearPath { position, velocity, center, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));

@@ -4,14 +4,14 @@ use std::path::Path;
 use glam::{DMat3, DMat4, DVec4};
 
 use super::*;
-use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, ReferenceFrame};
 use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 use crate::models;
-use crate::models::Conventions;
 use crate::models::OpenOptions;
+use crate::models::TrainingConventions;
 use crate::models::in_checkpoint::linear::covariance;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
@@ -105,7 +105,8 @@ impl CheckpointFolder {
 }
 
 fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn InputModel>> {
-    let conventions = Conventions { time_duration: Some(2.0), rot4d_unflipped, ..Conventions::default() };
+    let conventions =
+        TrainingConventions { time_duration: Some(2.0), rot4d_unflipped, ..TrainingConventions::default() };
     models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?.with_times(TIMES.to_vec())
 }
 
@@ -250,7 +251,7 @@ fn written_proxies_and_deltas_read_back() {
     }
     let model = open(&folder.put(parts));
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.6), (1, 0.4)] };
-    let reference = Reference { frame: 2, extent: 10.0 };
+    let reference = ReferenceFrame { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.refused.is_empty(), "{proxies:?}");
     let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule());
@@ -258,7 +259,7 @@ fn written_proxies_and_deltas_read_back() {
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(1, [0.1, 0.2, 0.0]);
     let by = Gaussians { rotation: Default::default(), log_scale: Default::default(), ..by };
-    let reduction = CompressedModel { clusters: vec![cluster], proxies, change: ParamDelta(by), ..pruned };
+    let reduction = CompressedModel { clusters: vec![cluster], proxies, delta: ParamDelta(by), ..pruned };
     let shown = model.reduced(&reduction).unwrap();
     let result = folder.written(&*model, &reduction);
     let whole = states(&*model);

@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::deform_folder::{
     Arguments, DeformFolder, MIN_SCALE, ModelParts, NetworkMotionModel, has_network, network_tensor_names,
 };
-use crate::deform::{Encoded, Network, PredictedMotion};
+use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::functions::{exp, ln};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, logit, opacity};
@@ -59,7 +59,7 @@ struct NodeMotion {
 struct CachedNodes {
     nodes: Nodes,
     /// Canonical positions of the nodes, encoded as input of the network.
-    encoded: Encoded,
+    encoded: EncodedPositions,
     /// Whether the last feature of a Gaussian is its motion mask.
     has_mask: bool,
     /// Network outputs for all nodes at the last requested times, oldest first. The key is the f32 bits of the time.
@@ -71,7 +71,7 @@ enum PreparedNodes {
     /// For each Gaussian the K nodes that move it: index of the node, and its weight multiplied by the motion mask.
     Shares(Vec<(u32, f64)>),
     /// Positions encoded as input of the network, for a model without nodes.
-    Encoded(Encoded),
+    Encoded(EncodedPositions),
 }
 
 impl NodeMotion {
@@ -168,7 +168,7 @@ impl CachedNodes {
     /// Returns the motion mask of the Gaussian in row `row`: σ (logistic function) of its last feature; 1 without a
     /// mask.
     fn mask(&self, raw: &StoredParams, row: usize) -> f64 {
-        if self.has_mask { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
+        if self.has_mask { opacity(raw.format_specific.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
     /// Returns the network's output for all nodes at `time`. The output is the same for all blocks of Gaussians, so it
@@ -214,7 +214,7 @@ fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> Attrib
 impl NodeMotion {
     /// Returns the network's output at `time` for a block of Gaussians, as far as the attributes `want` need it.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Attributes) -> Result<PredictedMotion> {
-        let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
+        let (mut motion, want) = (PredictedMotion::default(), want & self.network.deformed_attributes());
         match (prepared, &self.nodes) {
             _ if want.is_empty() => (),
             (PreparedNodes::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
@@ -258,7 +258,7 @@ impl MotionModel for NodeMotion {
     }
 
     fn varying(&self) -> Attributes {
-        self.network.active()
+        self.network.deformed_attributes()
     }
 
     fn movable(&self) -> Attributes {
@@ -301,7 +301,7 @@ impl MotionModel for NodeMotion {
             *found.column_mut(Attributes::POSITION) = match &self.nodes {
                 Some(sparse) => position_slopes(sparse, &self.network, raw, time)?,
                 None => {
-                    let mut slopes = self.network.slopes(&raw.gaussians.position, time)?;
+                    let mut slopes = self.network.warp_jacobian(&raw.gaussians.position, time)?;
                     (0..3).for_each(|c| slopes.plane_mut(4 * c).iter_mut().for_each(|slope| *slope += 1.0));
                     slopes
                 }

@@ -97,7 +97,7 @@ impl Nodes {
     /// Appends to `out` the K nodes that move the Gaussian in row `row` of `raw`, nearest first, with their weights.
     pub(super) fn shares(&self, raw: &StoredParams, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
-        at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));
+        at.extend((0..self.features()).map(|k| raw.format_specific.plane(k)[row]));
         let mut nearest: Vec<(f64, u32)> = Vec::with_capacity(self.nearest + 1);
         for (node, values) in self.values.chunks_exact(self.width).enumerate() {
             let distance = values.iter().zip(&at).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum::<f64>();

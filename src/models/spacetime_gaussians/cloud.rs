@@ -12,7 +12,7 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
-use crate::model::{AttributeValues, Attributes, SH_C0, StoredParams, harmonic};
+use crate::model::{AttributeValues, Attributes, SH_C0, StoredParams, sh_from_color};
 
 /// Name of a property that the point cloud file of no other format has.
 pub(super) const MARKER_PROPERTY: &str = "trbf_center";
@@ -21,7 +21,7 @@ pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 #[derive(Debug)]
 pub(super) struct PointCloudFile {
     ply: Ply,
-    /// Property of the file for each parameter in [`StoredParams::own`].
+    /// Property of the file for each parameter in [`StoredParams::format_specific`].
     own: Vec<Property>,
 }
 
@@ -77,12 +77,12 @@ impl PointCloudFile {
     /// Fails if a value is not finite or the file was cut short since it was opened.
     pub(super) fn raw(&self, activation: ColorActivation) -> Result<StoredParams> {
         let count = self.ply.count();
-        let mut raw = StoredParams { gaussians: self.ply.whole()?, own: AttributeValues::zeros(0, count) };
+        let mut raw = StoredParams { gaussians: self.ply.whole()?, format_specific: AttributeValues::zeros(0, count) };
         let mut own = Vec::with_capacity(self.own.len() * count);
         for property in &self.own {
             own.extend(self.ply.values(&property.name)?.unwrap_or_default());
         }
-        raw.own = match own.is_empty() {
+        raw.format_specific = match own.is_empty() {
             true => AttributeValues::zeros(self.own.len(), 0),
             false => AttributeValues::from_planes(self.own.len(), own),
         };
@@ -94,7 +94,7 @@ impl PointCloudFile {
             names.enumerate().try_for_each(|(c, name)| self.check(name, raw.gaussians.column(column).plane(c)))?;
         }
         for (plane, property) in self.own.iter().enumerate() {
-            self.check(&property.name, raw.own.plane(plane))?;
+            self.check(&property.name, raw.format_specific.plane(plane))?;
         }
         set_colors(&mut raw, self.is_full().then_some(activation));
         Ok(raw)
@@ -131,7 +131,7 @@ impl PointCloudFile {
     pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let (layout, rows) = (self.ply.layout(), rows_of_model(reduction));
         let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
-        let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
+        let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.delta.0);
         let places = |column: Attributes| layout.planes(column).iter().enumerate();
         let columns: Vec<Attributes> =
             Attributes::all().iter().filter(|&of| of != Attributes::SH || !self.is_full()).collect();
@@ -170,7 +170,7 @@ impl PointCloudFile {
                 }
                 if let Some((proxy, raw)) = rows[place].proxy.zip(proxies) {
                     for (plane, property) in self.own.iter().enumerate() {
-                        put(bytes, property, big_endian, raw.own.plane(plane)[proxy as usize]);
+                        put(bytes, property, big_endian, raw.format_specific.plane(plane)[proxy as usize]);
                     }
                 }
             },
@@ -178,7 +178,7 @@ impl PointCloudFile {
     }
 }
 
-/// Returns the name of the property for each parameter in [`StoredParams::own`].
+/// Returns the name of the property for each parameter in [`StoredParams::format_specific`].
 fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
@@ -193,9 +193,10 @@ fn own_property_names(is_full: bool) -> Vec<String> {
 /// three features. Without, it is the stored color, which the PLY reader put where a coefficient would be.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
-        let features = raw.own.width() > FEATURES;
-        let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
+        let features = raw.format_specific.width() > FEATURES;
+        let from: Vec<f32> =
+            if features { raw.format_specific.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
         let color = |x: f32| activation.map_or(f64::from(x), |activation| activation.apply(f64::from(x)));
-        raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(color(x)));
+        raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = sh_from_color(color(x)));
     }
 }

@@ -1,7 +1,7 @@
 //! Computes the states of Gaussians at a time from the stored parameters of a SpacetimeGaussians model.
 //!
 //! [`StoredParams::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH
-//! of degree 0. [`StoredParams::own`] holds the other parameters, at the indices that the constants of this module
+//! of degree 0. [`StoredParams::format_specific`] holds the other parameters, at the indices that the constants of this module
 //! give.
 
 use super::decoder::{self, ColorDecoder};
@@ -11,28 +11,28 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
-/// Index in [`StoredParams::own`] of the center of the temporal window.
+/// Index in [`StoredParams::format_specific`] of the center of the temporal window.
 pub(super) const CENTER: usize = 0;
-/// Index in [`StoredParams::own`] of the natural logarithm of the width of the temporal window.
+/// Index in [`StoredParams::format_specific`] of the natural logarithm of the width of the temporal window.
 pub(super) const LOG_WIDTH: usize = 1;
-/// First of nine indices in [`StoredParams::own`]: coefficients of dt, dt², dt³ of the position, each for x, y, z.
+/// First of nine indices in [`StoredParams::format_specific`]: coefficients of dt, dt², dt³ of the position, each for x, y, z.
 pub(super) const MOTION: usize = 2;
-/// First of four indices in [`StoredParams::own`]: change of the quaternion per unit of time.
+/// First of four indices in [`StoredParams::format_specific`]: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
-/// Number of parameters in [`StoredParams::own`] that both the lite and the full model have.
+/// Number of parameters in [`StoredParams::format_specific`] that both the lite and the full model have.
 pub(super) const WIDTH: usize = 15;
-/// First of six indices in [`StoredParams::own`] of the full model: features that are constant in time. The first three
+/// First of six indices in [`StoredParams::format_specific`] of the full model: features that are constant in time. The first three
 /// are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
 pub(super) const FEATURES: usize = 15;
-/// First of three indices in [`StoredParams::own`] of the full model: features per unit of time.
+/// First of three indices in [`StoredParams::format_specific`] of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
-/// Number of parameters in [`StoredParams::own`] of the full model.
+/// Number of parameters in [`StoredParams::format_specific`] of the full model.
 pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
     /// Returns the motion and temporal window of the Gaussian in row `row`.
     pub(super) fn from_raw(raw: &StoredParams, row: usize) -> SpacetimeMotion {
-        let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
+        let own = |plane: usize| f64::from(raw.format_specific.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {
             center: own(CENTER),
@@ -45,7 +45,7 @@ impl SpacetimeMotion {
 
     /// Stores this motion and window as those of the Gaussian in row `row`, rounded to f32.
     pub(super) fn write(&self, raw: &mut StoredParams, row: usize) {
-        let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
+        let mut own = |plane: usize, value: f64| raw.format_specific.plane_mut(plane)[row] = value as f32;
         own(CENTER, self.center);
         own(LOG_WIDTH, self.log_width);
         for (k, terms) in self.path[1..].iter().enumerate() {
@@ -87,7 +87,12 @@ impl MotionModel for Spacetime {
 
     fn prepare(&self, raw: &StoredParams) -> PreparedGaussian {
         PreparedGaussian {
-            inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
+            inverse_squared: raw
+                .format_specific
+                .plane(LOG_WIDTH)
+                .iter()
+                .map(|&log| (-2.0 * f64::from(log)).exp())
+                .collect(),
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
         }
     }
@@ -111,7 +116,7 @@ impl MotionModel for Spacetime {
         want: Attributes,
         out: &mut Gaussians,
     ) -> Result<()> {
-        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTER));
+        let (stored, own, centers) = (&raw.gaussians, &raw.format_specific, raw.format_specific.plane(CENTER));
         let since = |center: &f32| time - f64::from(*center);
         if want.contains(Attributes::POSITION) {
             for c in 0..3 {
@@ -154,7 +159,7 @@ impl MotionModel for Spacetime {
     ) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Attributes::OPACITY) {
-            let centers = raw.own.plane(CENTER);
+            let centers = raw.format_specific.plane(CENTER);
             let derivative = |row: usize| {
                 let dt = time - f64::from(centers[row]);
                 slope(prepared.inverse_odds[row], window_exponent(dt, prepared.inverse_squared[row])) as f32
@@ -175,12 +180,12 @@ impl Shading for Spacetime {
     /// the temporal window.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues {
         let mut found = AttributeValues::zeros(decoder::FEATURES, raw.len());
-        let centers = raw.own.plane(CENTER);
+        let centers = raw.format_specific.plane(CENTER);
         for plane in 0..FEATURES_IN_TIME - FEATURES {
-            found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));
+            found.plane_mut(plane).copy_from_slice(raw.format_specific.plane(FEATURES + plane));
         }
         for c in 0..FULL_WIDTH - FEATURES_IN_TIME {
-            let by_time = raw.own.plane(FEATURES_IN_TIME + c);
+            let by_time = raw.format_specific.plane(FEATURES_IN_TIME + c);
             for (row, to) in found.plane_mut(FEATURES_IN_TIME - FEATURES + c).iter_mut().enumerate() {
                 *to = ((time - f64::from(centers[row])) * f64::from(by_time[row])) as f32;
             }

@@ -20,20 +20,20 @@ use std::path::{Path, PathBuf};
 
 use super::files::copy;
 use super::iterations::find_iteration;
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{NO_ARCHIVE, write_sequence};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result, quoted};
-use crate::files::cameras::Clock;
+use crate::files::cameras::TimeConvention;
 use crate::files::digest::digest_of_files;
 use crate::files::open::open_file;
 use crate::files::python_literal::{Literal, parse_call};
 use crate::files::state_dict::read_state_dict;
 use crate::files::text::read_text;
 use crate::limits::Limits;
-use crate::model::{StoredParams, color};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
-use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
+use crate::model::{StoredParams, color_from_sh};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
@@ -219,7 +219,7 @@ impl SpacetimeGaussians {
 /// Returns a note with the number of Gaussians whose color is negative; `None` if there are none. The authors' renderer
 /// adds such colors, others clamp them to 0.
 fn negative_color_note(raw: &StoredParams) -> Option<String> {
-    let is_negative = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
+    let is_negative = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color_from_sh(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_negative(row)).count();
     (count > 0).then(|| {
         format!(
@@ -244,39 +244,41 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn bytes(&self) -> Result<u64> {
-        Ok(self.size()?.whole())
+        Ok(self.size()?.total())
     }
 
-    fn size(&self) -> Result<Size> {
+    fn size(&self) -> Result<ModelSize> {
         let other = self.files.other_files();
         let (cloud, rest) =
             (bytes_read_for([&*self.files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
-        Ok(Size { cloud, rest, ..Size::default() })
+        Ok(ModelSize { cloud, rest, ..ModelSize::default() })
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
             OutputKind::Model => Files::find(path, &OpenOptions::default()).and_then(|files| {
                 let other = files.other_files();
                 let (cloud, rest) =
                     (bytes_read_for([&*files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
-                Ok(Size { cloud, rest, ..Size::default() })
+                Ok(ModelSize { cloud, rest, ..ModelSize::default() })
             }),
-            OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            _ => Ok(Size::from_frames(bytes_below(path)?)),
+            OutputKind::Ply | OutputKind::Splatv => {
+                Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() })
+            }
+            _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         residence(if self.cloud.is_full() { FULL_WIDTH } else { WIDTH })
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Continuous
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Continuous
     }
 
-    fn clock(&self) -> Clock {
-        Clock::Given
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -314,14 +316,14 @@ impl InputModel for SpacetimeGaussians {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        solve(&self.model, clusters, reference, rule, |clusters| {
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, self.activation)
         })
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.reduced(reduction)))
+        Ok(Box::new(self.model.compressed_frames(reduction)))
     }
 
     fn write(
@@ -348,7 +350,7 @@ impl InputModel for SpacetimeGaussians {
                 splatv::write(&raw, known, self.files.root_file(CAMERAS).as_deref(), path)?;
             }
             OutputKind::Archive => return Err(Error::usage(NO_ARCHIVE)),
-            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
+            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events),
         }
         Ok(Vec::new())
     }

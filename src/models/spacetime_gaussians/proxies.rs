@@ -16,7 +16,7 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::moments::{WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::merge_state;
-use crate::model::{Attributes, Gaussians, StoredParams, harmonic, opacity};
+use crate::model::{Attributes, Gaussians, StoredParams, opacity, sh_from_color};
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -126,11 +126,12 @@ fn proxy_parameters(
     }
     if model.motion_model().is_full {
         for plane in WIDTH..FULL_WIDTH {
-            out.own.plane_mut(plane)[0] = average(&members, members.raw.own.plane(plane)) as f32;
+            out.format_specific.plane_mut(plane)[0] =
+                average(&members, members.raw.format_specific.plane(plane)) as f32;
         }
         for c in 0..3 {
-            let feature = f64::from(out.own.plane(FEATURES + c)[0]);
-            out.gaussians.sh.plane_mut(c)[0] = harmonic(activation.apply(feature));
+            let feature = f64::from(out.format_specific.plane(FEATURES + c)[0]);
+            out.gaussians.sh.plane_mut(c)[0] = sh_from_color(activation.apply(feature));
         }
     }
     Ok(out)

@@ -11,22 +11,24 @@ use super::common::{check_kind, residence};
 use super::decoder::ColorActivation;
 use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
-use crate::files::accuracy::Accuracy;
-use crate::files::cameras::Clock;
+use crate::files::accuracy::CodingErrors;
+use crate::files::cameras::TimeConvention;
 use crate::files::defects::Defects;
 use crate::files::digest::digest_of_files;
 use crate::files::json::read_json;
-use crate::files::splatv::rows::{has_zero_quaternion, inspect, repair};
-use crate::files::splatv::write::{default_cameras, measure, words, write as write_file};
+use crate::files::splatv::rows::{check_rows, has_zero_quaternion, repair_words};
+use crate::files::splatv::write::{add_errors, default_cameras, encode_words, write_splatv as write_file};
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::Limits;
-use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, color, harmonic, logit, opacity};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::model::{
+    AttributeValues, Attributes, Gaussians, StoredParams, color_from_sh, logit, opacity, sh_from_color,
+};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::models::motion_model::window::MAX_LOGIT;
-use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
-use crate::models::size::{Size, bytes_below, bytes_read_for};
+use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
+use crate::models::size::{ModelSize, bytes_below, bytes_read_for};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -69,9 +71,12 @@ impl SplatvModel {
         let values = (Attributes::all().width(0) + WIDTH + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
-        let (defects, rows) = inspect(&file, zero_rotation)?;
+        let (defects, rows) = check_rows(&file, zero_rotation)?;
         let count = file.count() - defects.dropped;
-        let mut raw = StoredParams { gaussians: Gaussians::zeros(count, 0), own: AttributeValues::zeros(WIDTH, count) };
+        let mut raw = StoredParams {
+            gaussians: Gaussians::zeros(count, 0),
+            format_specific: AttributeValues::zeros(WIDTH, count),
+        };
         for i in 0..count {
             set_from_row(&mut raw, i, &SplatvGaussian::from_words(&file.words(file_row(rows.as_deref(), i))));
         }
@@ -94,8 +99,8 @@ fn set_from_row(raw: &mut StoredParams, i: usize, row: &SplatvGaussian) {
     // Players square the scales, so their sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MAX_LOGIT, MAX_LOGIT) as f32]);
-    raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
-    let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
+    raw.gaussians.sh.set_row(i, row.rgb.map(sh_from_color));
+    let mut own = |plane: usize, value: f32| raw.format_specific.plane_mut(plane)[i] = value;
     own(CENTER, row.center);
     own(LOG_WIDTH, if row.width.is_finite() { log(row.width) } else { UNBOUNDED_LOG_WIDTH });
     row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
@@ -104,14 +109,14 @@ fn set_from_row(raw: &mut StoredParams, i: usize, row: &SplatvGaussian) {
 
 /// Returns Gaussian `i` of `raw` as a row of a `.splatv`.
 fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
-    let own = |plane: usize| raw.own.plane(plane)[i];
+    let own = |plane: usize| raw.format_specific.plane(plane)[i];
     SplatvGaussian {
         position: raw.gaussians.position.row(i),
         motion: std::array::from_fn(|k| own(MOTION + k)),
         rotation: raw.gaussians.rotation.row(i),
         omega: std::array::from_fn(|k| own(OMEGA + k)),
         scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
-        rgb: raw.gaussians.sh.row::<3>(i).map(color),
+        rgb: raw.gaussians.sh.row::<3>(i).map(color_from_sh),
         opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
         center: own(CENTER),
         width: f64::from(own(LOG_WIDTH)).exp() as f32,
@@ -138,10 +143,10 @@ pub(super) fn write(
         let row = to_row(raw, i);
         SplatvGaussian { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
     };
-    let mut accuracy = Accuracy::new(&raw.gaussians.position);
-    (0..raw.len()).for_each(|i| measure(&output_row(i), i, &mut accuracy));
+    let mut accuracy = CodingErrors::new(&raw.gaussians.position);
+    (0..raw.len()).for_each(|i| add_errors(&output_row(i), i, &mut accuracy));
     accuracy.check("a .splatv")?;
-    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&output_row(i))), &cameras)
+    write_file(path, raw.len(), (0..raw.len()).map(|i| encode_words(&output_row(i))), &cameras)
 }
 
 impl InputModel for SplatvModel {
@@ -161,18 +166,18 @@ impl InputModel for SplatvModel {
         bytes_read_for([self.file.path()])
     }
 
-    fn size(&self) -> Result<Size> {
-        Ok(Size { cloud: self.bytes()?, ..Size::default() })
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize { cloud: self.bytes()?, ..ModelSize::default() })
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind {
-            OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            _ => Ok(Size::from_frames(bytes_below(path)?)),
+            OutputKind::Splatv => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
+            _ => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let all = residence(WIDTH);
         let of_rows = if self.rows.is_some() { size_of::<u32>() as u64 } else { 0 };
         MemoryProfile { per_gaussian: all.per_gaussian + of_rows, ..all }
@@ -182,12 +187,12 @@ impl InputModel for SplatvModel {
         self.defects.notes().into_iter().chain(self.file.note()).collect()
     }
 
-    fn timing(&self) -> Timing {
-        Timing::Continuous
+    fn timing(&self) -> TimeOrigin {
+        TimeOrigin::Continuous
     }
 
-    fn clock(&self) -> Clock {
-        Clock::Given
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
@@ -213,14 +218,14 @@ impl InputModel for SplatvModel {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        solve(&self.model, clusters, reference, rule, |clusters| {
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, ColorActivation::None)
         })
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.reduced(reduction)))
+        Ok(Box::new(self.model.compressed_frames(reduction)))
     }
 
     fn write(
@@ -232,7 +237,7 @@ impl InputModel for SplatvModel {
         events: &Events,
     ) -> Result<Vec<String>> {
         if kind != OutputKind::Splatv {
-            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events);
+            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events);
         }
         self.file.check()?;
         let raw = compressed_raw(self.model.raw(), reduction);
@@ -240,15 +245,15 @@ impl InputModel for SplatvModel {
         let words_of = |i: usize| {
             let (now, before) = (to_row(&raw, i), to_row(&unchanged, i));
             if now != before {
-                return words(&now);
+                return encode_words(&now);
             }
             let mut stored = self.file.words(file_row(self.rows.as_deref(), reduction.kept[i] as usize));
-            repair(&mut stored);
+            repair_words(&mut stored);
             stored
         };
-        let mut accuracy = Accuracy::new(&raw.gaussians.position);
+        let mut accuracy = CodingErrors::new(&raw.gaussians.position);
         let changed = |&i: &usize| to_row(&raw, i) != to_row(&unchanged, i);
-        (0..raw.len()).filter(changed).for_each(|i| measure(&to_row(&raw, i), i, &mut accuracy));
+        (0..raw.len()).filter(changed).for_each(|i| add_errors(&to_row(&raw, i), i, &mut accuracy));
         accuracy.check("a .splatv")?;
         write_file(path, raw.len(), (0..raw.len()).map(words_of), self.file.cameras())?;
         Ok(Vec::new())

@@ -113,7 +113,7 @@ fn states_follow_the_formulas_in_both_variants() {
         assert_eq!(model.kind().contains("full"), is_full);
         assert_eq!(
             (model.source().info().count, model.clock(), model.background()),
-            (COUNT, Clock::Given, Some([0.0; 3]))
+            (COUNT, TimeConvention::Given, Some([0.0; 3]))
         );
         for (state, time) in states(model.source()).iter().zip(TIMES) {
             for i in 0..COUNT {
@@ -126,7 +126,7 @@ fn states_follow_the_formulas_in_both_variants() {
                     assert_eq!(state.log_scale.plane(c)[i], value(&format!("scale_{c}"), i));
                     let feature = stored(&format!("f_dc_{c}"));
                     let expected = if is_full { 1.0 / (1.0 + (-feature).exp()) } else { feature };
-                    assert!((crate::model::color(state.sh.plane(c)[i]) - expected).abs() < 1e-6);
+                    assert!((crate::model::color_from_sh(state.sh.plane(c)[i]) - expected).abs() < 1e-6);
                 }
                 for c in 0..4 {
                     let expected = stored(&format!("rot_{c}")) + dt * stored(&format!("omega_{c}"));
@@ -218,7 +218,7 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
         assert_eq!(states(open_with_frames(result.path()).source()), expected);
         let size = model.size_written(OutputKind::Model, result.path()).unwrap();
         assert_eq!(size, open(result.path()).unwrap().size().unwrap());
-        assert!(size.whole() < model.bytes().unwrap() && size.rest > 0);
+        assert!(size.total() < model.bytes().unwrap() && size.rest > 0);
         // The PLY alone, as viewers open it.
         let alone = result.path().join("alone.ply");
         model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
@@ -234,7 +234,7 @@ fn kept_rows_of_a_folder_keep_their_bytes() {
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };
-    let reference = Reference { frame: 0, extent: 1.0 };
+    let reference = ReferenceFrame { frame: 0, extent: 1.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule).unwrap();
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(0, [0.5, 0.0, -0.25]);
@@ -249,7 +249,7 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
     CompressedModel {
         clusters: vec![cluster],
         proxies,
-        change: ParamDelta(by),
+        delta: ParamDelta(by),
         ..CompressedModel::pruned(vec![0, 3, 6], &rule)
     }
 }
@@ -293,7 +293,7 @@ fn proxy_of_similar_members_is_their_mean_at_every_frame() {
         Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] },
         Cluster { output: 1, leader: 2, members: vec![(2, 0.3), (3, 0.7)] },
     ];
-    let proxies = model.solve(&clusters, Reference { frame: 0, extent: 1.0 }, &rule).unwrap();
+    let proxies = model.solve(&clusters, ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
     let reduction =
         CompressedModel { clusters: clusters.to_vec(), proxies, ..CompressedModel::pruned(vec![0, 2], &rule) };
     let found = states(&*model.reduced(&reduction).unwrap());
@@ -349,7 +349,7 @@ fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     assert_eq!(small.cameras(), file.cameras());
     let mut by = Gaussians { position: AttributeValues::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
-    let moved = CompressedModel { change: ParamDelta(by), ..CompressedModel::pruned(vec![2, 5], &rule) };
+    let moved = CompressedModel { delta: ParamDelta(by), ..CompressedModel::pruned(vec![2, 5], &rule) };
     read.write(&moved, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     let moved = Splatv::open(&kept).unwrap();
     assert_eq!(moved.words(0), file.words(2));

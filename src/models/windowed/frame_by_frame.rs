@@ -12,7 +12,7 @@ use crate::models::motion_model::window::MAX_LOGIT;
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Index in [`StoredParams::own`] of the frame in which a Gaussian is visible.
+/// Index in [`StoredParams::format_specific`] of the frame in which a Gaussian is visible.
 const FRAME: usize = 0;
 
 /// Motion model of single frames.
@@ -64,7 +64,7 @@ impl MotionModel for FrameByFrame {
         copy_stored(raw, want, out);
         if want.contains(Attributes::OPACITY) {
             let now = self.frame(time) as f32;
-            let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(raw.own.plane(FRAME));
+            let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(raw.format_specific.plane(FRAME));
             logits.filter(|(_, frame)| **frame != now).for_each(|(logit, _)| *logit = -MAX_LOGIT as f32);
         }
         Ok(())
@@ -74,7 +74,8 @@ impl MotionModel for FrameByFrame {
         let mut jacobian = Jacobian::default();
         if want.contains(Attributes::OPACITY) {
             let now = self.frame(time) as f32;
-            let slopes = raw.own.plane(FRAME).iter().map(|&frame| f32::from(u8::from(frame == now))).collect();
+            let slopes =
+                raw.format_specific.plane(FRAME).iter().map(|&frame| f32::from(u8::from(frame == now))).collect();
             *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes);
         }
         Ok(jacobian)

@@ -7,7 +7,7 @@ use super::WindowedModel;
 use crate::files::ftgs::{Ftgs, MARKER_COMMENT};
 use crate::files::open::open_file;
 use crate::models::free_time_gs::frame_state::FreeTime;
-use crate::models::input_model::{ModelFormat, Timing};
+use crate::models::input_model::{ModelFormat, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
 use crate::outputs::kind::OutputKind;
 
@@ -30,7 +30,7 @@ pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
             path: path.to_owned(),
             name: "ftgs-player model",
             own: OutputKind::Ftgs,
-            timing: Timing::Continuous,
+            timing: TimeOrigin::Continuous,
             notes: file.defects.notes(),
             model: MotionModelFrames::new(motion, file.params, sh_degree),
         }))

@@ -10,16 +10,16 @@ mod tsog;
 use std::path::{Path, PathBuf};
 
 use super::in_checkpoint::{ProxyRule, write_frames};
-use super::motion_model::{MotionModelFrames, solve};
-use super::size::{Size, bytes_below, bytes_read_for};
+use super::motion_model::{MotionModelFrames, propose_proxies};
+use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{NO_ARCHIVE, state_bytes};
-use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
-use crate::files::cameras::Clock;
+use crate::files::cameras::TimeConvention;
 use crate::files::digest::digest_of_files;
 use crate::limits::Limits;
 use crate::model::{Attributes, Jacobian};
-use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, TimeOrigin};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -37,7 +37,7 @@ struct WindowedModel<L: ProxyRule> {
     /// Kind of output that has the format of this file.
     own: OutputKind,
     /// Whether frames can be at any time.
-    timing: Timing,
+    timing: TimeOrigin,
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
@@ -60,20 +60,20 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         bytes_read_for([&*self.path])
     }
 
-    fn size(&self) -> Result<Size> {
-        Ok(Size { cloud: self.bytes()?, ..Size::default() })
+    fn size(&self) -> Result<ModelSize> {
+        Ok(ModelSize { cloud: self.bytes()?, ..ModelSize::default() })
     }
 
-    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<ModelSize> {
         match kind == self.own {
-            true => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            false => Ok(Size::from_frames(bytes_below(path)?)),
+            true => Ok(ModelSize { cloud: bytes_read_for([path])?, ..ModelSize::default() }),
+            false => Ok(ModelSize::from_frames(bytes_below(path)?)),
         }
     }
 
-    fn residence(&self) -> MemoryProfile {
+    fn memory_profile(&self) -> MemoryProfile {
         let raw = self.model.raw();
-        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.own.width() as u64;
+        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.format_specific.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
             // A copy of the parameters, without the Gaussians that were left out.
@@ -96,17 +96,17 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         self.notes.clone()
     }
 
-    fn timing(&self) -> Timing {
+    fn timing(&self) -> TimeOrigin {
         self.timing
     }
 
-    fn clock(&self) -> Clock {
-        Clock::Given
+    fn clock(&self) -> TimeConvention {
+        TimeConvention::Given
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         let found = self.model.info().times.len();
-        if self.timing == Timing::Numbered && times.len() != found {
+        if self.timing == TimeOrigin::Numbered && times.len() != found {
             return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
         }
         self.model = match self.model.motion_model().for_times(&times) {
@@ -132,12 +132,12 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        solve(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
+    fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
+        propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.model.reduced(reduction)))
+        Ok(Box::new(self.model.compressed_frames(reduction)))
     }
 
     fn write(
@@ -148,7 +148,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         limits: &Limits,
         events: &Events,
     ) -> Result<Vec<String>> {
-        write_frames(&self.model, reduction, kind, path, limits.frames_held, events)
+        write_frames(&self.model, reduction, kind, path, limits.max_kept_frames, events)
     }
 }
 

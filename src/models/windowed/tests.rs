@@ -3,7 +3,7 @@ use std::path::Path;
 
 use super::*;
 use crate::compressed_model::ParamDelta;
-use crate::files::ftgs::{CENTER, ClipTimes, Ftgs, LOG_DEVIATION, VELOCITY, WIDTH, write_ftgs};
+use crate::files::ftgs::{CENTER, ClipTimes, Ftgs, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_ftgs};
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::files::tsog::read::read_tsog;
@@ -22,7 +22,10 @@ const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
 /// Returns Gaussians with linear motion in windows of time. Gaussian 3 is visible for less than the minimum duration.
 fn params() -> StoredParams {
     let noise = |seed: usize, i: usize| ((i * 37 + seed * 101) % 97) as f32 / 97.0 - 0.5;
-    let mut made = StoredParams { gaussians: Gaussians::zeros(COUNT, 1), own: AttributeValues::zeros(WIDTH, COUNT) };
+    let mut made = StoredParams {
+        gaussians: Gaussians::zeros(COUNT, 1),
+        format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, COUNT),
+    };
     for i in 0..COUNT {
         let g = &mut made.gaussians;
         g.position.set_row(i, [0, 1, 2].map(|c| 4.0 * noise(c, i)));
@@ -30,9 +33,9 @@ fn params() -> StoredParams {
         g.log_scale.set_row(i, [0, 1, 2].map(|c| noise(5 + c, i) - 2.0));
         g.opacity_logit.set_row(i, [2.0 * noise(8, i)]);
         (0..12).for_each(|c| g.sh.plane_mut(c)[i] = noise(9 + c, i));
-        made.own.plane_mut(CENTER)[i] = noise(21, i) + 0.5;
-        made.own.plane_mut(LOG_DEVIATION)[i] = if i == 3 { -9.0 } else { noise(22, i) - 1.5 };
-        (0..3).for_each(|c| made.own.plane_mut(VELOCITY + c)[i] = 2.0 * noise(23 + c, i));
+        made.format_specific.plane_mut(CENTER)[i] = noise(21, i) + 0.5;
+        made.format_specific.plane_mut(LOG_DEVIATION)[i] = if i == 3 { -9.0 } else { noise(22, i) - 1.5 };
+        (0..3).for_each(|c| made.format_specific.plane_mut(VELOCITY + c)[i] = 2.0 * noise(23 + c, i));
     }
     made
 }
@@ -60,13 +63,13 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
     let path = folder.path().join("a.ftgs.ply");
     let stored = params();
     for (first, last) in [(0.0, 1.0), (-1.0, 3.0)] {
-        write_ftgs(&stored, &ClipTimes { first, last, ..ClipTimes::UNIT }, &path).unwrap();
+        write_ftgs(&stored, &ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
         let times = TIMES.map(|time| first + (last - first) * time);
         let model = open_at(&path, &times);
         assert_eq!((model.kind(), model.own_output()), ("ftgs-player model", OutputKind::Ftgs));
         for (state, time) in states(&*model).iter().zip(TIMES) {
             for i in 0..COUNT {
-                let own = |plane: usize| f64::from(stored.own.plane(plane)[i]);
+                let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
                 let dt = time - own(CENTER);
                 for c in 0..3 {
                     let expected = f64::from(stored.gaussians.position.plane(c)[i]) + own(VELOCITY + c) * dt;
@@ -86,7 +89,7 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
 fn a_smaller_ftgs_keeps_the_values_of_its_rows() {
     let folder = tempfile::tempdir().unwrap();
     let [path, small] = ["a.ftgs.ply", "small.ftgs.ply"].map(|name| folder.path().join(name));
-    let clip = ClipTimes { first: 1.0, last: 2.0, frames: Some(7), ..ClipTimes::UNIT };
+    let clip = ClipTimes { first: 1.0, last: 2.0, frames: Some(7), ..ClipTimes::UNIT_INTERVAL };
     write_ftgs(&params(), &clip, &path).unwrap();
     let model = open_at(&path, &[1.0, 1.5, 2.0]);
     assert!(write(&*model, &pruned(vec![2, 7, 9]), OutputKind::Ftgs, &small).is_empty());
@@ -99,11 +102,11 @@ fn a_smaller_ftgs_keeps_the_values_of_its_rows() {
 fn deltas_of_refinement_are_written_into_the_rows() {
     let folder = tempfile::tempdir().unwrap();
     let [path, small] = ["a.ftgs.ply", "small.ftgs.ply"].map(|name| folder.path().join(name));
-    write_ftgs(&params(), &ClipTimes::UNIT, &path).unwrap();
+    write_ftgs(&params(), &ClipTimes::UNIT_INTERVAL, &path).unwrap();
     let model = open_at(&path, &TIMES);
     let mut by = Gaussians { position: AttributeValues::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
-    let reduction = CompressedModel { change: ParamDelta(by), ..pruned(vec![2, 5]) };
+    let reduction = CompressedModel { delta: ParamDelta(by), ..pruned(vec![2, 5]) };
     write(&*model, &reduction, OutputKind::Ftgs, &small);
     assert_eq!(states(&*open_at(&small, &TIMES)), states_of(&*model.reduced(&reduction).unwrap()));
 }
@@ -119,13 +122,13 @@ fn proxies_of_copies_move_like_their_members() {
     let mut made = params();
     let copy = made.clone();
     made.set_row(1, &copy, 0);
-    made.own.plane_mut(LOG_DEVIATION).fill(0.0);
+    made.format_specific.plane_mut(LOG_DEVIATION).fill(0.0);
     made.gaussians.opacity_logit.plane_mut(0).fill(-3.0);
-    write_ftgs(&made, &ClipTimes { first: 2.0, last: 6.0, ..ClipTimes::UNIT }, &path).unwrap();
+    write_ftgs(&made, &ClipTimes { first: 2.0, last: 6.0, ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
     let model = open_at(&path, &[2.0, 3.0, 4.0, 6.0]);
     let rule = Recipe::preset("default").unwrap().merge;
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] };
-    let proxies = model.solve(std::slice::from_ref(&cluster), Reference { frame: 0, extent: 1.0 }, &rule).unwrap();
+    let proxies = model.solve(std::slice::from_ref(&cluster), ReferenceFrame { frame: 0, extent: 1.0 }, &rule).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-5), "{proxies:?}");
     let reduction = CompressedModel { clusters: vec![cluster], proxies, ..pruned(vec![0, 4]) };
     for (merged, all) in states_of(&*model.reduced(&reduction).unwrap()).iter().zip(states(&*model)) {
@@ -137,7 +140,7 @@ fn proxies_of_copies_move_like_their_members() {
 fn player_files_are_no_trained_models() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ftgs.ply");
-    write_ftgs(&params(), &ClipTimes::UNIT, &path).unwrap();
+    write_ftgs(&params(), &ClipTimes::UNIT_INTERVAL, &path).unwrap();
     let model = open_at(&path, &TIMES);
     for kind in [OutputKind::Model, OutputKind::Ply, OutputKind::Archive] {
         assert!(model.check_output(kind, Path::new("x")).is_err(), "{kind:?}");
@@ -148,14 +151,14 @@ fn player_files_are_no_trained_models() {
 }
 
 fn timed(timeline: Timeline) -> TimedGaussians {
-    let StoredParams { gaussians, own } = params();
+    let StoredParams { gaussians, format_specific: own } = params();
     let own = match timeline {
         Timeline::Windows => own,
         Timeline::Frames(frames) => AttributeValues::from_planes(1, (0..COUNT).map(|i| (i % frames) as f32).collect()),
         Timeline::Still => AttributeValues::zeros(0, COUNT),
     };
-    let clip = ClipTimes { frames: Some(4), ..ClipTimes::UNIT };
-    TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip }
+    let clip = ClipTimes { frames: Some(4), ..ClipTimes::UNIT_INTERVAL };
+    TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip }
 }
 
 #[test]
@@ -168,7 +171,7 @@ fn tsog_states_follow_the_formulas_of_the_player() {
     assert_eq!((model.kind(), model.own_output()), ("TSOG model", OutputKind::Tsog));
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for i in 0..COUNT {
-            let own = |plane: usize| f64::from(stored.own.plane(plane)[i]);
+            let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
             let dt = time - own(CENTER);
             let x = f64::from(stored.gaussians.position.plane(0)[i]) + own(VELOCITY) * dt;
             assert!((f64::from(state.position.plane(0)[i]) - x).abs() < 1e-6);
@@ -186,10 +189,10 @@ fn a_tsog_of_single_frames_shows_each_gaussian_once() {
     write_tsog(&timed(Timeline::Frames(5)), &path).unwrap();
     let stored = read_tsog(&path, ReadLimit::NONE).unwrap().params;
     let model = models::open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((model.timing(), model.source().info().times.len()), (Timing::Numbered, 5));
+    assert_eq!((model.timing(), model.source().info().times.len()), (TimeOrigin::Numbered, 5));
     for (frame, state) in states(&*model).iter().enumerate() {
         for i in 0..COUNT {
-            let is_seen = stored.own.plane(0)[i] as usize == frame;
+            let is_seen = stored.format_specific.plane(0)[i] as usize == frame;
             assert_eq!(opacity(state.opacity_logit.plane(0)[i]) > 1e-9, is_seen, "Gaussian {i} in frame {frame}");
         }
     }

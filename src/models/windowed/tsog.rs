@@ -11,7 +11,7 @@ use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::models::free_time_gs::frame_state::FreeTime;
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::still::Still;
-use crate::models::input_model::{InputModel, ModelFormat, Timing};
+use crate::models::input_model::{InputModel, ModelFormat, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
 use crate::outputs::kind::OutputKind;
 
@@ -25,7 +25,7 @@ pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
         match timeline {
             Timeline::Windows => {
                 let motion = FreeTime { clip, deviation_floor: [SMALLEST_DEVIATION, 0.0], min_opacity: 0.0 };
-                opened(path, Timing::Continuous, MotionModelFrames::new(motion, params, sh_degree), Vec::new())
+                opened(path, TimeOrigin::Continuous, MotionModelFrames::new(motion, params, sh_degree), Vec::new())
             }
             Timeline::Frames(frames) => {
                 let motion = FrameByFrame::new(frames, clip);
@@ -36,11 +36,11 @@ pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
                 );
                 let times = motion.times().to_vec();
                 let model = MotionModelFrames::new(motion, params, sh_degree).with_times(times)?;
-                opened(path, Timing::Numbered, model, vec![note])
+                opened(path, TimeOrigin::Numbered, model, vec![note])
             }
             Timeline::Still => {
                 let model = MotionModelFrames::new(Still, params, sh_degree).with_times(vec![0.0])?;
-                opened(path, Timing::Numbered, model, Vec::new())
+                opened(path, TimeOrigin::Numbered, model, Vec::new())
             }
         }
     },
@@ -55,7 +55,7 @@ fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
 /// Returns the opened file at `path`, whose frames `model` computes.
 fn opened<L: ProxyRule + 'static>(
     path: &Path,
-    timing: Timing,
+    timing: TimeOrigin,
     model: MotionModelFrames<L>,
     notes: Vec<String>,
 ) -> Result<Box<dyn InputModel>> {

@@ -10,18 +10,20 @@
 use std::collections::BTreeMap;
 
 use super::bounds;
-use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
+use crate::archive::{
+    self, ATTRIBUTES, ArchiveContent, EncodedArchive, QuantizationSteps, STEP_NUMBERS, TensorRole, TensorSteps,
+};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
 use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
-use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
     ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
     OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, pictures,
@@ -58,7 +60,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for ArchiveStage {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits)]
+        vec![self.resource_estimate(work, limits)]
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -112,19 +114,19 @@ impl ValueGroup {
 impl ArchiveStage {
     /// Returns the resource estimate of the stage. Its memory holds the result, renders of it, the archive and the
     /// decoded archive.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        let whole = work.state_bytes(Attributes::all());
         let count = pictures(work.pixels);
         // About forty groups of values are quantized alone in every balancing round, and all together in each halving.
         let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
-            seconds: work.render_seconds(looked, 0.3 * work.count(), RENDER),
+            seconds: work.render_seconds(looked, 0.3 * work.gaussian_count(), RENDER_COST),
             per_gaussian: vec![
                 ("states", whole),
                 ("readers", work.input.reader),
-                ("held", work.held(limits, Attributes::all())),
+                ("held", work.kept_frames_bytes(limits, Attributes::all())),
                 ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
                 ("contents", 4 * whole),
             ],
@@ -149,18 +151,18 @@ impl ArchiveStage {
         compressed: &CompressedModel,
         asked: ArchiveTarget,
         journal: &mut Journal,
-    ) -> Result<(Archived, ArchiveSummary)> {
+    ) -> Result<(PreparedArchive, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, compressed));
         let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_as_frames() {
                 true => {
                     let left = scene.input.reduced(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
-                    (Archived::Frames(bounds), summary)
+                    (PreparedArchive::Frames(bounds), summary)
                 }
                 false => {
                     let (encoded, summary) = self.make(scene, compressed, asked)?;
-                    (Archived::Content(encoded), summary)
+                    (PreparedArchive::Content(encoded), summary)
                 }
             };
             Ok(((archived, AsToml(summary)), compressed.len()))
@@ -173,8 +175,8 @@ impl ArchiveStage {
         scene: &Scene,
         compressed: &CompressedModel,
         asked: ArchiveTarget,
-    ) -> Result<(Encoded, ArchiveSummary)> {
-        let mut content = scene.input.content(compressed)?;
+    ) -> Result<(EncodedArchive, ArchiveSummary)> {
+        let mut content = scene.input.archive_content(compressed)?;
         let reference_views = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
         let original = ReferenceViews::new(scene, scene.source())?;
         let level = check_measurable(reference_views.psnr(scene.source())?)?;
@@ -193,7 +195,7 @@ impl ArchiveStage {
             progress.advance(1);
             archive::encode(&content, &grids.steps(added))
         };
-        let measure_views = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
+        let measure_views = |encoded: EncodedArchive| -> Result<(EncodedArchive, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
             let shown = scene.input.decode_frames(&decoded)?;
             Ok((encoded, [reference_views.psnr(&*shown)?, level - original.psnr(&*shown)?]))
@@ -226,17 +228,17 @@ impl ArchiveStage {
 ///
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
-pub fn bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
+pub fn estimated_bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
     if scene.input.archives_as_frames() {
         return bounds::bytes(scene, &*scene.input.reduced(compressed)?);
     }
-    let content = scene.input.content(compressed)?;
+    let content = scene.input.archive_content(compressed)?;
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
 }
 
 /// Returns `encoded`, the archive of `gaussians` Gaussians with the coarsest steps, or an error if it has more than
 /// `most` bytes.
-fn check_coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
+fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Result<EncodedArchive> {
     let least = encoded.bytes.len();
     if least as u64 > most {
         return Err(Error::usage(format!(
@@ -259,19 +261,20 @@ struct Grids {
 }
 
 impl Grids {
-    fn from_content(content: &Content) -> Grids {
+    fn from_content(content: &ArchiveContent) -> Grids {
         let groups = groups(content);
         let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
         let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.initial_steps()).log2();
         let octaves = groups.iter().zip(&deviations).map(first).collect();
-        let space = archive::space(content);
-        let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
+        let space = archive::field_box(content);
+        let offsets =
+            archive::step_offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
         Grids { groups, deviations, octaves, offsets }
     }
 
     /// Returns the quantization steps, each made coarser by `added` octaves (doublings).
-    fn steps(&self, added: f64) -> Steps {
-        let mut steps = Steps::default();
+    fn steps(&self, added: f64) -> QuantizationSteps {
+        let mut steps = QuantizationSteps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
                 ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
@@ -292,7 +295,7 @@ impl Grids {
         &mut self,
         scene: &Scene,
         reference_views: &ReferenceViews<'_>,
-        content: &mut Content,
+        content: &mut ArchiveContent,
         error: f64,
         progress: &Progress,
     ) -> Result<Vec<(String, f64, f64, f64)>> {
@@ -323,10 +326,10 @@ impl Grids {
         &self,
         scene: &Scene,
         reference_views: &ReferenceViews<'_>,
-        content: &mut Content,
+        content: &mut ArchiveContent,
         progress: &Progress,
     ) -> Result<Vec<f64>> {
-        let space = archive::space(content);
+        let space = archive::field_box(content);
         let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
             progress.advance(1);
             match group {
@@ -342,7 +345,7 @@ impl Grids {
                 ValueGroup::Tensor(name) => {
                     let (before, role) = (content.tensors[name].clone(), content.field[name]);
                     let steps = self.tensor(name, octave);
-                    let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
+                    let rounded = archive::round_tensor(&before, role, &steps, &content.cloud.position, space);
                     content.tensors.insert(name.clone(), rounded);
                     let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.tensors.insert(name.clone(), before);
@@ -354,9 +357,9 @@ impl Grids {
     }
 }
 
-fn groups(content: &Content) -> Vec<ValueGroup> {
+fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
     let attributes = 4 + content.cloud.sh_degree() + 1;
-    let tensors = content.field.iter().filter(|(_, role)| !matches!(role, Role::Exact | Role::Unread));
+    let tensors = content.field.iter().filter(|(_, role)| !matches!(role, TensorRole::Exact | TensorRole::Unread));
     (0..attributes)
         .map(ValueGroup::Attribute)
         .chain(tensors.map(|(name, _)| ValueGroup::Tensor(name.clone())))
@@ -364,7 +367,7 @@ fn groups(content: &Content) -> Vec<ValueGroup> {
 }
 
 /// Returns the standard deviation of the values of `group`, at least 1e-9.
-fn deviation(content: &Content, group: &ValueGroup) -> f64 {
+fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     let deviation = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
         values.for_each(|value| {
@@ -377,7 +380,7 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     };
     let found = match group {
         ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
-        ValueGroup::Attribute(k) => deviation(&mut archive::attribute(&content.cloud, *k)),
+        ValueGroup::Attribute(k) => deviation(&mut archive::attribute_values(&content.cloud, *k)),
     };
     found.max(1e-9)
 }
@@ -385,5 +388,5 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
 /// Returns the quantization step nearest to 2^`octave`, as a number of eighths of an octave, limited to the valid
 /// steps.
 fn nearest_step(octave: f64) -> i32 {
-    ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
+    ((8.0 * octave).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }

@@ -7,13 +7,13 @@ use super::field::{COMPARED_VIEWS, least};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
-use crate::journal::records::BandsSummary;
+use crate::journal::records::ShDegreeSummary;
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
 use crate::model::{Attributes, FrameView, Gaussians};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{Batch, RenderedSource, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
@@ -95,7 +95,7 @@ impl ShDegreeStage {
     /// renders of them. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) =
-            (work.state(Attributes::all()), work.input.reader, work.held(limits, Attributes::all()));
+            (work.state_bytes(Attributes::all()), work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
             ("kept", bytes_of_survivors(left, 24)),
             ("states", whole + bytes_of_survivors(left, 2 * whole)),
@@ -107,12 +107,12 @@ impl ShDegreeStage {
         let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
         ResourceEstimate {
             stage: NAME,
-            seconds: work.reading(work.count(), 2.0 * pictures as f64)
-                + work.render_seconds(pictures as f64, work.count(), RENDER)
-                + work.render_seconds(2.0 * pictures as f64, left * work.count(), RENDER),
-            reads: 2.0 * work.scattered_reads(pictures, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), 2.0 * pictures as f64)
+                + work.render_seconds(pictures as f64, work.gaussian_count(), RENDER_COST)
+                + work.render_seconds(2.0 * pictures as f64, left * work.gaussian_count(), RENDER_COST),
+            reads: 2.0 * work.scattered_full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.arriving(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
+            fixed: vec![work.filling_blocks(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
     }
 
@@ -127,7 +127,7 @@ impl ShDegreeStage {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
-        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
+        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
         let stay = match scene.input.needs_all_bands() {
             _ if all == 0 => Some("colors have SH degree 0"),
             None if compressed.is_empty() || pictures.is_empty() => {
@@ -150,7 +150,7 @@ impl ShDegreeStage {
         }
         drop(source);
         let [result, least] = found;
-        let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
+        let found = ShDegreeSummary { sh_degree, pictures: pictures.len(), tried, result, least };
         if sh_degree == all {
             journal.leave_out(DROPPED_DEGREES, found.why());
         }
@@ -170,7 +170,7 @@ fn quality_without_degrees(
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(result)];
-    show(subjects, &scene.schedule.cameras, pictures, Batch::one_frame(&scene.limits), |views| {
+    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
         for view in views {
             let picture = |state: &Gaussians| render(state, view.camera, scene.background);
             let [original, whole] = view.states.map(picture);

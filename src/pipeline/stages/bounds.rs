@@ -14,14 +14,14 @@ use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::memory_plan::{MemoryPart, Workload};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
-use crate::outputs::bounds::Bounds;
+use crate::outputs::bounds::ErrorBounds;
 use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
 use crate::pipeline::stages::reference_views::{
     ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, OCTAVE_HALVINGS, OCTAVE_RANGE,
     QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
-use crate::scene::{Scene, first_box};
+use crate::scene::{Scene, first_frame_box};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Compression level of zstd for archives of frames.
@@ -38,8 +38,8 @@ const COUNTED_BLOCKS: usize = 4;
 const ESTIMATE_OCTAVES: f64 = 2.0;
 
 /// Returns the storage options of a container whose values may err by at most `bounds`.
-pub(crate) fn packing(bounds: Bounds) -> Packing {
-    Packing::within(bounds, LEVEL)
+pub(crate) fn packing(bounds: ErrorBounds) -> Packing {
+    Packing::with_bounds(bounds, LEVEL)
 }
 
 /// Returns the memory that storing the frames of an input within error bounds takes. Empty for models and point clouds,
@@ -48,7 +48,7 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
     }
-    [work.writing_together(BOUNDED_FRAME_BLOCK), vec![work.compressing(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
+    [work.tile_write_buffers(BOUNDED_FRAME_BLOCK), vec![work.compressor_memory(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
 }
 
 /// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If
@@ -61,7 +61,7 @@ pub(crate) fn find(
     source: &dyn FrameSource,
     psnr: Option<f64>,
     asked: ArchiveTarget,
-) -> Result<(Bounds, ArchiveSummary)> {
+) -> Result<(ErrorBounds, ArchiveSummary)> {
     let (reference_views, original) =
         (ReferenceViews::new(scene, source)?, ReferenceViews::new(scene, scene.source())?);
     let level = check_measurable(reference_views.psnr(scene.source())?)?;
@@ -88,7 +88,7 @@ pub(crate) fn find(
     }
     let measure_views = |widths: [f64; 5]| -> Result<([f64; 5], [f64; 2])> {
         progress.advance(1);
-        let shown = Rounded { source, bounds: Bounds::new(widths) };
+        let shown = Rounded { source, bounds: ErrorBounds::new(widths) };
         Ok((widths, [reference_views.psnr(&shown)?, level - original.psnr(&shown)?]))
     };
     let (widths, [psnr, loss]) = match quality_target {
@@ -128,7 +128,7 @@ pub(crate) fn find(
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
     let summary = ArchiveSummary { asked, psnr, level, loss, parts: None, bounds: Some(bounds), bits, measured };
-    Ok((Bounds::new(widths), summary))
+    Ok((ErrorBounds::new(widths), summary))
 }
 
 /// Returns the estimated size, bytes, of an archive of the frames of `source`. Its error bounds are fixed ones, chosen
@@ -144,13 +144,13 @@ pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
 fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");
-    write_container(source, &path, packing(Bounds::new(widths)), BTreeMap::new(), |_| ())?;
+    write_container(source, &path, packing(ErrorBounds::new(widths)), BTreeMap::new(), |_| ())?;
     Ok(fs::metadata(&path).map_err(Error::io("read", &path))?.len())
 }
 
 /// Returns the initial error bounds [`INITIAL_BOUNDS`], with that of positions in scene units.
 fn initial_bounds(source: &dyn FrameSource) -> Result<[f64; 5]> {
-    let extent = first_box(source)?.map_or(1.0, |found| found.extent());
+    let extent = first_frame_box(source)?.map_or(1.0, |found| found.extent());
     let [position, others @ ..] = INITIAL_BOUNDS;
     let [rotation, log_scale, opacity, sh] = others;
     let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };
@@ -165,14 +165,14 @@ fn widened(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
 /// are exact.
 fn errors(reference_views: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
-    (0..5).map(|k| reference_views.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
+    (0..5).map(|k| reference_views.error(&Rounded { source, bounds: ErrorBounds::new(alone(k)) })).collect()
 }
 
 /// Returns for each attribute the size in bits of a sample of the archive, encoded with the error bounds `widths`. The
 /// sample is at most [`COUNTED_BLOCKS`] evenly spaced blocks of Gaussians over one block of frames in the middle of the
 /// sequence.
 fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
-    let (info, packing) = (source.info(), packing(Bounds::new(widths)));
+    let (info, packing) = (source.info(), packing(ErrorBounds::new(widths)));
     let blocks = info.count.div_ceil(GAUSSIAN_BLOCK);
     let counted = blocks.min(COUNTED_BLOCKS);
     let spread: Vec<usize> = (0..counted).map(|k| (2 * k + 1) * blocks / (2 * counted)).collect();
@@ -185,7 +185,7 @@ fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
 /// Source that returns the values of another source rounded to multiples of twice their error bounds.
 struct Rounded<'a> {
     source: &'a dyn FrameSource,
-    bounds: Bounds,
+    bounds: ErrorBounds,
 }
 
 impl FrameSource for Rounded<'_> {
@@ -204,14 +204,14 @@ impl FrameSource for Rounded<'_> {
 
 struct RoundedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    bounds: Bounds,
+    bounds: ErrorBounds,
 }
 
 impl BlockReader for RoundedReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         for column in want.iter() {
-            let step = 2.0 * self.bounds.column(column);
+            let step = 2.0 * self.bounds.max_error(column);
             if step > 0.0 {
                 let values = out.column_mut(column).planes_mut().iter_mut();
                 values.for_each(|value| *value = ((f64::from(*value) / step).round() * step) as f32);

@@ -9,10 +9,10 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::{decibels_text, psnr};
 use crate::model::{Attributes, FrameView};
-use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Message;
@@ -68,10 +68,10 @@ impl Choose {
     /// Returns the resource estimate of the stage. Its memory holds the merged and the pruned model, two states (all
     /// Gaussians at one frame), and rendered views. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
+        let whole = work.state_bytes(Attributes::all());
         // The trajectories of proxies, which replace merged clusters, are computed from all members.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
-        let (reader, held) = (work.input.reader, work.held(limits, Attributes::all()));
+        let (reader, held) = (work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
             ("alternatives", bytes_of_survivors(left, 8)),
             ("clusters", CLUSTERED),
@@ -81,18 +81,18 @@ impl Choose {
             ("held", held + bytes_of_survivors(merging, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
-        let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
+        let together = VIEWS_PER_BATCH.min(limits.views_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (COMPARED_VIEWS as u64).min(work.pictures);
         // Renders of the original, and of two alternatives with about half as many Gaussians.
-        let made = work.render_seconds(frames as f64, 2.0 * work.count(), RENDER)
-            + work.render_seconds(2.0 * frames as f64, 0.0, RENDER);
+        let made = work.render_seconds(frames as f64, 2.0 * work.gaussian_count(), RENDER_COST)
+            + work.render_seconds(2.0 * frames as f64, 0.0, RENDER_COST);
         ResourceEstimate {
             stage: NAME,
-            seconds: work.reading(work.count(), frames as f64) + made,
-            reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), frames as f64) + made,
+            reads: work.full_reads(frames, limits) + work.scattered_full_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.arriving(), ("views", pictures)],
+            fixed: vec![work.filling_blocks(), ("views", pictures)],
         }
     }
 
@@ -115,8 +115,8 @@ impl Choose {
         if compressed.clusters.is_empty() {
             return Ok(merged);
         }
-        let pruned = ranking.take(count);
-        let pictures = spread(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
+        let pruned = ranking.best_ids(count);
+        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
         let key = scene.work.key(&(&pruned, compressed, &pictures));
         let [without, with]: [f64; 2] = journal.run_cached_stage(NAME, count, scene, key, |_| {
             Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count))
@@ -130,8 +130,8 @@ impl Choose {
         );
         scene.events.send(Message::Discarded { stage: "merging", why: &why });
         journal.leave_out("merging", why);
-        let kept = if self.has_target { pruned } else { ranking.take(scored.selection.counts.kept) };
-        Ok(MergeOutcome { compressed: CompressedModel::pruned(kept, &compressed.rule), summary: None })
+        let kept = if self.has_target { pruned } else { ranking.best_ids(scored.selection.counts.kept) };
+        Ok(MergeOutcome { compressed: CompressedModel::pruned(kept, &compressed.merge_params), summary: None })
     }
 }
 
@@ -141,10 +141,10 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let pictures_together = VIEWS_PER_BATCH.min(scene.limits.pictures_together);
-    let batch = Batch { pictures: pictures_together, ..Batch::one_frame(&scene.limits) };
+    let pictures_together = VIEWS_PER_BATCH.min(scene.limits.views_together);
+    let batch = BatchLimits { views: pictures_together, ..BatchLimits::one_frame(&scene.limits) };
     let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(&*result)];
-    show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
+    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
         // All views of a batch show the same frame.
@@ -171,7 +171,7 @@ mod tests {
     /// Returns the mean PSNR of `compressed` against the original, dB, over the views on which this stage compares
     /// models.
     fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
-        mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
+        mean_psnr(scene, &[], compressed, &select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
     /// Merges the Gaussians of a scene and runs the stage. Returns the merged model, the chosen model, and the journal.
@@ -182,7 +182,7 @@ mod tests {
         target: Option<usize>,
     ) -> (CompressedModel, MergeOutcome, Journal) {
         let merge = MergeStage { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
-        let (ranking, mut journal) = (scored.ranked(), Journal::default());
+        let (ranking, mut journal) = (scored.ranking(), Journal::default());
         let survivors = target.map_or(scored.selection.counts.kept, |_| ranking.order().len());
         let merged = merge.merge(scene, scored, &ranking, survivors, &mut journal).unwrap();
         let before = merged.compressed.clone();
@@ -201,7 +201,7 @@ mod tests {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
             assert_eq!(chosen.compressed.len(), target);
             let got = quality(&scene, &chosen.compressed);
-            let own = CompressedModel::pruned(scored.ranked().take(target), &recipe.merge);
+            let own = CompressedModel::pruned(scored.ranking().best_ids(target), &recipe.merge);
             for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");

@@ -46,9 +46,10 @@ impl Stage for Degree {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        if run.fits.len() > 1 {
+        if run.counts_within_bytes.len() > 1 {
             let (scored, ranking) = (run.scored()?, run.ranking()?);
-            let fit = self.best(run.scene, &scored, &ranking, &run.template, &run.fits, &mut run.journal)?;
+            let fit =
+                self.best(run.scene, &scored, &ranking, &run.template, &run.counts_within_bytes, &mut run.journal)?;
             run.template.sh_degree = fit.sh_degree;
             run.target = Some(fit.gaussians);
         }
@@ -59,7 +60,7 @@ impl Stage for Degree {
 impl Degree {
     /// Returns the resource estimate of the stage, which runs one refinement for every SH degree.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let need = self.refine.need(work, limits);
+        let need = self.refine.resource_estimate(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
@@ -78,17 +79,19 @@ impl Degree {
         fits: &[ByteLimitFit],
         journal: &mut Journal,
     ) -> Result<ByteLimitFit> {
-        let all = scored.count();
+        let all = scored.gaussian_count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.run_cached_stage(NAME, all, scene, key, |journal| {
-            let first = |gaussians: usize| self.refine.first(gaussians, all).min(ranked.order().len());
+            let first = |gaussians: usize| self.refine.initial_count(gaussians, all).min(ranked.order().len());
             let largest = fits.iter().map(|fit| first(fit.gaussians)).max().unwrap_or_default();
             let stride = self.refine.stored_stride(scene.workload().pixels, largest);
             let targets = Targets::new(scene, self.refine.pictures, stride, false)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
-                let start =
-                    CompressedModel { sh_degree: fit.sh_degree, ..template.with(ranked.take(first(fit.gaussians))) };
+                let start = CompressedModel {
+                    sh_degree: fit.sh_degree,
+                    ..template.with_kept(ranked.best_ids(first(fit.gaussians)))
+                };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));

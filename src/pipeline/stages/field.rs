@@ -7,16 +7,16 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::FieldSummary;
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
 use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{Batch, RenderedSource, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
-use crate::recipe::Precision;
+use crate::recipe::FieldPrecision;
 use crate::refinement::MAX_USEFUL_PSNR;
 use crate::render::{self, render};
 use crate::scene::Scene;
@@ -61,14 +61,14 @@ impl FieldPrecisionStage {
     /// Returns the stage if the run writes a model folder and the recipe allows half precision.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
-        (kind == OutputKind::Model && field.field == Precision::Half)
+        (kind == OutputKind::Model && field.field == FieldPrecision::Half)
             .then_some(FieldPrecisionStage { margin: field.field_margin })
     }
 
     /// Returns the resource estimate of the stage. Its memory holds two states (all Gaussians at one frame), rendered
     /// views, and a second copy of the deformation field. `left` is the fraction of the Gaussians in the result.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
+        let whole = work.state_bytes(Attributes::all());
         let per_gaussian = vec![
             ("kept", bytes_of_survivors(left, 24)),
             ("states", whole + bytes_of_survivors(left, whole)),
@@ -79,13 +79,13 @@ impl FieldPrecisionStage {
         let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
         ResourceEstimate {
             stage: NAME,
-            seconds: work.reading(work.count(), 4.0 * pictures as f64)
-                + work.render_seconds(2.0 * pictures as f64, work.count(), RENDER)
-                + work.render_seconds(2.0 * pictures as f64, left * work.count(), RENDER),
-            reads: work.reads(pictures, limits),
+            seconds: work.reading_seconds(work.gaussian_count(), 4.0 * pictures as f64)
+                + work.render_seconds(2.0 * pictures as f64, work.gaussian_count(), RENDER_COST)
+                + work.render_seconds(2.0 * pictures as f64, left * work.gaussian_count(), RENDER_COST),
+            reads: work.full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
-                work.arriving(),
+                work.filling_blocks(),
                 ("field", work.input.fixed),
                 ("views", render::STRIP_BYTES as u64 + 24 * work.pixels),
             ],
@@ -102,12 +102,12 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let what = "half precision of the field";
-        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
+        let pictures = select_evenly(&scene.schedule, COMPARED_VIEWS, 1);
         if compressed.is_empty() || pictures.is_empty() {
             journal.leave_out(what, "there are no Gaussians or no views to compare");
             return Ok(compressed);
         }
-        let halved = CompressedModel { field: Precision::Half, ..compressed.clone() };
+        let halved = CompressedModel { field: FieldPrecision::Half, ..compressed.clone() };
         let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
@@ -139,7 +139,7 @@ fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sum = 0.0;
     let subjects = [RenderedSource::all(a), RenderedSource::all(b)];
-    show(subjects, &scene.schedule.cameras, pictures, Batch::one_frame(&scene.limits), |views| {
+    for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
         for view in views {
             let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));
             sum += psnr(&a, &b);

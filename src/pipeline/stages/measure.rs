@@ -15,7 +15,7 @@ use crate::pipeline::stage::{
 };
 use crate::pruning::score;
 use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
-use crate::pruning::visible::{self, Visible};
+use crate::pruning::visible::{self, VisibilityStage};
 use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
@@ -25,42 +25,42 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
         let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-        let visible = Visible { recipe: scan.clone() };
-        stages.leave_out_stage("visible coverage", why, move |work, limits| visible.need(work, limits));
+        let visible = VisibilityStage { recipe: scan.clone() };
+        stages.leave_out_stage("visible coverage", why, move |work, limits| visible.resource_estimate(work, limits));
     }
-    stages.add(Phase::Rank, Measure::from_planning(planning));
+    stages.add(Phase::Rank, MeasureStages::from_planning(planning));
 }
 
 /// Stages that take statistics of the Gaussians and score them.
 #[derive(Debug, Clone)]
-pub struct Measure {
+pub struct MeasureStages {
     /// Scan of every frame for statistics of motion, opacity and shape.
     pub scan: ScanStage,
     /// Rendering of views, if the contribution C of Gaussians is measured on renders.
-    pub visible: Option<Visible>,
+    pub visible: Option<VisibilityStage>,
     /// Scoring of Gaussians and selection of those that stay.
     pub score: ScoreStage,
 }
 
-impl Measure {
+impl MeasureStages {
     /// Returns the stages for the request and the input of `planning`.
-    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Measure {
+    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> MeasureStages {
         let recipe = &planning.request.recipe;
-        let mut measure = Measure::new(recipe, planning.input.has_cameras, planning.user.clone());
+        let mut measure = MeasureStages::new(recipe, planning.input.has_cameras, planning.user.clone());
         // If rounds rank the Gaussians and their number is given, no threshold of the scores decides which of them stay.
         measure.scan.can_be_partial = recipe.scan.scan_frames == ScanFrames::Needed
             && planning.target.is_some()
             && planning.prunes_by_views()
-            && Rounds::from_recipe(&recipe.select, planning.part()).is_some();
+            && Rounds::from_recipe(&recipe.select, planning.target_fraction()).is_some();
         measure
     }
 
     /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own; `user` holds
     /// Gaussians that the user keeps or drops.
-    pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
-        Measure {
+    pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> MeasureStages {
+        MeasureStages {
             scan: ScanStage { recipe: recipe.scan.clone(), can_be_partial: false },
-            visible: Visible::from_recipe(&recipe.scan, has_cameras),
+            visible: VisibilityStage::from_recipe(&recipe.scan, has_cameras),
             score: ScoreStage {
                 snap_noise: recipe.scan.snap_noise,
                 non_finite: recipe.scan.non_finite,
@@ -72,10 +72,19 @@ impl Measure {
     }
 
     /// Returns the resource estimates of the stages. Statistics that are `measured` already are not counted.
-    pub fn needs(&self, work: &Workload, limits: &Limits, measured: MeasuredOnArrival) -> Vec<ResourceEstimate> {
-        let scan = (!measured.scanned).then(|| self.scan.need(work, limits));
-        let visible = self.visible.as_ref().filter(|_| !measured.seen).map(|visible| visible.need(work, limits));
-        [scan, visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
+    pub fn resource_estimates(
+        &self,
+        work: &Workload,
+        limits: &Limits,
+        measured: MeasuredOnArrival,
+    ) -> Vec<ResourceEstimate> {
+        let scan = (!measured.scanned).then(|| self.scan.resource_estimate(work, limits));
+        let visible = self
+            .visible
+            .as_ref()
+            .filter(|_| !measured.visible_contribution)
+            .map(|visible| visible.resource_estimate(work, limits));
+        [scan, visible, Some(self.score.resource_estimate(work, limits))].into_iter().flatten().collect()
     }
 
     /// Takes the statistics of the Gaussians of `scene`, unless they were taken while it arrived (`arrived`), and
@@ -91,7 +100,7 @@ impl Measure {
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
         let scored =
-            journal.kept(&scene.work, score::NAME, key, |journal| self.measure_anew(scene, arrived, journal))?;
+            journal.cached(&scene.work, score::NAME, key, |journal| self.measure_anew(scene, arrived, journal))?;
         scene.set_absent(&scored.absent);
         scored.within(&scene.limits, &scene.scratch)
     }
@@ -104,7 +113,7 @@ impl Measure {
     pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         scene.set_absent(&[]);
         let scanned = self.scan.run(scene, journal)?;
-        let absent = self.score.absent(&scanned.rows);
+        let absent = self.score.absent_ids(&scanned.rows);
         if absent.is_empty() {
             return Ok(scanned);
         }
@@ -113,9 +122,9 @@ impl Measure {
     }
 
     fn measure_anew(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
-        let Measured { scanned, seen } = match arrived {
+        let Measured { scanned, visible_contribution: seen } = match arrived {
             Some(measured) => measured,
-            None => Measured { scanned: self.scan(scene, journal)?, seen: None },
+            None => Measured { scanned: self.scan(scene, journal)?, visible_contribution: None },
         };
         let seen = match (&self.visible, seen) {
             (Some(visible), None) => Some(visible.run(scene, &scanned.rows.life, journal)?),
@@ -125,9 +134,9 @@ impl Measure {
     }
 }
 
-impl Stage for Measure {
+impl Stage for MeasureStages {
     fn estimates(&self, EstimateInput { work, limits, measured, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        self.needs(work, limits, measured)
+        self.resource_estimates(work, limits, measured)
     }
 
     fn parameters(&self) -> String {
@@ -144,8 +153,8 @@ impl Stage for Measure {
         let mut units = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
         if let Some(visible) = &self.visible {
             let most = match visible.recipe.look_pictures {
-                0 => scene.schedule.pairs(),
-                most => most.min(scene.schedule.pairs()),
+                0 => scene.schedule.pair_count(),
+                most => most.min(scene.schedule.pair_count()),
             };
             units.push(format!("{}: {most} views", visible::NAME));
         }
@@ -154,7 +163,7 @@ impl Stage for Measure {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let scored = self.measure(run.scene, run.arrived.take(), &mut run.journal)?;
-        run.ranking = Some(Arc::new(scored.ranked()));
+        run.ranking = Some(Arc::new(scored.ranking()));
         run.scored = Some(Arc::new(scored));
         Ok(())
     }

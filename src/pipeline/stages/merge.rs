@@ -18,18 +18,18 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging;
-use crate::merging::known::{KnownPairs, PairSimilarity};
-use crate::merging::motion::MotionGate;
+use crate::merging::known::{PairSimilarity, SimilarityCache};
+use crate::merging::motion::MotionThresholds;
 use crate::merging::motion_pass;
 use crate::merging::motion_pass::PairMeter;
 use crate::merging::proxy::{Importance, weights};
 use crate::merging::voxels::voxel_order;
-use crate::merging::{Merged, RequestedPairs, Survivors};
+use crate::merging::{MergeResult, RequestedPairs, Survivors};
 use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::models::trajectories::state_bytes;
-use crate::passes::{BLOCK, gather};
+use crate::passes::{GAUSSIANS_PER_BLOCK, gather};
 use crate::pipeline::planning::Planning;
-use crate::pipeline::request::Only;
+use crate::pipeline::request::PruneOrMerge;
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::summary::MergeSummary;
 use crate::progress::Progress;
@@ -57,7 +57,7 @@ const USUAL_TRIALS: f64 = 16.0;
 
 /// Number of Gaussians whose full state is in memory at a time while the attributes that merging does not use are
 /// dropped.
-const GATHER_CHUNK: usize = 16 * BLOCK;
+const GATHER_CHUNK: usize = 16 * GAUSSIANS_PER_BLOCK;
 
 /// Processor time per Gaussian of finding neighbors, tests and clusters, seconds (`benches/merge.rs`).
 const SECONDS_TO_MERGE: f64 = 1e-5;
@@ -102,7 +102,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let what = "merging, and its pass over the frames";
     let has_passes = !recipe.merge.passes.is_empty();
     let why = match planning.request.only {
-        Only::Prune => "--prune-only",
+        PruneOrMerge::Prune => "--prune-only",
         _ if !has_passes => "the recipe has no merge pass",
         _ if planning.request.goal.is_some() => "a quality or a size on disk is reached by pruning alone",
         _ => "refinement gives better quality at the same count (--no-refine merges instead)",
@@ -142,29 +142,29 @@ impl MergeStage {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Only base colors are compared. There is at most one proxy for every two Gaussians, held before and after a
         // pass, and then once with all SH coefficients.
-        let proxies = state_bytes(0, Attributes::all()).max(work.state(Attributes::all()).div_ceil(2));
+        let proxies = state_bytes(0, Attributes::all()).max(work.state_bytes(Attributes::all()).div_ceil(2));
         let per_gaussian = vec![
             // The importances C (contribution) and Vis (fraction of views that may show the Gaussian) are read back
             // from disk if they were moved there.
-            ("importance", if limits.rows_aside { 16 } else { 0 }),
+            ("importance", if limits.statistics_on_disk { 16 } else { 0 }),
             ("pool", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
             ("survivors", merging::BYTES_PER_SURVIVOR as u64),
             ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSING) as u64),
             ("readers", work.input.reader),
-            ("followed", motion_pass::bytes_per_gaussian(limits.frames_held) as u64),
+            ("followed", motion_pass::bytes_per_gaussian(limits.max_kept_frames) as u64),
         ];
         // States are read once. Every pass of every trial follows its pairs over all frames twice, because coinciding
         // pairs, if there are any, are merged first.
         let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
-        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
+        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_full_reads(work.frames, limits);
         ResourceEstimate {
             stage: NAME,
-            reads: work.scattered_reads(1, limits) + followed,
-            seconds: SECONDS_TO_MERGE * work.count()
-                + FOLLOWED_FRACTION * work.reading(work.count(), work.frames as f64),
+            reads: work.scattered_full_reads(1, limits) + followed,
+            seconds: SECONDS_TO_MERGE * work.gaussian_count()
+                + FOLLOWED_FRACTION * work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.filling_blocks()],
         }
     }
 
@@ -182,30 +182,30 @@ impl MergeStage {
         journal: &mut Journal,
     ) -> Result<MergeOutcome> {
         // Importances may have to be read from disk, so they are read only if a cache key is needed.
-        let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
+        let importance = scene.work.is_enabled().then(|| scored.importance()).transpose()?;
         let key = scene.work.key(&(
             (&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors),
             (ranking, &scored.protected, scored.reference, scored.position_ulp, importance),
         ));
         let run = |journal: &mut Journal| {
-            journal.stage(NAME, survivors, scene.source(), |_| {
+            journal.run_stage(NAME, survivors, scene.source(), |_| {
                 // The progress task also covers the computation of the proxies.
                 let progress = scene.events.counting_task(NAME, "sets of survivors");
-                let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
+                let mut trial = Trial::new(scene, scored, self, ranking.best_ids(survivors), &progress)?;
                 let mut merged = match self.target {
-                    None => trial.merge(&ranking.take(survivors), None)?,
-                    Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
+                    None => trial.merge(&ranking.best_ids(survivors), None)?,
+                    Some(target) if !self.prunes => trial.merge_to(&ranking.best_ids(survivors), target)?,
                     Some(target) => {
-                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.compressed.len());
+                        let count = |m| Ok(trial.merge(&ranking.best_ids(m), None)?.compressed.len());
                         let m = bracket(target, survivors, count)?;
-                        trial.merge_to(&ranking.take(m), target)?
+                        trial.merge_to(&ranking.best_ids(m), target)?
                     }
                 };
                 drop(trial);
                 scene.work.end_shard_before(NAME)?;
                 let MergeOutcome { compressed, summary } = &mut merged;
                 let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
-                compressed.make(proxies);
+                compressed.set_proxies(proxies);
                 if let Some(summary) = summary {
                     summary.deviation = compressed.proxies.deviation;
                     summary.count(&compressed.clusters);
@@ -214,7 +214,7 @@ impl MergeStage {
                 Ok((merged, left))
             })
         };
-        journal.kept(&scene.work, NAME, key, run)
+        journal.cached(&scene.work, NAME, key, run)
     }
 }
 
@@ -262,7 +262,7 @@ struct Trial<'a> {
     /// Maximum number of pairs whose motion is measured at the same time.
     pairs_together: usize,
     /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is tried.
-    known: KnownPairs,
+    known: SimilarityCache,
     /// Progress of the stage: one unit per set of survivors on which merging was tried.
     progress: &'a Progress,
 }
@@ -290,13 +290,13 @@ impl<'a> Trial<'a> {
         let meter = PairMeter {
             source,
             scan: &stage.scan,
-            gate: MotionGate::new(&merge, unit),
-            frames_held: scene.limits.frames_held,
+            gate: MotionThresholds::new(&merge, unit),
+            max_kept_frames: scene.limits.max_kept_frames,
             scratch: scene.scratch.clone(),
             events: scene.events.clone(),
             gathered: None,
         };
-        let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
+        let (pairs_together, known) = (scene.limits.pairs_together, SimilarityCache::default());
         let importance = scored.importance()?;
         let work = &scene.work;
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
@@ -335,8 +335,8 @@ impl<'a> Trial<'a> {
                 true => Vec::new(),
                 false => measure(work, meter, (pool, &states.position), missing, &asked, merge)?,
             };
-            let found = KnownPairs::new(found);
-            let likeness = |pair| known.likeness(pair).or_else(|| found.likeness(pair)).unwrap_or(f64::NAN);
+            let found = SimilarityCache::new(found);
+            let likeness = |pair| known.similarity(pair).or_else(|| found.similarity(pair)).unwrap_or(f64::NAN);
             let answer = asked.pairs().map(likeness).collect();
             known.add(found, most);
             Ok::<_, Error>(answer)
@@ -356,23 +356,23 @@ fn measure(
     asked: &RequestedPairs<'_>,
     merge: &recipe::MergeParams,
 ) -> Result<Vec<PairSimilarity>> {
-    if !work.keeps() || pairs.len() < MIN_DIVIDED_PAIRS {
-        return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
+    if !work.is_enabled() || pairs.len() < MIN_DIVIDED_PAIRS {
+        return meter.measure(pool, reference, pairs, asked.max_distance, asked.is_part);
     }
     // Pairs are sorted by position, so that few shards read the same Gaussians.
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
-    let order = voxel_order(&rows, |row| reference.row(row as usize), asked.reach);
+    let order = voxel_order(&rows, |row| reference.row(row as usize), asked.max_distance);
     let mut place = rows;
     order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
     pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
     let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
-    let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
+    let (fresh, meter) = (meter.without_trajectories(), RefCell::new(meter));
     let compute = |some: Range<usize>| match some.len() == pairs.len() {
-        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),
+        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.max_distance, asked.is_part),
         // The pairs of a shard are measured once, and share no buffers with other shards.
-        false => fresh.fresh().measure(pool, reference, pairs[some].to_vec(), asked.reach, false),
+        false => fresh.without_trajectories().measure(pool, reference, pairs[some].to_vec(), asked.max_distance, false),
     };
-    work.divided(PAIRS, key, pairs.len(), compute, |parts| {
+    work.compute_in_shards(PAIRS, key, pairs.len(), compute, |parts| {
         let mut all = Vec::with_capacity(pairs.len());
         for part in parts {
             all.extend(part?);
@@ -384,7 +384,7 @@ fn measure(
 /// Returns the compressed model made of the merged groups in `merged`, with the counts of the passes.
 fn outcome(
     survivors: &Survivors<'_>,
-    merged: &Merged,
+    merged: &MergeResult,
     reference_frame: usize,
     merge: &recipe::MergeParams,
 ) -> MergeOutcome {

@@ -39,9 +39,9 @@ impl Stage for Prune {
         let most = ranking.order().len();
         // With a byte limit, more Gaussians may fit than may stay.
         let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
-        run.wanted = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
-        let survivors = run.stages.counts.before_refinement(run.wanted, scored.count()).min(most);
-        run.result = run.template.with(ranking.take(survivors));
+        run.refine_to = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
+        let survivors = run.stages.counts.count_before_refinement(run.refine_to, scored.gaussian_count()).min(most);
+        run.result = run.template.with_kept(ranking.best_ids(survivors));
         Ok(())
     }
 }
@@ -71,7 +71,7 @@ impl Prune {
             Some(target) if !self.merges => target,
             Some(_) => all,
         };
-        journal.stage(NAME, scored.count(), scene.source(), |_| Ok((survivors, survivors)))
+        journal.run_stage(NAME, scored.gaussian_count(), scene.source(), |_| Ok((survivors, survivors)))
     }
 }
 
@@ -104,7 +104,7 @@ mod tests {
         let scored = score_scene(&scene, &Recipe::preset("default").unwrap(), &user);
         let own = scored.selection.counts.kept;
         let run = |prunes, merges, target| {
-            Prune { prunes, merges }.survivors(&scene, &scored, &scored.ranked(), target, &mut Journal::default())
+            Prune { prunes, merges }.survivors(&scene, &scored, &scored.ranking(), target, &mut Journal::default())
         };
         for (prunes, merges, target, expected) in [
             (true, true, None, own),

@@ -17,12 +17,12 @@ use crate::files::atomic::ScratchFolder;
 use crate::journal::Journal;
 use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
-use crate::memory_plan::{RENDER, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
+use crate::memory_plan::{RENDER_COST, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
 use crate::model::FrameView;
-use crate::passes::{Batch, RenderedSource, ViewStates, show};
+use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::planning::Planning;
-use crate::pipeline::stage::{Archived, EstimateInput, MeasuredOnArrival, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
 use crate::scene::pictures::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
@@ -87,7 +87,8 @@ impl Stage for QualityStage {
         }
         let (scene, count) = (run.scene, run.result.len());
         let mut journal = std::mem::take(&mut run.journal);
-        let quality = journal.stage(NAME, count, scene.source(), |journal| Ok((self.measure(run, journal)?, count)))?;
+        let quality =
+            journal.run_stage(NAME, count, scene.source(), |journal| Ok((self.measure(run, journal)?, count)))?;
         run.journal = journal;
         run.quality = quality;
         Ok(())
@@ -99,13 +100,13 @@ impl QualityStage {
     /// `left` of the Gaussians.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
-        let of_views = pictures::need(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
+        let of_views = pictures::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result =
             vec![("kept", bytes_of_survivors(left, 24)), ("result", bytes_of_survivors(left, 2 * work.input.reduced))];
         ResourceEstimate {
             // The number of views is derived from the estimated time of all other stages; see `view_count`.
             seconds: 0.0,
-            reads: if self.merges { MERGED_READS } else { READS } * work.reads(views, limits),
+            reads: if self.merges { MERGED_READS } else { READS } * work.full_reads(views, limits),
             per_gaussian: [scored_memory(limits), of_views.per_gaussian, result].concat(),
             fixed: [of_views.fixed, vec![("field", work.input.fixed), ("margin", MARGIN)]].concat(),
             ..of_views
@@ -123,7 +124,7 @@ impl QualityStage {
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };
-        let all = pictures::pictures(&scene.rig, times, ViewSet::HeldOut)?;
+        let all = pictures::select_views(&scene.rig, times, ViewSet::HeldOut)?;
         let views = spread_views(all, self.view_count(run));
         let folder;
         let (opened, reduced);
@@ -132,7 +133,7 @@ impl QualityStage {
                 reduced = scene.input.reduced(&run.result)?;
                 &*reduced
             }
-            Some(Archived::Content(encoded)) => {
+            Some(PreparedArchive::Content(encoded)) => {
                 folder = ScratchFolder::new(&scene.scratch)?;
                 let path = folder.path().join("result.gsz");
                 fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
@@ -140,7 +141,7 @@ impl QualityStage {
                 opened.source()
             }
             // Frames with error bounds exist only once they are written.
-            Some(Archived::Frames(_)) => return Ok(None),
+            Some(PreparedArchive::Frames(_)) => return Ok(None),
         };
         let render_ms = render_times(scene, result, &views)?;
         if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
@@ -156,12 +157,12 @@ impl QualityStage {
     /// same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
-        let work = Workload { pace: Throughput::UNKNOWN, ..scene.workload() };
-        let left = run.result.len() as f64 / work.count().max(1.0);
+        let work = Workload { throughput: Throughput::UNKNOWN, ..scene.workload() };
+        let left = run.result.len() as f64 / work.gaussian_count().max(1.0);
         let input = EstimateInput { work: &work, limits: &Limits::NONE, left, measured: MeasuredOnArrival::default() };
         let seconds: f64 = run.stages.all().flat_map(|stage| stage.estimates(input)).map(|need| need.seconds).sum();
-        let per_view = work.render_seconds(1.0, (1.0 + left) * work.count(), RENDER)
-            + work.reading(work.count(), 2.0)
+        let per_view = work.render_seconds(1.0, (1.0 + left) * work.gaussian_count(), RENDER_COST)
+            + work.reading_seconds(work.gaussian_count(), 2.0)
             + 2.0 * SCORE_SECONDS_PER_PIXEL * work.pixels as f64;
         ((SHARE * seconds / per_view.max(1e-9)) as usize).clamp(FEWEST_VIEWS, MOST_VIEWS)
     }
@@ -175,7 +176,7 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
     let subjects = [scene.source(), result].map(RenderedSource::all);
-    show(subjects, &scene.rig.cameras, views, Batch::one_frame(&scene.limits), |batch| {
+    for_each_view_batch(subjects, &scene.rig.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
         let score = |view: &ViewStates<'_, 2>| {
             let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
             progress.advance(1);
@@ -196,7 +197,7 @@ pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[Fra
     let views = spread_views(views.to_vec(), TIMED_VIEWS);
     let mut times = [Vec::new(), Vec::new()];
     let subjects = [scene.source(), result].map(RenderedSource::all);
-    show(subjects, &scene.rig.cameras, &views, Batch::one_frame(&scene.limits), |batch| {
+    for_each_view_batch(subjects, &scene.rig.cameras, &views, BatchLimits::one_frame(&scene.limits), |batch| {
         for view in batch {
             for (subject, times) in times.iter_mut().enumerate() {
                 times.push(pool.install(|| {

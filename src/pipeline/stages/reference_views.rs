@@ -6,7 +6,7 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::metrics::{decibels_text, psnr};
 use crate::model::FrameView;
-use crate::passes::{Batch, RenderedSource, show, spread};
+use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
 use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -121,22 +121,28 @@ impl ReferenceViews<'_> {
     pub(crate) fn new<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
         let count = pictures(scene.workload().pixels) as usize;
         let mut reference_views =
-            ReferenceViews { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
+            ReferenceViews { scene, pictures: select_evenly(&scene.schedule, count, 1), images: Vec::new() };
         reference_views.images = reference_views.render(source, |_, image| image)?;
         Ok(reference_views)
     }
 
     fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
         let mut rendered = Vec::with_capacity(self.pictures.len());
-        let batch = Batch::one_frame(&self.scene.limits);
-        show([RenderedSource::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
-            let first = rendered.len();
-            let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
-                finish(first + k, render(view.states[0], view.camera, self.scene.background))
-            };
-            rendered.par_extend(views.par_iter().enumerate().map(view));
-            Ok(())
-        })?;
+        let batch = BatchLimits::one_frame(&self.scene.limits);
+        for_each_view_batch(
+            [RenderedSource::all(source)],
+            &self.scene.schedule.cameras,
+            &self.pictures,
+            batch,
+            |views| {
+                let first = rendered.len();
+                let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
+                    finish(first + k, render(view.states[0], view.camera, self.scene.background))
+                };
+                rendered.par_extend(views.par_iter().enumerate().map(view));
+                Ok(())
+            },
+        )?;
         Ok(rendered)
     }
 

@@ -23,7 +23,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for RefineStage {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits)]
+        vec![self.resource_estimate(work, limits)]
     }
 
     fn parameters(&self) -> String {
@@ -43,7 +43,7 @@ impl Stage for RefineStage {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
-        let wanted = run.wanted.min(run.result.len());
+        let wanted = run.refine_to.min(run.result.len());
         let start = run.take_result();
         run.result = match &mut run.prune_steps {
             None => self.run(run.scene, &scored, start, wanted, &mut run.journal)?,

@@ -17,9 +17,9 @@ use crate::cache::CacheKey;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
-use crate::memory_plan::{REMOVE, ResourceEstimate, Workload};
+use crate::memory_plan::{REMOVAL_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, FrameView};
-use crate::passes::spread_over;
+use crate::passes::select_evenly_over_frames;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
@@ -58,7 +58,7 @@ const USUAL_LEFT: f64 = 0.5;
 
 /// Adds the stage to `stages` if Gaussians are ranked by views.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.part());
+    let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.target_fraction());
     if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {
         stages.add(Phase::Rank, rounds);
     }
@@ -77,13 +77,13 @@ impl Stage for Rounds {
     fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
         let count = scene.source().info().count;
         let usual = (self.usual * count as f64).ceil() as usize;
-        self.shardable_rounds(count, counts.after_ranking(usual, count))
+        self.shardable_rounds(count, counts.count_after_ranking(usual, count))
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let wanted = run.target.unwrap_or(scored.selection.counts.kept);
-        let fewest = run.stages.counts.after_ranking(wanted, scored.count());
+        let fewest = run.stages.counts.count_after_ranking(wanted, scored.gaussian_count());
         run.ranking = None;
         let ranking = Arc::unwrap_or_clone(ranking);
         run.ranking = Some(Arc::new(self.rank(run.scene, &scored, ranking, fewest, &mut run.journal)?));
@@ -109,21 +109,23 @@ impl Rounds {
     /// Returns the resource estimate of the stage. Its memory holds the ranking, and what rendering all survivors
     /// needs.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let (looking, fixed) = work.looking(limits, Attributes::all(), 8);
+        let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
         let per_gaussian =
             [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking]
                 .concat();
         let seconds = (0..self.rounds(self.usual)).map(|round| {
-            let left = work.count() * self.fraction.powi(round as i32);
+            let left = work.gaussian_count() * self.fraction.powi(round as i32);
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
-            work.reading(left, pictures.min(work.frames as f64)) + work.render_seconds(pictures, left, REMOVE)
+            work.reading_seconds(left, pictures.min(work.frames as f64))
+                + work.render_seconds(pictures, left, REMOVAL_COST)
         });
         // The first round renders the views of all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
-        let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
+        let reads =
+            work.scattered_full_reads(frames * turns, limits) + later * work.scattered_full_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
@@ -145,7 +147,7 @@ impl Rounds {
     /// Returns the views divided into groups (turns). Views of a frame stay together if there are enough frames,
     /// otherwise views are divided one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
-        let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
+        let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
         let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
         let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
@@ -181,14 +183,14 @@ impl Rounds {
             return Ok(before);
         }
         let turns = self.turns(scene, scored);
-        state.errors = vec![vec![0; scored.count()]; turns.len()];
+        state.errors = vec![vec![0; scored.gaussian_count()]; turns.len()];
         // All rounds use the same pixels, because a round adds errors that earlier rounds measured.
         let stride = ranking_stride(scene.workload().pixels, first);
         // The key does not depend on `fewest`, because the survivors of a round do not.
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected, stride));
         let mut done = 0;
-        for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
-            if let Some(found) = scene.work.find(&entry_name(round), key.and(&round))? {
+        for round in (0..sizes.len()).rev().filter(|_| scene.work.is_enabled()) {
+            if let Some(found) = scene.work.load(&entry_name(round), key.extended_by(&round))? {
                 (state, done) = (found, round + 1);
                 break;
             }
@@ -196,7 +198,7 @@ impl Rounds {
         let pictures =
             (done..sizes.len()).map(|round| active_turns(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
         let progress = scene.events.task(NAME, "views", pictures.sum::<usize>() as u64);
-        let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
+        let RoundState { free, removed, .. } = journal.run_stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left, stride), &progress)?;
             }
@@ -253,7 +255,7 @@ impl Rounds {
             };
             active.iter().map(turn_errors).collect()
         };
-        scene.work.divided(&entry_name(round), key.and(&round), units, compute, |parts| {
+        scene.work.compute_in_shards(&entry_name(round), key.extended_by(&round), units, compute, |parts| {
             for &turn in &active {
                 ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
             }
@@ -305,7 +307,7 @@ fn active_turns(turns: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = 
 mod tests {
     use super::*;
     use crate::metrics::psnr;
-    use crate::passes::{gather, spread};
+    use crate::passes::{gather, select_evenly};
     use crate::pipeline::tests::{scene, score_scene};
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
@@ -316,8 +318,8 @@ mod tests {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
         let rounds = Rounds::from_recipe(&recipe.select, None).unwrap();
-        let found = rounds.rank(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
-        (scored.ranked(), found)
+        let found = rounds.rank(scene, &scored, scored.ranking(), fewest, &mut Journal::default()).unwrap();
+        (scored.ranking(), found)
     }
 
     #[test]
@@ -325,8 +327,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let [(once, few), (_, many)] = [200, 800].map(|fewest| ranked(&scene, &UserOverrides::default(), fewest));
-        assert_eq!(few.take(800), many.take(800));
-        assert_ne!(few.take(800), once.take(800), "rounds changed nothing");
+        assert_eq!(few.best_ids(800), many.best_ids(800));
+        assert_ne!(few.best_ids(800), once.best_ids(800), "rounds changed nothing");
         let mut every = few.order().to_vec();
         every.sort_unstable();
         assert!(every.iter().copied().eq(0..1500), "a Gaussian is missing or stands twice");
@@ -345,10 +347,10 @@ mod tests {
                     let camera = &scene.schedule.cameras[picture.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
-                spread(&scene.schedule, 12, 1).iter().map(view_psnr).sum::<f64>() / 12.0
+                select_evenly(&scene.schedule, 12, 1).iter().map(view_psnr).sum::<f64>() / 12.0
             };
-            let got = quality(&rounds.take(target));
-            let at_once = quality(&once.take(target));
+            let got = quality(&rounds.best_ids(target));
+            let at_once = quality(&once.best_ids(target));
             assert!(got > at_once + 1.0, "{target}: got {got} dB in rounds, {at_once} at once");
         }
     }
@@ -376,7 +378,7 @@ mod tests {
         for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
             let rounds = Rounds { turns, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             let parts = rounds.turns(&scene, &scored);
-            let all = spread_over(&scene.schedule, rounds.pictures, scored.frames_to_see);
+            let all = select_evenly_over_frames(&scene.schedule, rounds.pictures, scored.frames_to_cover);
             assert_eq!(parts.len(), turns.min(all.len()));
             let mut together: Vec<FrameView> = parts.concat();
             together.sort_by_key(|picture| (picture.frame, picture.view));

@@ -5,7 +5,7 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Attributes, Rows, ViewSchedule};
-use crate::passes::{BLOCK, SomeFrames};
+use crate::passes::{GAUSSIANS_PER_BLOCK, SomeFrames};
 use crate::recipe;
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -44,24 +44,25 @@ impl ScanStage {
 
     /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
     /// statistics rows (one per Gaussian) of all blocks.
-    pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
+    pub fn resource_estimate(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
         // Frames held by readers count twice, because a second reader may decode while the first is read.
-        let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
+        let block =
+            statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.kept_frames_bytes(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
         let frames_read = self.frames_read(work.frames as usize, work.input.jacobian > 0) as f64;
         ResourceEstimate {
             stage: NAME,
             reads: if work.frames == 0 { 1.0 } else { frames_read / work.frames as f64 },
-            seconds: work.pace.states
-                * work.count()
+            seconds: work.throughput.states
+                * work.gaussian_count()
                 * frames_read
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
-                + work.reading(work.count(), frames_read),
+                + work.reading_seconds(work.gaussian_count(), frames_read),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
-                ("blocks", work.threads * work.at_most(BLOCK as u64) * block),
-                work.arriving(),
+                ("blocks", work.threads * work.largest_block(GAUSSIANS_PER_BLOCK as u64) * block),
+                work.filling_blocks(),
                 ("frames", frames),
             ],
         }
@@ -107,15 +108,16 @@ impl ScanStage {
     ) -> Result<ScanResult> {
         let info = source.info();
         let compute = |blocks| scan_blocks(source, schedule, plan, blocks, &scene.events);
-        journal.stage(NAME, info.count, source, |_| {
+        journal.run_stage(NAME, info.count, source, |_| {
             let units = scan_units(info);
-            let found = scene.work.divided(NAME, scene.work.key(&(plan, &info.times)), units, compute, |parts| {
-                let mut all = ScanResult { alive_per_frame: vec![0; info.times.len()], ..ScanResult::default() };
-                for part in parts {
-                    all.join(part?);
-                }
-                Ok(all)
-            })?;
+            let found =
+                scene.work.compute_in_shards(NAME, scene.work.key(&(plan, &info.times)), units, compute, |parts| {
+                    let mut all = ScanResult { alive_per_frame: vec![0; info.times.len()], ..ScanResult::default() };
+                    for part in parts {
+                        all.join(part?);
+                    }
+                    Ok(all)
+                })?;
             Ok((found, info.count))
         })
     }
@@ -180,7 +182,7 @@ mod tests {
     fn memory_beside_rows_is_bounded_by_one_block() {
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan, can_be_partial: false };
         let need = |count| {
-            let need = scan.need(&work(count), &Limits::NONE);
+            let need = scan.resource_estimate(&work(count), &Limits::NONE);
             (need.per_gaussian, need.fixed)
         };
         assert_eq!(need(1_024), need(1_000_000));

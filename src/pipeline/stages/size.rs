@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::ResourceEstimate;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{VIEWS_PER_FRAME, spread};
+use crate::passes::{VIEWS_PER_FRAME, select_evenly};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
@@ -19,7 +19,7 @@ use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pipeline::stages::write::WriteStage;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
-use crate::recipe::Precision;
+use crate::recipe::FieldPrecision;
 use crate::scene::Scene;
 
 /// Name of both stages in plans, progress and summaries.
@@ -61,9 +61,10 @@ impl Stage for CountByBytes {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let template = CompressedModel { field: self.limit.field, ..run.template.clone() };
-        let (present, recipe) = (run.scored()?.present(), run.recipe.len() as u64);
-        run.fits = self.limit.fits(run.scene, (&present, recipe), &template, self.drops_bands, &mut run.journal)?;
-        run.target = run.fits.first().map(|fit| fit.gaussians);
+        let (present, recipe) = (run.scored()?.present_ids(), run.recipe.len() as u64);
+        run.counts_within_bytes =
+            self.limit.fits(run.scene, (&present, recipe), &template, self.drops_bands, &mut run.journal)?;
+        run.target = run.counts_within_bytes.first().map(|fit| fit.gaussians);
         Ok(())
     }
 }
@@ -94,14 +95,14 @@ struct ByteLimit {
     /// Maximum number of bytes of all output files together.
     most: u64,
     /// Precision of the deformation field that is assumed: half precision if the recipe allows it.
-    field: Precision,
+    field: FieldPrecision,
 }
 
 impl ByteLimit {
     fn from_planning(planning: &Planning<'_>) -> Option<ByteLimit> {
         let Some(Goal::Bytes(most)) = planning.request.goal else { return None };
         let is_rounded = FieldPrecisionStage::from_request(planning.request, planning.output).is_some();
-        let field = if is_rounded { Precision::Half } else { Precision::Exact };
+        let field = if is_rounded { FieldPrecision::Half } else { FieldPrecision::Exact };
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
@@ -155,11 +156,11 @@ impl ByteLimit {
         journal.run_cached_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
-                let some = template.with(kept);
+                let some = template.with_kept(kept);
                 match self.writer.kind {
                     // The files beside an archive are neither stored nor sent with it, so their bytes do not count.
-                    OutputKind::Archive => archive::bytes(scene, &some),
-                    _ => self.writer.bytes(scene, &some, recipe),
+                    OutputKind::Archive => archive::estimated_bytes(scene, &some),
+                    _ => self.writer.output_bytes(scene, &some, recipe),
                 }
             };
             let one = 1.min(all);
@@ -208,9 +209,9 @@ impl ByteLimit {
         recipe: u64,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let key = self.key(scene, recipe, &compressed).and(&scored.protected);
+        let key = self.key(scene, recipe, &compressed).extended_by(&scored.protected);
         journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
-            let bytes = |compressed: &CompressedModel| self.writer.bytes(scene, compressed, recipe);
+            let bytes = |compressed: &CompressedModel| self.writer.output_bytes(scene, compressed, recipe);
             let empty = bytes(&compressed.pick(&[]))?;
             let mut tried = 0;
             loop {
@@ -241,7 +242,7 @@ impl ByteLimit {
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
-        let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
+        let pictures = select_evenly(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
         let errors =
             removal_error(&*result, &places, looked_at, scene.background, (0.0, NonZeroU32::MIN), scene.limits, || ())?;

@@ -11,7 +11,7 @@ use crate::TOOL;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{
-    Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
+    Replace, SUMMARY_FILE, ScratchFolder, StagedFiles, StagedFolder, TargetKind, check_target, check_targets,
 };
 use crate::files::names::name_of;
 use crate::files::sog::images::morton_order;
@@ -19,14 +19,14 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload, bytes_of_survivors};
 use crate::model::Attributes;
-use crate::models::{InputModel, Size};
-use crate::outputs::bounds::Bounds;
+use crate::models::{InputModel, ModelSize};
+use crate::outputs::bounds::ErrorBounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::pipeline::planning::Planning;
-use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::stage::{EstimateInput, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, Summary};
 use crate::progress::{Events, Progress};
 use crate::pruning::score::scored_memory;
@@ -46,13 +46,13 @@ pub const SECONDS_TO_ENCODE: f64 = 3.5e-7;
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
 /// Name of the file, beside every result, that holds all parameters of its run.
-pub const RECIPE: &str = "recipe.toml";
+pub const RECIPE_FILE: &str = "recipe.toml";
 /// Name of the file, beside every result, that holds for every input Gaussian its index in the output.
-pub const INDEX_MAP: &str = "index_map.npy";
+pub const INDEX_MAP_FILE: &str = "index_map.npy";
 
 /// Returns the path of the accompanying file `name` of a result: inside the result if it is a folder, otherwise next to
 /// the result file, with the name of the result as prefix.
-pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
+pub fn companion_path(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     if is_folder {
         return result.join(name);
     }
@@ -64,10 +64,10 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
 
 /// Returns the paths of the files (recipe, index map, summary) that accompany a result of kind `kind` at the path
 /// `output`.
-pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
-    [RECIPE, INDEX_MAP, MARKER]
+pub fn companion_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
+    [RECIPE_FILE, INDEX_MAP_FILE, SUMMARY_FILE]
         .into_iter()
-        .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
+        .map(move |name| companion_path(output, kind.is_folder(), name).to_string_lossy().into_owned())
 }
 
 /// Stage that writes the compressed model and the files beside it.
@@ -88,7 +88,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for WriteStage {
     fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits, left)]
+        vec![self.resource_estimate(work, limits, left)]
     }
 
     fn check(&self, scene: &Scene) -> Result<()> {
@@ -100,7 +100,7 @@ impl Stage for WriteStage {
         run.scene.work.end_shard_before("writing")?;
         let scored = run.scored()?;
         let mut map = run.result.index_map(run.scene.source().info().count);
-        if let Some(Archived::Content(encoded)) = &run.archived {
+        if let Some(PreparedArchive::Content(encoded)) = &run.archived {
             reorder(&mut map, &encoded.order);
         }
         if self.kind == OutputKind::Sog {
@@ -111,14 +111,14 @@ impl Stage for WriteStage {
         let input =
             run.input.take().ok_or_else(|| Error::internal("the input was not described before it was written"))?;
         let (merge, goal, archive) = (run.merge.take(), run.goal.take(), run.archive.take());
-        let summarize = |journal: Journal, output: Size| Summary {
+        let summarize = |journal: Journal, output: ModelSize| Summary {
             schema: summary::SCHEMA,
             files: Vec::new(),
             tool: TOOL.to_owned(),
             cameras: CameraSummary::from_scene(run.scene),
             output: name_of(&self.output),
             gaussians: run.result.len(),
-            output_bytes: output.whole(),
+            output_bytes: output.total(),
             output_size: output,
             selection: scored.selection.counts,
             terms: scored.term_summaries(),
@@ -167,14 +167,14 @@ impl WriteStage {
     /// Fails if an output exists already or cannot be created; see [`check_target`].
     pub fn check_target(&self, inputs: &[&Path]) -> Result<()> {
         if self.kind.is_folder() {
-            return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
+            return check_target(&self.output, TargetKind::Folder, inputs, self.overwrite);
         }
         check_targets(&self.output, &self.companions(), inputs, self.overwrite)
     }
 
     /// Returns the paths of the summary, the recipe and the index map, which lie next to the result if it is a file.
     fn companions(&self) -> [PathBuf; 3] {
-        [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
+        [SUMMARY_FILE, RECIPE_FILE, INDEX_MAP_FILE].map(|name| companion_path(&self.output, false, name))
     }
 
     /// Returns the folder in which the recipe file of the result is written.
@@ -187,19 +187,20 @@ impl WriteStage {
 
     /// Returns the resource estimate of the stage. Its memory holds the result, which has the fraction `left` of the
     /// Gaussians, and write buffers.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+        let whole = work.state_bytes(Attributes::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
             [scored_memory(limits), vec![("kept", 40), ("result", bytes_of_survivors(left, work.input.reduced))]]
                 .concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
-        let mut fixed = if within.is_empty() { work.writing() } else { within };
+        let mut fixed = if within.is_empty() { work.write_buffers() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
                 // States at the frames of one block, and one full state, of each member and of each proxy.
                 let mixed = Attributes::all().difference(Attributes::SH) | work.varying;
-                let waiting = work.held(&Limits::NONE, Attributes::all()) + FRAME_BLOCK as u64 * work.state(mixed);
+                let waiting = work.kept_frames_bytes(&Limits::NONE, Attributes::all())
+                    + FRAME_BLOCK as u64 * work.state_bytes(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
                 per_gaussian.push(("members", CLUSTERED));
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
@@ -211,7 +212,8 @@ impl WriteStage {
                 // The trajectories of proxies are computed from all members of their clusters.
                 let merging = if is_solved { left } else { 1.0 };
                 per_gaussian.push(("readers", bytes_of_survivors(merging, work.input.reader)));
-                per_gaussian.push(("held", bytes_of_survivors(merging, work.held(limits, Attributes::all()))));
+                per_gaussian
+                    .push(("held", bytes_of_survivors(merging, work.kept_frames_bytes(limits, Attributes::all()))));
                 let rows = bytes_of_survivors(left, work.threads * (work.input.file + 2 * whole));
                 per_gaussian.push(("files", work.input.file + rows));
                 per_gaussian.push(("members", CLUSTERED));
@@ -228,13 +230,13 @@ impl WriteStage {
             OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),
             _ => 1,
         };
-        let reads = match is_solved && !self.kind.holds_frames() {
+        let reads = match is_solved && !self.kind.stores_frames() {
             true => 0.0,
-            false => parts as f64 * work.scattered_reads(work.frames, limits),
+            false => parts as f64 * work.scattered_full_reads(work.frames, limits),
         };
-        let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
-        let left = USUAL_LEFT * work.count();
-        let seconds = work.reading(left, frames) + left * frames * SECONDS_TO_ENCODE;
+        let frames = if is_solved && !self.kind.stores_frames() { 0.0 } else { work.frames as f64 };
+        let left = USUAL_LEFT * work.gaussian_count();
+        let seconds = work.reading_seconds(left, frames) + left * frames * SECONDS_TO_ENCODE;
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
@@ -243,10 +245,11 @@ impl WriteStage {
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
-    pub fn bytes(&self, scene: &Scene, compressed: &CompressedModel, recipe: u64) -> Result<u64> {
+    pub fn output_bytes(&self, scene: &Scene, compressed: &CompressedModel, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        let written = write_alone(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)?;
+        let written =
+            write_without_companions(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)?;
         let beside = MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
         Ok(written + beside)
     }
@@ -261,28 +264,28 @@ impl WriteStage {
         &self,
         scene: &Scene,
         compressed: &CompressedModel,
-        (map, archive): (&[Option<u32>], Option<&Archived>),
+        (map, archive): (&[Option<u32>], Option<&PreparedArchive>),
         recipe: &str,
         mut journal: Journal,
-        summarize: impl FnOnce(Journal, Size) -> Summary,
+        summarize: impl FnOnce(Journal, ModelSize) -> Summary,
     ) -> Result<Summary> {
-        let mut write = |path: &Path| -> Result<Size> {
-            journal.stage(NAME, compressed.len(), scene.source(), |journal| {
+        let mut write = |path: &Path| -> Result<ModelSize> {
+            journal.run_stage(NAME, compressed.len(), scene.source(), |journal| {
                 let count = compressed.len() as u64;
                 // Outputs that hold frames report their own progress.
-                let has_frames = self.kind.holds_frames() || matches!(archive, Some(Archived::Frames(_)));
+                let has_frames = self.kind.stores_frames() || matches!(archive, Some(PreparedArchive::Frames(_)));
                 let progress = match has_frames {
                     true => Progress::IGNORED,
                     false => scene.events.task(NAME, "Gaussians", count),
                 };
                 let size = match archive {
-                    Some(Archived::Content(encoded)) => {
+                    Some(PreparedArchive::Content(encoded)) => {
                         fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
                         encoded.parts.into()
                     }
-                    Some(Archived::Frames(bounds)) => {
+                    Some(PreparedArchive::Frames(bounds)) => {
                         write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
-                        Size::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
+                        ModelSize::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
                         journal.notes.extend(scene.input.write(
@@ -304,15 +307,15 @@ impl WriteStage {
         if self.kind.is_folder() {
             let staged = StagedFolder::new(target, self.overwrite)?;
             let size = write(staged.path())?;
-            write_text(&staged.path().join(RECIPE), recipe)?;
-            write_index_map(map, &staged.path().join(INDEX_MAP))?;
+            write_text(&staged.path().join(RECIPE_FILE), recipe)?;
+            write_index_map(map, &staged.path().join(INDEX_MAP_FILE))?;
             let summary = summarize(journal, size);
-            write_text(&staged.path().join(MARKER), &summary.json())?;
+            write_text(&staged.path().join(SUMMARY_FILE), &summary.json())?;
             staged.commit()?;
             return Ok(summary);
         }
         let staged = StagedFiles::new(target, self.companions().to_vec(), self.overwrite)?;
-        let [marker, recipe_file, index_map] = [0, 1, 2].map(|index| staged.companion(index));
+        let [marker, recipe_file, index_map] = [0, 1, 2].map(|index| staged.companion_path(index));
         let size = write(staged.path())?;
         write_text(&recipe_file, recipe)?;
         write_index_map(map, &index_map)?;
@@ -328,7 +331,7 @@ impl WriteStage {
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
-pub fn write_alone(
+pub fn write_without_companions(
     input: &dyn InputModel,
     compressed: &CompressedModel,
     kind: OutputKind,
@@ -340,11 +343,11 @@ pub fn write_alone(
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
     input.write(compressed, kind, path, limits, events)?;
-    Ok(input.size_written(kind, path)?.whole())
+    Ok(input.size_written(kind, path)?.total())
 }
 
 /// Writes the frames of `source` as a container to `path`, with values that err by at most `bounds`.
-fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path, events: &Events) -> Result<()> {
+fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);
     write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
@@ -360,8 +363,14 @@ mod tests {
 
     #[test]
     fn companion_paths_do_not_collide_between_output_kinds() {
-        assert_eq!(beside(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
-        assert_eq!(beside(Path::new("a/small.ply"), false, "summary.json"), Path::new("a/small.ply.summary.json"));
-        assert_eq!(beside(Path::new("small.gseq"), false, "summary.json"), Path::new("small.gseq.summary.json"));
+        assert_eq!(companion_path(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
+        assert_eq!(
+            companion_path(Path::new("a/small.ply"), false, "summary.json"),
+            Path::new("a/small.ply.summary.json")
+        );
+        assert_eq!(
+            companion_path(Path::new("small.gseq"), false, "summary.json"),
+            Path::new("small.gseq.summary.json")
+        );
     }
 }

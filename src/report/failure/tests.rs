@@ -4,7 +4,7 @@
 use glam::DVec3;
 
 use super::*;
-use crate::diagnostics::demo_scene::{DemoBody, Scene};
+use crate::diagnostics::demo_scene::{DemoBody, DemoScene};
 use crate::evaluation::RenderedViews;
 use crate::files::container::Container;
 use crate::model::Split;
@@ -13,20 +13,20 @@ use crate::passes::gather;
 use crate::pipeline::score_scene;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::Recipe;
-use crate::report::traits::{shares, traits};
+use crate::report::traits::{contribution_shares, kind_flags};
 use crate::source::FrameSource;
 
 /// Test scene with its scores and the kinds of its Gaussians.
 struct Looked {
-    made: Scene,
+    made: DemoScene,
     scored: Scored,
-    traits: Vec<Traits>,
+    traits: Vec<KindFlags>,
     _folder: tempfile::TempDir,
 }
 
 fn looked() -> Looked {
     let folder = tempfile::tempdir().unwrap();
-    let made = Scene::new(3000, 12);
+    let made = DemoScene::new(3000, 12);
     let path = folder.path().join("scene.gseq");
     write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let input = Box::new(Container::open(&path).unwrap());
@@ -34,7 +34,7 @@ fn looked() -> Looked {
     let scene = crate::scene::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
-    let traits = traits(scene.source(), &scored, recipe.scan.alpha_min).unwrap();
+    let traits = kind_flags(scene.source(), &scored, recipe.scan.alpha_min).unwrap();
     Looked { made, scored, traits, _folder: folder }
 }
 
@@ -42,7 +42,7 @@ impl Looked {
     /// Returns the fraction of the visible Gaussians of a body (object of the test scene) that belong to a kind.
     fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
-        let members: Vec<usize> = self.made.members(body).filter(|&i| rows.c[i] > 0.0).collect();
+        let members: Vec<usize> = self.made.body_ids(body).filter(|&i| rows.c[i] > 0.0).collect();
         let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
         with as f64 / members.len().max(1) as f64
     }
@@ -62,11 +62,11 @@ impl Looked {
                     compressed: render(&state.pick(&left), camera, [0.0; 3]),
                     truth: None,
                 };
-                seen.push(observe(&state, &self.traits, camera, &taken));
+                seen.push(sum_errors(&state, &self.traits, camera, &taken));
                 names.push((frame, view as u32));
             }
         }
-        let shares = shares(&self.scored.rows().unwrap(), &self.traits, &lost);
+        let shares = contribution_shares(&self.scored.rows().unwrap(), &self.traits, &lost);
         GaussianKind::ALL.map(|kind| {
             let of = |wanted: bool| {
                 (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
@@ -97,7 +97,7 @@ fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
             assert_eq!(scene.part(body, kind), 0.0, "{} {kind:?}", body.name());
         }
     }
-    let buried = scene.made.members(DemoBody::Buried);
+    let buried = scene.made.body_ids(DemoBody::Buried);
     assert!(scene.traits[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
 }
 
@@ -109,7 +109,7 @@ fn each_mode_is_flagged_where_its_own_kind_is_lost_and_only_there() {
         let at = &found[number];
         assert_eq!(at.verdict, Verdict::Flagged, "{kind:?}: {at:?}");
         assert_eq!(at.dropped, Some(at.gaussians));
-        assert!(at.worst.unwrap().psnr <= at.psnr_there.unwrap(), "{kind:?}: the worst is not better than the mean");
+        assert!(at.worst.unwrap().psnr <= at.psnr_on_kind.unwrap(), "{kind:?}: the worst is not better than the mean");
         assert!(at.detail_lost.unwrap() > 0.1, "{kind:?}: {at:?}");
         for (other, of) in found.iter().enumerate().filter(|(other, _)| *other != number) {
             assert_ne!(of.verdict, Verdict::Flagged, "{kind:?} lost: {:?} {of:?}", GaussianKind::ALL[other]);
@@ -123,20 +123,21 @@ fn losing_what_is_of_no_kind_flags_nothing() {
     // Every third wall Gaussian: a large and visible loss.
     let found = scene.without(|i| scene.traits[i] == [false; 3] && i % 3 == 0);
     assert!(found.iter().all(|of| of.verdict == Verdict::Untouched), "{found:?}");
-    assert!(found[1].psnr_elsewhere.unwrap() < VISIBLE_DB, "the loss is not visible: {found:?}");
+    assert!(found[1].psnr_elsewhere.unwrap() < VISIBLE_ERROR_PSNR_DB, "the loss is not visible: {found:?}");
     let nothing = scene.without(|_| false);
-    assert!(nothing.iter().all(|of| of.verdict == Verdict::Untouched && of.psnr_there == Some(PSNR_CAP_DB)));
+    assert!(nothing.iter().all(|of| of.verdict == Verdict::Untouched && of.psnr_on_kind == Some(PSNR_CAP_DB)));
 }
 
-fn sums(weight: f64, error: f64) -> Observed {
+fn sums(weight: f64, error: f64) -> ViewErrorSums {
     let one = FailureSums { weight, error, kept_detail: weight, detail: weight };
-    Observed { kinds: [one, FailureSums::default(), FailureSums::default()], error: 2.0 * error, pixels: 1e4 }
+    ViewErrorSums { kinds: [one, FailureSums::default(), FailureSums::default()], error: 2.0 * error, pixels: 1e4 }
 }
 
 #[test]
 fn verdicts_follow_the_stated_thresholds() {
-    let verdict =
-        |members: KindMembers, observed: Observed| judge(GaussianKind::Motion, members, &[observed], &[(3, 7)]).verdict;
+    let verdict = |members: KindMembers, observed: ViewErrorSums| {
+        judge(GaussianKind::Motion, members, &[observed], &[(3, 7)]).verdict
+    };
     let lost = KindMembers { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
     // 100 pixels of 10,000 with a squared error of 0.01 each: 20 dB; elsewhere 40 dB.
     assert_eq!(verdict(lost, sums(100.0, 1.0)), Verdict::Flagged);
@@ -148,7 +149,7 @@ fn verdicts_follow_the_stated_thresholds() {
     // Without an index map the pictures alone decide.
     assert_eq!(verdict(KindMembers { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
     let found = judge(GaussianKind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
-    assert_eq!(found.psnr_there, Some(20.0));
+    assert_eq!(found.psnr_on_kind, Some(20.0));
     assert_eq!(found.worst.map(|worst| (worst.frame, worst.view)), Some((3, 7)));
     assert_eq!(judge(GaussianKind::Thin, KindMembers::default(), &[], &[]).verdict, Verdict::Absent);
 }
@@ -187,7 +188,7 @@ fn the_worst_square_is_where_the_kinds_error_is() {
     let (left, top) = worst_corner(&taken, &shares, GaussianKind::Thin);
     assert_eq!((left, top), (36, 26), "the first square that holds the last pixel");
     let part = crop(&taken.compressed, (left, top));
-    assert_eq!((part.width, part.height), (CROP, CROP));
+    assert_eq!((part.width, part.height), (CROP_SIDE_PX, CROP_SIDE_PX));
     assert!((part.data[3 * (63 * 64 + 63)] - 0.7).abs() < 1e-6);
     let small = Image { width: 5, height: 4, data: vec![0.0; 60] };
     assert_eq!((crop(&small, (0, 0)).width, crop(&small, (0, 0)).height), (5, 4));

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::error::Result;
 use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
-use crate::passes::BLOCK;
+use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::statistics::{BlockScan, ScanPlan, wanted};
@@ -36,7 +36,7 @@ impl<'a> BlockScans<'a> {
     /// Returns the ids of the Gaussians of block `block`, counted from the first block to scan.
     pub(crate) fn range(&self, block: usize) -> Range<usize> {
         let block = self.blocks.start + block;
-        block * BLOCK..self.source.info().count.min((block + 1) * BLOCK)
+        block * GAUSSIANS_PER_BLOCK..self.source.info().count.min((block + 1) * GAUSSIANS_PER_BLOCK)
     }
 
     /// Returns the attributes that may have changed from the previous frame to frame `frame`.
@@ -68,7 +68,7 @@ impl<'a> BlockScans<'a> {
             cameras.clear();
             cameras
                 .extend(self.schedule.views(frame).iter().map(|&(_, camera)| &self.schedule.cameras[camera as usize]));
-            scan.frame(frame, state, &cameras, changed);
+            scan.add_frame(frame, state, &cameras, changed);
             self.progress.advance(state.len() as u64);
         }
         Ok(())

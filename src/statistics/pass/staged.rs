@@ -143,9 +143,9 @@ fn accumulate<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
-    use crate::passes::BLOCK;
+    use crate::passes::GAUSSIANS_PER_BLOCK;
     use crate::recipe::Recipe;
     use crate::source::FrameSource;
     use crate::statistics::ScanPlan;
@@ -158,7 +158,7 @@ mod tests {
     /// Scene whose bytes are to be fetched in blocks of `frame_block` frames, and whose frames from `fails_from` on
     /// cannot be read.
     struct SlowScene {
-        scene: Scene,
+        scene: DemoScene,
         frame_block: Option<usize>,
         fails_from: usize,
         fetched: Mutex<Vec<Fetched>>,
@@ -166,7 +166,12 @@ mod tests {
 
     impl SlowScene {
         fn new(frame_block: Option<usize>, fails_from: usize) -> SlowScene {
-            SlowScene { scene: Scene::new(4 * BLOCK + 77, 7), frame_block, fails_from, fetched: Mutex::default() }
+            SlowScene {
+                scene: DemoScene::new(4 * GAUSSIANS_PER_BLOCK + 77, 7),
+                frame_block,
+                fails_from,
+                fetched: Mutex::default(),
+            }
         }
 
         fn scan(&self, threads: usize) -> Result<ScanResult> {

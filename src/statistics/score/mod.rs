@@ -13,7 +13,7 @@ pub use sketch::FloatSketch;
 use serde::{Deserialize, Serialize};
 
 use crate::model::{Flags, Rows, Statistic};
-use crate::recipe::{self, StaticTerm};
+use crate::recipe::{self, StaticScoreTerm};
 
 /// Scores of N Gaussians; every array has N entries, all finite.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,14 +44,14 @@ impl Scores {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// Quantity that the term normalizes.
-    pub of: Quantity,
+    pub of: ScoredQuantity,
     /// Normalization of the quantity, from its percentiles over all Gaussians.
     pub norm: Norm,
 }
 
 /// Quantity by which Gaussians are scored: a statistic, or a combination of several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Quantity {
+pub enum ScoredQuantity {
     /// A single statistic.
     By(Statistic),
     /// √(C·W): geometric mean of the contribution C and the largest weight W in any pixel.
@@ -62,40 +62,40 @@ pub enum Quantity {
     Dynamic,
 }
 
-impl From<StaticTerm> for Quantity {
-    fn from(term: StaticTerm) -> Quantity {
+impl From<StaticScoreTerm> for ScoredQuantity {
+    fn from(term: StaticScoreTerm) -> ScoredQuantity {
         match term {
-            StaticTerm::Mean => Quantity::By(Statistic::C),
-            StaticTerm::Peak => Quantity::By(Statistic::W),
-            StaticTerm::Geometric => Quantity::Geometric,
+            StaticScoreTerm::Mean => ScoredQuantity::By(Statistic::C),
+            StaticScoreTerm::Peak => ScoredQuantity::By(Statistic::W),
+            StaticScoreTerm::Geometric => ScoredQuantity::Geometric,
         }
     }
 }
 
-impl Quantity {
+impl ScoredQuantity {
     /// Returns the name used in summaries and reports.
     pub fn name(self) -> &'static str {
         match self {
-            Quantity::By(statistic) => statistic.name(),
-            Quantity::Geometric => "sqrt(C*W)",
-            Quantity::Static => "S_static",
-            Quantity::Dynamic => "S_dynamic",
+            ScoredQuantity::By(statistic) => statistic.name(),
+            ScoredQuantity::Geometric => "sqrt(C*W)",
+            ScoredQuantity::Static => "S_static",
+            ScoredQuantity::Dynamic => "S_dynamic",
         }
     }
 
     /// Returns whether the quantity describes how a Gaussian moves or how its opacity changes.
     pub fn describes_motion(self) -> bool {
         use Statistic::{D, Kappa, V};
-        matches!(self, Quantity::By(D | Kappa | V) | Quantity::Dynamic)
+        matches!(self, ScoredQuantity::By(D | Kappa | V) | ScoredQuantity::Dynamic)
     }
 
     /// Returns in words which property of a Gaussian the quantity measures.
-    pub fn property(self) -> &'static str {
+    pub fn measured_property(self) -> &'static str {
         match self {
-            Quantity::By(statistic) => statistic.property(),
-            Quantity::Geometric => Statistic::C.property(),
-            Quantity::Static => "the static score",
-            Quantity::Dynamic => "the dynamic score",
+            ScoredQuantity::By(statistic) => statistic.measured_property(),
+            ScoredQuantity::Geometric => Statistic::C.measured_property(),
+            ScoredQuantity::Static => "the static score",
+            ScoredQuantity::Dynamic => "the dynamic score",
         }
     }
 }
@@ -110,7 +110,7 @@ pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores
 
 /// Computes the scores as [`score`] does, with percentiles that are found in one pass or two as `passes` states.
 pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
-    use Quantity::By;
+    use ScoredQuantity::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
     let is_finite: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
@@ -119,9 +119,9 @@ pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, r
     let mut sum = Summation { is_finite: &is_finite, recipe, passes, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
     match recipe.static_term {
-        StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
-        StaticTerm::Geometric if !rows.w.is_empty() => {
-            sum.add(&mut static_score, Quantity::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
+        StaticScoreTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
+        StaticScoreTerm::Geometric if !rows.w.is_empty() => {
+            sum.add(&mut static_score, ScoredQuantity::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
         }
         _ => sum.add(&mut static_score, By(C), 1.0, |i| rows.c[i]),
     }
@@ -135,9 +135,9 @@ pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, r
     let score =
         static_score.iter().zip(&dynamic_score).map(|(s, d)| recipe.w_static * s + recipe.w_dynamic * d).collect();
     let mut static_norm = vec![0.0; rows.len()];
-    sum.add(&mut static_norm, Quantity::Static, 1.0, |i| static_score[i]);
+    sum.add(&mut static_norm, ScoredQuantity::Static, 1.0, |i| static_score[i]);
     let mut dynamic_norm = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_norm, Quantity::Dynamic, 1.0, |i| dynamic_score[i]);
+    sum.add(&mut dynamic_norm, ScoredQuantity::Dynamic, 1.0, |i| dynamic_score[i]);
     let terms = sum.terms;
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
@@ -153,7 +153,7 @@ struct Summation<'a> {
 impl Summation<'_> {
     /// Adds `weight` · norm(`value`) to `total` in all rows that are finite, and records the term under the quantity
     /// `of`. Does nothing if the weight is 0.
-    fn add(&mut self, total: &mut [f64], of: Quantity, weight: f64, value: impl Fn(usize) -> f64) {
+    fn add(&mut self, total: &mut [f64], of: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
@@ -223,7 +223,9 @@ mod tests {
         let mut rows = rows(100);
         rows.e = vec![f64::NAN; 100];
         let scores = score(&rows, 100, &preset("default"));
-        assert!(scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(Quantity::By).contains(&term.of)));
+        assert!(
+            scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(ScoredQuantity::By).contains(&term.of))
+        );
         assert!(scores.score.iter().all(|s| s.is_finite()));
     }
 
@@ -260,7 +262,7 @@ mod tests {
         for name in ["paper", "default"] {
             let scores = score(&rows, 300, &preset(name));
             assert!(scores.dynamic_score.iter().chain(&scores.dynamic_norm).all(|&s| s == 0.0));
-            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.is_active()).map(|t| t.of.name()).collect();
+            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.has_spread()).map(|t| t.of.name()).collect();
             assert_eq!(inactive, ["D", "kappa", "V", "S_dynamic"]);
         }
     }
@@ -292,7 +294,8 @@ mod tests {
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));
         let weighed = score(&rows, 100, &recipe::ScoreParams { weigh_motion_by_life: true, ..preset("paper") });
-        let d = |scores: &Scores| scores.terms.iter().find(|t| t.of == Quantity::By(Statistic::D)).unwrap().norm.p99;
+        let d =
+            |scores: &Scores| scores.terms.iter().find(|t| t.of == ScoredQuantity::By(Statistic::D)).unwrap().norm.p99;
         assert_eq!(d(&weighed), 0.5 * d(&plain));
     }
 }

@@ -53,13 +53,13 @@ impl Norm {
     }
 
     /// Returns whether the 1st and the 99th percentile differ, so that the normalized term grades Gaussians on a scale.
-    pub fn is_active(&self) -> bool {
+    pub fn has_spread(&self) -> bool {
         self.p99 > self.p1
     }
 
     /// Returns the normalized value norm(x).
     pub fn apply(&self, x: f64) -> f64 {
-        if !self.is_active() {
+        if !self.has_spread() {
             return f64::from(u8::from(x > self.p99));
         }
         let norm = (x - self.p1) / (self.p99 - self.p1 + self.epsilon);
@@ -80,7 +80,7 @@ mod tests {
     fn a_constant_term_is_inactive_and_zero() {
         for preset in ["paper", "default"] {
             let norm = preset_norm(preset, &[0.3; 1000]);
-            assert!(!norm.is_active() && norm.apply(0.3) == 0.0 && norm.apply(0.300_000_1) == 1.0, "{norm:?}");
+            assert!(!norm.has_spread() && norm.apply(0.3) == 0.0 && norm.apply(0.300_000_1) == 1.0, "{norm:?}");
         }
     }
 
@@ -95,6 +95,6 @@ mod tests {
     #[test]
     fn an_empty_set_gives_an_inactive_norm() {
         let norm = preset_norm("default", &[]);
-        assert!(!norm.is_active() && norm.apply(0.0) == 0.0);
+        assert!(!norm.has_spread() && norm.apply(0.0) == 0.0);
     }
 }

@@ -10,7 +10,7 @@
 /// Number of mantissa bits of a histogram key, unless another is requested.
 const MANTISSA_BITS: u32 = 7;
 /// Maximum number of mantissa bits of a histogram key; the counts then take 16 MiB.
-pub const MOST_BITS: u32 = 13;
+pub const MAX_MANTISSA_BITS: u32 = 13;
 /// Number of mantissa bits that an f32 stores.
 const ALL_BITS: u32 = 23;
 
@@ -29,10 +29,10 @@ impl FloatSketch {
         Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
-    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MOST_BITS`]. The histogram has
+    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MAX_MANTISSA_BITS`]. The histogram has
     /// 2^(9 + bits) counts of 4 bytes.
     pub fn with_mantissa_bits(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
-        let dropped = ALL_BITS - bits.min(MOST_BITS);
+        let dropped = ALL_BITS - bits.min(MAX_MANTISSA_BITS);
         let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
         for value in values.into_iter().filter(|value| value.is_finite()) {
             sketch.counts[key(value, dropped) as usize] += 1;
@@ -137,7 +137,7 @@ mod tests {
 
         #[test]
         fn one_pass_is_off_by_half_a_bucket_at_most(
-            values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..=MOST_BITS
+            values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..=MAX_MANTISSA_BITS
         ) {
             let exact = sorted_percentile(&values, p).unwrap();
             let sketch = FloatSketch::with_mantissa_bits(bits, values.iter().copied());

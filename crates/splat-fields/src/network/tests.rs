@@ -1,12 +1,12 @@
 use super::*;
 use crate::synthetic::Noise;
-use crate::synthetic::deep::{DeepVariant, KINDS, tensors};
+use crate::synthetic::deep::{ALL_VARIANTS, DeepVariant, random_tensors};
 
 const FILE: &str = "deform.pth";
 
 /// Builds a network with random weights of the architecture `kind`.
 fn network(kind: DeepVariant) -> Network {
-    Network::new(&tensors(kind), "network.", Path::new(FILE)).unwrap()
+    Network::new(&random_tensors(kind), "network.", Path::new(FILE)).unwrap()
 }
 
 /// Returns random positions of `rows` Gaussians, from −1.5 to 1.5.
@@ -71,10 +71,10 @@ fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
 
 #[test]
 fn every_variant_matches_the_f64_oracle() {
-    for kind in KINDS {
-        let (network, oracle, positions) = (network(kind), NetworkOracle(tensors(kind)), positions(37));
+    for kind in ALL_VARIANTS {
+        let (network, oracle, positions) = (network(kind), NetworkOracle(random_tensors(kind)), positions(37));
         assert_eq!(
-            (network.predicts_screw_motion(), network.active().contains(Attributes::SH)),
+            (network.predicts_screw_motion(), network.deformed_attributes().contains(Attributes::SH)),
             (kind.screws, kind.all_heads)
         );
         let encoded = network.encode(&positions);
@@ -118,9 +118,9 @@ fn encoded_values_are_correctly_rounded() {
 
 #[test]
 fn slopes_match_finite_differences() {
-    for kind in &KINDS[..2] {
-        let (network, oracle, positions) = (network(*kind), NetworkOracle(tensors(*kind)), positions(19));
-        let slopes = network.slopes(&positions, 0.25).unwrap();
+    for kind in &ALL_VARIANTS[..2] {
+        let (network, oracle, positions) = (network(*kind), NetworkOracle(random_tensors(*kind)), positions(19));
+        let slopes = network.warp_jacobian(&positions, 0.25).unwrap();
         let outputs = if kind.screws { 6 } else { 3 };
         assert_eq!(slopes.width(), 3 * outputs);
         for i in 0..positions.len() {
@@ -145,7 +145,7 @@ fn slopes_match_finite_differences() {
 
 #[test]
 fn motion_does_not_depend_on_block_or_requested_heads() {
-    let network = network(KINDS[0]);
+    let network = network(ALL_VARIANTS[0]);
     let all = positions(70);
     let mut whole = PredictedMotion::default();
     network.motion(&network.encode(&all), 0.6, Attributes::all(), &mut whole).unwrap();
@@ -163,21 +163,21 @@ fn motion_does_not_depend_on_block_or_requested_heads() {
 fn tensors_that_do_not_fit_are_named_in_the_error() {
     type Break = fn(&mut Tensors);
     let cases: [(DeepVariant, Break, &[&str]); 7] = [
-        (KINDS[0], |t| drop(t.remove("network.linear.0.weight")), &["network.linear.0.weight", "none"]),
-        (KINDS[0], |t| drop(t.remove("network.linear.3.bias")), &["network.linear.3.bias", "none"]),
-        (KINDS[0], |t| drop(t.remove("network.gaussian_scaling.weight")), &["network.gaussian_scaling.weight"]),
+        (ALL_VARIANTS[0], |t| drop(t.remove("network.linear.0.weight")), &["network.linear.0.weight", "none"]),
+        (ALL_VARIANTS[0], |t| drop(t.remove("network.linear.3.bias")), &["network.linear.3.bias", "none"]),
+        (ALL_VARIANTS[0], |t| drop(t.remove("network.gaussian_scaling.weight")), &["network.gaussian_scaling.weight"]),
         (
-            KINDS[0],
+            ALL_VARIANTS[0],
             |t| t.get_mut("network.linear.1.weight").unwrap().data[3] = f32::NAN,
             &["network.linear.1.weight", "finite", "element 3"],
         ),
         (
-            KINDS[0],
+            ALL_VARIANTS[0],
             |t| t.get_mut("network.linear.4.weight").unwrap().shape = vec![11, 44],
             &["network.linear.4.weight", "[11, 44]"],
         ),
         (
-            KINDS[1],
+            ALL_VARIANTS[1],
             |t| {
                 let tensor = t.get_mut("network.linear.0.weight").unwrap();
                 tensor.shape[1] -= 1;
@@ -186,13 +186,13 @@ fn tensors_that_do_not_fit_are_named_in_the_error() {
             &["network.linear.0.weight", "odd", "83"],
         ),
         (
-            KINDS[0],
+            ALL_VARIANTS[0],
             |t| drop(t.insert("network.timenet.2.weight".into(), t["network.linear.1.weight"].clone())),
             &["network.timenet.2.weight"],
         ),
     ];
     for (kind, damage, parts) in cases {
-        let mut damaged = tensors(kind);
+        let mut damaged = random_tensors(kind);
         damage(&mut damaged);
         let message = Network::new(&damaged, "network.", Path::new(FILE)).unwrap_err().to_string();
         for part in parts.iter().chain(&[FILE]) {
@@ -200,8 +200,8 @@ fn tensors_that_do_not_fit_are_named_in_the_error() {
         }
     }
     assert!(
-        network(KINDS[0])
-            .motion(&Encoded::default(), f64::NAN, Attributes::all(), &mut PredictedMotion::default())
+        network(ALL_VARIANTS[0])
+            .motion(&EncodedPositions::default(), f64::NAN, Attributes::all(), &mut PredictedMotion::default())
             .is_err()
     );
 }

@@ -22,7 +22,7 @@ pub struct DeepVariant {
 }
 
 /// Variants to test: each option is on in one and off in another.
-pub const KINDS: [DeepVariant; 3] = [
+pub const ALL_VARIANTS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },
     DeepVariant { time_network: true, screws: false, all_heads: true },
@@ -30,7 +30,7 @@ pub const KINDS: [DeepVariant; 3] = [
 
 /// Returns the tensors `network.*` of a network with five layers, of which the fourth has a skip connection. Its
 /// outputs are of the order of 1.
-pub fn tensors(kind: DeepVariant) -> Tensors {
+pub fn random_tensors(kind: DeepVariant) -> Tensors {
     let mut noise = Noise(5);
     let mut tensors = Tensors::new();
     let mut add = |name: &str, outputs: usize, inputs: usize, size: f32| {

@@ -4,7 +4,7 @@ use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
 
 /// Returns a camera near the origin that looks along +z, rotated a little so that no axis is special.
-pub fn camera(width: u32, height: u32) -> Camera {
+pub fn tilted_camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
         height,
@@ -38,7 +38,7 @@ pub struct Random(pub u64);
 
 impl Random {
     /// Returns the next number in [0, 1).
-    pub fn draw(&mut self) -> f32 {
+    pub fn next_f32(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -47,32 +47,32 @@ impl Random {
     }
 
     /// Returns the next number in [`low`, `high`).
-    pub fn within(&mut self, low: f32, high: f32) -> f32 {
-        low + (high - low) * self.draw()
+    pub fn next_in(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.next_f32()
     }
 }
 
 /// Returns `count` random Gaussians: among them needles, flat, very large and very small ones, some with quaternions
 /// that are not normalized, some off-screen.
-pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
+pub fn random_gaussians(seed: u64, count: usize, degree: usize) -> Gaussians {
     let mut random = Random(seed);
     let mut scene = Gaussians::zeros(count, degree);
     for i in 0..count {
-        let depth = random.within(-0.5, 6.0);
+        let depth = random.next_in(-0.5, 6.0);
         let reach = depth.abs() + 0.3;
-        scene.position.set_row(i, [random.within(-reach, reach), random.within(-reach, reach), depth]);
-        scene.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.within(-2.0, 2.0)));
-        scene.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.within(-6.5, -1.0)));
-        scene.opacity_logit.set_row(i, [random.within(-6.0, 6.0)]);
+        scene.position.set_row(i, [random.next_in(-reach, reach), random.next_in(-reach, reach), depth]);
+        scene.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.next_in(-2.0, 2.0)));
+        scene.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.next_in(-6.5, -1.0)));
+        scene.opacity_logit.set_row(i, [random.next_in(-6.0, 6.0)]);
         for c in 0..scene.sh.width() {
-            scene.sh.plane_mut(c)[i] = random.within(-0.5, 0.5) * if c < 3 { 3.0 } else { 1.0 };
+            scene.sh.plane_mut(c)[i] = random.next_in(-0.5, 0.5) * if c < 3 { 3.0 } else { 1.0 };
         }
     }
     scene
 }
 
 /// Returns one Gaussian with the color (1, ½, 0), on the axis of [`plain_camera`] at the distance `depth`.
-pub fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
+pub fn single_gaussian(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);
     one.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);

@@ -117,13 +117,13 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
 }
 
 /// Renders a view of `gaussians`. Only the pixels of every `stride`-th column and row count for `sum` and `max`.
-pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
+pub fn render_view(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
     render_with(gaussians, camera, background, stride, |_, _| ())
 }
 
 /// Returns for each pixel the indices of the Gaussians that are blended there, nearest first. A small change of a
 /// Gaussian may change these lists.
-pub fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
+pub fn blended_indices(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
     let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
     render_with(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
     ids

@@ -50,7 +50,7 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan:
             touched += u32::from(alive(t) && area > 0.0);
         }
     }
-    let pairs = schedule.pairs().max(1) as f64;
+    let pairs = schedule.pair_count().max(1) as f64;
     OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 

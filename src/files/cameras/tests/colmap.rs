@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 
-use crate::files::cameras::{CameraOptions, Times, load};
+use crate::files::cameras::{CameraOptions, TimesSource, load};
 use crate::model::Split;
 
 /// Writes cameras and images to `folder` as COLMAP does. `lens` is the rest of a line of `cameras.txt` after the camera
@@ -103,12 +103,12 @@ fn colmap_folders_per_frame_share_the_first_cameras() {
 fn colmap_times_come_from_a_table_or_are_absent() {
     let folder = tempfile::tempdir().unwrap();
     write_colmap(folder.path(), "SIMPLE_PINHOLE 80 60 70 40 30", false);
-    let with = |times: Times| load(folder.path(), &CameraOptions { times, ..CameraOptions::default() });
+    let with = |times: TimesSource| load(folder.path(), &CameraOptions { times, ..CameraOptions::default() });
     let table = folder.path().join("t.csv");
     fs::write(&table, "name,time\ncam1/frame_0001.png,0.25\nframe_0003.png, 0.5\nframe_0002,4\n").unwrap();
-    let times: Vec<_> = with(Times::Table(table.clone())).unwrap().shots.iter().map(|shot| shot.time).collect();
+    let times: Vec<_> = with(TimesSource::Table(table.clone())).unwrap().shots.iter().map(|shot| shot.time).collect();
     assert_eq!(times, [Some(0.25), Some(0.5), Some(4.0)]);
-    assert!(with(Times::None).unwrap().times().is_empty());
+    assert!(with(TimesSource::None).unwrap().times().is_empty());
     for (text, parts) in [
         ("frame_0001,0\n", &["t.csv", "frame_0003.png"][..]),
         ("frame_0001 0\n", &["line 1", "a comma"]),
@@ -116,7 +116,7 @@ fn colmap_times_come_from_a_table_or_are_absent() {
         ("a,0\na,1\n", &["line 2", "once"]),
     ] {
         fs::write(&table, text).unwrap();
-        let message = with(Times::Table(table.clone())).unwrap_err().to_string();
+        let message = with(TimesSource::Table(table.clone())).unwrap_err().to_string();
         assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message:?}");
     }
 }

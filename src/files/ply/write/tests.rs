@@ -21,18 +21,18 @@ impl TempPly {
         Ply::open(&self.path("template.ply")).unwrap()
     }
 
-    fn write(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Vec<u8> {
+    fn write(&self, template: &Ply, rows: &[OutputRow], proxies: &Gaussians) -> Vec<u8> {
         self.write_changed(template, rows, proxies, &ParamDelta::default())
     }
 
-    fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Vec<u8> {
-        write_like(template, rows, proxies, change, NO_SH_LIMIT, &self.path("out.ply")).unwrap();
+    fn write_changed(&self, template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Vec<u8> {
+        write_like_template(template, rows, proxies, change, NO_SH_LIMIT, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
 }
 
-fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutRow> {
-    ids.into_iter().map(|source| OutRow { source, proxy: None }).collect()
+fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutputRow> {
+    ids.into_iter().map(|source| OutputRow { source, proxy: None }).collect()
 }
 
 fn all(ply: &Ply) -> Gaussians {
@@ -127,9 +127,9 @@ fn a_proxy_replaces_attributes_and_keeps_extra_properties() {
             let ply = temp.open(&file(format, kind, &names, 6, "\n"));
             let proxies = proxies(2, 1);
             let rows = [
-                OutRow { source: 4, proxy: Some(1) },
-                OutRow { source: 2, proxy: None },
-                OutRow { source: 4, proxy: Some(0) },
+                OutputRow { source: 4, proxy: Some(1) },
+                OutputRow { source: 2, proxy: None },
+                OutputRow { source: 4, proxy: Some(0) },
             ];
             let written = temp.write(&ply, &rows, &proxies);
             let folder = TempPly::new();
@@ -156,7 +156,7 @@ fn deltas_are_added_and_zeros_leave_the_bytes() {
     for (format, kind) in [("binary_little_endian", "float"), ("binary_big_endian", "double"), ("ascii", "short")] {
         let ply = temp.open(&file(format, kind, &names(), 3, "\n"));
         let proxies = proxies(1, 1);
-        let rows = [OutRow { source: 2, proxy: None }, OutRow { source: 0, proxy: Some(0) }];
+        let rows = [OutputRow { source: 2, proxy: None }, OutputRow { source: 0, proxy: Some(0) }];
         let plain = temp.write(&ply, &rows, &proxies);
         let mut by = Gaussians::zeros(2, 0);
         for column in Attributes::all().difference(Attributes::LOG_SCALE).iter() {
@@ -184,15 +184,15 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
         assert_eq!(fewer.sh_degree(), degree.min(3));
         let [expected, found] = ["expected.ply", "found.ply"].map(|name| temp.path(name));
         write_inria(&fewer, ply.comments(), &expected).unwrap();
-        write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
+        write_like_template(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
     // Proxies and deltas contain all SH coefficients, and extra properties keep their place.
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
+    let (rows, change) = ([OutputRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&temp.open(&temp.write_changed(&ply, &rows, &proxies(1, 1), &change)));
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    write_like(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
+    write_like_template(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
     let found = Ply::open(&temp.path("out.ply")).unwrap();
     expected.truncate_sh(0);
     assert!(all(&found) == expected);
@@ -211,7 +211,7 @@ fn a_surfel_file_drops_the_third_scale_of_proxies() {
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let ply = temp.open(&file("binary_little_endian", "float", &names, 1, "\n"));
     let proxies = proxies(1, 1);
-    let written = temp.write(&ply, &[OutRow { source: 0, proxy: Some(0) }], &proxies);
+    let written = temp.write(&ply, &[OutputRow { source: 0, proxy: Some(0) }], &proxies);
     let out = TempPly::new();
     let out = all(&out.open(&written));
     assert_eq!(out.log_scale.row::<2>(0), proxies.log_scale.row::<2>(0));
@@ -222,17 +222,17 @@ fn a_surfel_file_drops_the_third_scale_of_proxies() {
 fn missing_rows_and_proxies_are_refused() {
     let temp = TempPly::new();
     let ply = temp.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
-    let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &ParamDelta::default(), NO_SH_LIMIT, &temp.path("none.ply"))
+    let refusal = |rows: &[OutputRow], proxies: &Gaussians| {
+        write_like_template(&ply, rows, proxies, &ParamDelta::default(), NO_SH_LIMIT, &temp.path("none.ply"))
             .unwrap_err()
             .to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
-    assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
-    assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
+    assert!(refusal(&[OutputRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
+    assert!(refusal(&[OutputRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = ParamDelta(Gaussians::zeros(1, 1));
     let path = temp.path("none.ply");
-    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
+    let message = write_like_template(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
     assert!(!temp.path("none.ply").exists());
 }

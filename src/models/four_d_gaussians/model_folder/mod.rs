@@ -8,12 +8,12 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::deform::{Deltas, Field, Prepared, Scratch};
+use crate::deform::{Deltas, Field, LayerBuffers, PreparedPositions};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
-use crate::passes::{BLOCK, BlockSlices, BlockwiseReader};
-use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, ReadPlan, Reads};
+use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
+use crate::source::{BlockReader, Deformation, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
 use rayon::prelude::*;
 
 use super::cfg_args::ModelConfig;
@@ -95,7 +95,7 @@ pub struct ModelFolder {
     field: Arc<Field>,
     tensor_bytes: u64,
     info: SequenceInfo,
-    states: Count,
+    states: SharedCounter,
     notes: Vec<String>,
     memory: ReadLimit,
 }
@@ -118,8 +118,9 @@ impl ModelFolder {
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
-        let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
-        let (canonical, field, states) = (Arc::new(canonical.into()), Arc::new(field), Count::default());
+        let info =
+            SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.deformed_attributes() };
+        let (canonical, field, states) = (Arc::new(canonical.into()), Arc::new(field), SharedCounter::default());
         Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes, memory })
     }
 
@@ -177,7 +178,7 @@ impl ModelFolder {
     /// # Errors
     /// Fails if times are not finite or not strictly increasing; the message names the frames.
     pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
-        self.info = self.info.at(times)?;
+        self.info = self.info.with_frames_at(times)?;
         Ok(self)
     }
 
@@ -214,7 +215,7 @@ impl ModelFolder {
     }
 
     /// Returns the changes (deltas) that the deformation field makes at `time` to Gaussians at the canonical positions
-    /// `position` `[N, 3]`, which need not belong to this model. [`Deltas::solve`] computes stored parameters from a
+    /// `position` `[N, 3]`, which need not belong to this model. [`Deltas::invert`] computes stored parameters from a
     /// desired state.
     ///
     /// # Errors
@@ -222,7 +223,7 @@ impl ModelFolder {
     pub fn deltas_at(&self, position: &AttributeValues, time: f64) -> Result<Deltas> {
         let prepared = self.field.prepare(position);
         let mut deltas = Deltas::new(self.info.sh_degree);
-        self.field.deltas(&prepared, time, Attributes::all(), &mut Scratch::default(), &mut deltas)?;
+        self.field.deltas(&prepared, time, Attributes::all(), &mut LayerBuffers::default(), &mut deltas)?;
         Ok(deltas)
     }
 }
@@ -249,7 +250,7 @@ impl FrameSource for ModelFolder {
             model: self,
             prepared: self.field.prepare(&raw.position),
             raw,
-            scratch: Scratch::default(),
+            scratch: LayerBuffers::default(),
             deltas: Deltas::new(self.info.sh_degree),
         }))
     }
@@ -286,8 +287,8 @@ impl Deformation for ModelFolder {
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
         let parts = BlockSlices::split(out, want, ids.len());
-        ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
-            || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
+        ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
+            || (nothing(), nothing(), LayerBuffers::default(), Deltas::new(self.info.sh_degree)),
             |(raw, state, scratch, deltas), (ids, parts)| {
                 for column in (want | Attributes::POSITION).iter() {
                     *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
@@ -310,7 +311,7 @@ impl Deformation for ModelFolder {
             }
             self.field.jacobian(&raw, time, want)
         };
-        let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;
+        let blocks: Vec<Jacobian> = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect::<Result<_>>()?;
         Ok(Jacobian::joined(&blocks, ids.len()))
     }
 }
@@ -319,8 +320,8 @@ impl Deformation for ModelFolder {
 struct FieldReader<'a> {
     model: &'a ModelFolder,
     raw: Gaussians,
-    prepared: Prepared,
-    scratch: Scratch,
+    prepared: PreparedPositions,
+    scratch: LayerBuffers,
     deltas: Deltas,
 }
 

@@ -7,7 +7,7 @@ use crate::model::Camera;
 /// rotation, distance from the point where the optical axes meet, focal length and principal point are interpolated
 /// evenly. Steps are equally long if the stops are at different positions. All images have the size of the first stop's
 /// image.
-pub fn along(stops: &[Camera], count: usize) -> Vec<Camera> {
+pub fn cameras_along(stops: &[Camera], count: usize) -> Vec<Camera> {
     let (Some(first), Some(last)) = (stops.first(), stops.last()) else { return Vec::new() };
     let focus = meeting_point(stops);
     let mut lengths: Vec<f64> = stops.windows(2).map(|pair| pair[0].center().distance(pair[1].center())).collect();
@@ -68,7 +68,7 @@ mod tests {
     #[test]
     fn path_through_an_arc_stays_on_its_circle() {
         let stops = arc();
-        let path = along(&stops, 21);
+        let path = cameras_along(&stops, 21);
         assert_eq!((path.len(), &path[0], &path[20]), (21, &stops[0], &stops[2]));
         assert!(path[10].center().distance(stops[1].center()) < 1e-9, "the middle of the path is the middle camera");
         let mut before = -1e-9;
@@ -90,11 +90,11 @@ mod tests {
     #[test]
     fn zero_one_and_coinciding_stops_have_a_path() {
         let stops = arc();
-        assert!(along(&[], 3).is_empty());
-        assert!(along(&stops[..1], 3).iter().all(|camera| *camera == stops[0]));
+        assert!(cameras_along(&[], 3).is_empty());
+        assert!(cameras_along(&stops[..1], 3).iter().all(|camera| *camera == stops[0]));
         let turned = Camera::look_at(stops[0].center(), DVec3::new(0.0, 1.0, 0.0), 0.6, (64, 48));
-        let path = along(&[stops[0].clone(), turned], 5);
+        let path = cameras_along(&[stops[0].clone(), turned], 5);
         assert!(path.iter().all(|camera| camera.center().distance(stops[0].center()) < 1e-9));
-        assert_eq!(along(&stops, 1), stops[..1]);
+        assert_eq!(cameras_along(&stops, 1), stops[..1]);
     }
 }

@@ -8,13 +8,13 @@
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, VELOCITY, WIDTH, write_ftgs};
+use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_ftgs};
 use crate::files::tsog::write::{MAX_FRAMES, write_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
-use crate::fit::{CubicTrack, CurveForm, MIN_VISIBLE_OPACITY, Misfit, Tolerance, curved};
+use crate::fit::{CubicTrack, CurveForm, FitError, MIN_VISIBLE_OPACITY, Tolerance, fit_curves};
 use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, logit, opacity};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{States, tracks};
+use crate::passes::{FrameStates, map_tracks};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -25,8 +25,8 @@ const CONSTANT_DEVIATION: f64 = 2000.0;
 const OPACITY_MARGIN: f64 = 1e-6;
 
 /// Maximum number of Gaussians of all single frames together in a `.tsog`. Its player shows no more by default.
-pub const MAX_SINGLE_FRAMES: usize = 1_000_000;
-/// Fraction of the visible states that are far off in a fit ([`Misfit::far_share`]) above which single frames are
+pub const MAX_SINGLE_FRAME_GAUSSIANS: usize = 1_000_000;
+/// Fraction of the visible states that are far off in a fit ([`FitError::far_off_fraction`]) above which single frames are
 /// written.
 const MAX_FAR_SHARE: f64 = 0.1;
 /// Maximum number of intervals between the lines of a Gaussian in a `.tsog`. More lines take many bytes for the few
@@ -39,7 +39,7 @@ const BYTES_RATIO: f64 = 1.5;
 #[derive(Debug)]
 struct FittedWindows {
     lines: TimedGaussians,
-    misfit: Misfit,
+    misfit: FitError,
     /// Number of lines that were left out because a value of their Gaussian is not finite.
     left_out: usize,
 }
@@ -93,7 +93,7 @@ pub fn write_fitted_windows(
          error of opacities: {:.3} rms, {:.3} at most",
         info.count,
         lines.params.len(),
-        100.0 * misfit.far_share(),
+        100.0 * misfit.far_off_fraction(),
         misfit.rms(),
         misfit.position,
         misfit.opacity_rms(),
@@ -116,23 +116,23 @@ pub fn write_fitted_windows(
 }
 
 /// Returns whether single frames are written instead of `lines`: if more than [`MAX_FAR_SHARE`] of them are far off, or if
-/// single frames, which have no such error, take about as few bytes. There may be at most [`MAX_SINGLE_FRAMES`] of
+/// single frames, which have no such error, take about as few bytes. There may be at most [`MAX_SINGLE_FRAME_GAUSSIANS`] of
 /// them.
-fn are_frames_better(lines: &TimedGaussians, misfit: &Misfit) -> bool {
-    let is_far_off = misfit.far_share() > MAX_FAR_SHARE;
+fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
+    let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
     let frames = lines.clip.frames.unwrap_or(1);
-    (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAMES as u64 && frames <= MAX_FRAMES
+    (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAME_GAUSSIANS as u64 && frames <= MAX_FRAMES
 }
 
 /// Returns the visible Gaussians of all frames, each seen in its own frame only. Gaussians with values that are not
 /// finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
-    let mut states = States::open(source, &ReadPlan::every().holding(1))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(1))?;
     let (mut parts, mut frame_of) = (Vec::new(), Vec::new());
     for frame in 0..info.times.len() {
-        let state = states.at(frame)?;
+        let state = states.read(frame)?;
         let is_finite = |row: usize| {
             let columns = Attributes::all().iter().map(|column| state.column(column));
             columns.flat_map(|values| (0..values.width()).map(|c| values.plane(c)[row])).all(f32::is_finite)
@@ -152,7 +152,7 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
     }
     let own = AttributeValues::from_planes(1, frame_of);
     let timeline = Timeline::Frames(info.times.len());
-    Ok(TimedGaussians { params: StoredParams { gaussians, own }, timeline, clip: *clip })
+    Ok(TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip: *clip })
 }
 
 /// Fits lines in time windows to all Gaussians of `source`, for the format `kind`.
@@ -165,16 +165,16 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
         OutputKind::Tsog => (Tolerance::COMPACT, CurveForm::linear(0.0).with_intervals(COMPACT_INTERVALS)),
         _ => (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_DEVIATION)),
     };
-    let found = tracks(source, &times, &progress, |track| {
-        let mut misfit = Misfit::default();
-        (curved(track, form, &tolerance, &mut misfit), misfit)
+    let found = map_tracks(source, &times, &progress, |track| {
+        let mut misfit = FitError::default();
+        (fit_curves(track, form, &tolerance, &mut misfit), misfit)
     })?;
-    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
+    let misfit = found.iter().map(|(_, misfit)| *misfit).fold(FitError::default(), FitError::merged_with);
     let all = found.iter().map(|(lines, _)| lines.len()).sum::<usize>();
     let lines: Vec<&CubicTrack> = found.iter().flat_map(|(lines, _)| lines).filter(|line| is_finite(line)).collect();
     let mut params = StoredParams {
         gaussians: Gaussians::zeros(lines.len(), info.sh_degree),
-        own: AttributeValues::zeros(WIDTH, lines.len()),
+        format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, lines.len()),
     };
     lines.iter().enumerate().for_each(|(row, line)| set_row(&mut params, row, line));
     let left_out = all - lines.len();
@@ -203,15 +203,15 @@ fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     line.sh.iter().enumerate().for_each(|(c, &value)| gaussians.sh.plane_mut(c)[row] = value);
     // The window of the fit is exp(−(dt/w)²), which has the standard deviation w/√2.
     let deviation = (line.width / std::f64::consts::SQRT_2).min(CONSTANT_DEVIATION);
-    params.own.plane_mut(CENTER)[row] = narrow(line.center);
-    params.own.plane_mut(LOG_DEVIATION)[row] = narrow(deviation.ln());
-    (0..3).for_each(|c| params.own.plane_mut(VELOCITY + c)[row] = narrow(line.position[1][c]));
+    params.format_specific.plane_mut(CENTER)[row] = narrow(line.center);
+    params.format_specific.plane_mut(LOG_DEVIATION)[row] = narrow(deviation.ln());
+    (0..3).for_each(|c| params.format_specific.plane_mut(VELOCITY + c)[row] = narrow(line.position[1][c]));
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnostics::demo_scene::Scene;
+    use crate::diagnostics::demo_scene::DemoScene;
     use crate::files::ftgs::Ftgs;
     use crate::files::ply::PlyOptions;
     use crate::files::splatv::rows::ZeroRotation;
@@ -222,7 +222,7 @@ mod tests {
     /// Evaluates the formulas of the player: positions and opacities of all Gaussians at the time `time`.
     fn shown(file: &Ftgs, time: f64) -> Vec<([f64; 3], f64)> {
         let params = &file.params;
-        let own = |plane: usize, row: usize| f64::from(params.own.plane(plane)[row]);
+        let own = |plane: usize, row: usize| f64::from(params.format_specific.plane(plane)[row]);
         let state = |row: usize| {
             let dt = time - own(CENTER, row);
             let at = params.gaussians.position.row::<3>(row);
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn the_formulas_of_the_player_show_every_gaussian() {
-        let scene = Scene::new(300, 30);
+        let scene = DemoScene::new(300, 30);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.ftgs.ply");
         let notes = write_fitted_windows(&scene, OutputKind::Ftgs, &path, &Events::IGNORED).unwrap();
@@ -268,7 +268,7 @@ mod tests {
 
     #[test]
     fn the_file_does_not_depend_on_the_number_of_threads() {
-        let scene = Scene::new(150, 12);
+        let scene = DemoScene::new(150, 12);
         let folder = tempfile::tempdir().unwrap();
         let file = |threads: usize| {
             let path = folder.path().join(format!("{threads}.ftgs.ply"));
@@ -281,20 +281,25 @@ mod tests {
 
     #[test]
     fn still_gaussians_are_one_line_with_an_open_window() {
-        let scene = Scene::new(40, 1);
+        let scene = DemoScene::new(40, 1);
         let fitted = fit(&scene, OutputKind::Ftgs, &Events::IGNORED).unwrap();
         let params = &fitted.lines.params;
         assert!(params.len() <= 40 && !params.is_empty());
-        assert!(params.own.plane(LOG_DEVIATION).iter().all(|&log| f64::from(log) > 7.0));
-        assert!((VELOCITY..WIDTH).all(|plane| params.own.plane(plane).iter().all(|&x| x == 0.0)));
+        assert!(params.format_specific.plane(LOG_DEVIATION).iter().all(|&log| f64::from(log) > 7.0));
+        assert!(
+            (VELOCITY..PARAMS_PER_GAUSSIAN).all(|plane| params.format_specific.plane(plane).iter().all(|&x| x == 0.0))
+        );
     }
 
     /// Returns lines and the error of their fit, which visited `states` states.
-    fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, Misfit) {
-        let mut misfit = Misfit::default();
+    fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, FitError) {
+        let mut misfit = FitError::default();
         (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));
-        let params = StoredParams { gaussians: Gaussians::zeros(lines, 0), own: AttributeValues::zeros(WIDTH, lines) };
-        let clip = ClipTimes { frames: Some(10), ..ClipTimes::UNIT };
+        let params = StoredParams {
+            gaussians: Gaussians::zeros(lines, 0),
+            format_specific: AttributeValues::zeros(PARAMS_PER_GAUSSIAN, lines),
+        };
+        let clip = ClipTimes { frames: Some(10), ..ClipTimes::UNIT_INTERVAL };
         (TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit)
     }
 
@@ -304,7 +309,7 @@ mod tests {
             (100, 1000, 0.1, false),
             (100, 1000, 1.5, true),
             (700, 1000, 0.1, true),
-            (700, MAX_SINGLE_FRAMES + 1, 1.5, false),
+            (700, MAX_SINGLE_FRAME_GAUSSIANS + 1, 1.5, false),
         ] {
             let (lines, misfit) = fitted(lines, states, position);
             assert_eq!(are_frames_better(&lines, &misfit), expected, "{states} states, {position} off");
@@ -313,7 +318,7 @@ mod tests {
 
     #[test]
     fn single_frames_hold_all_visible_gaussians() {
-        let scene = Scene::new(60, 2);
+        let scene = DemoScene::new(60, 2);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.tsog");
         let frames = single_frames(&scene, &ClipTimes::from_times(&scene.info().times)).unwrap();
@@ -332,7 +337,7 @@ mod tests {
 
     #[test]
     fn a_tsog_of_one_frame_is_a_still() {
-        let scene = Scene::new(50, 1);
+        let scene = DemoScene::new(50, 1);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("still.tsog");
         write_fitted_windows(&scene, OutputKind::Tsog, &path, &Events::IGNORED).unwrap();
