@@ -11,6 +11,7 @@ pub mod method;
 pub mod precision;
 pub mod trade_off;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -23,18 +24,19 @@ use serde::de::DeserializeOwned;
 use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
-use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, TruthComparison, ViewScores};
+use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, RigSides, TruthComparison, ViewScores};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::records::RenderTime;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, FrameView, Gaussians};
+use crate::model::{Camera, FrameView, Gaussians, Split};
 use crate::models::InputModel;
 use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
+use crate::scene::outside::RigCone;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
@@ -304,12 +306,24 @@ impl ModelPair {
             },
             background: self.background,
             loss: Comparison::from_views(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
+            rig_sides: RigSides::from_views(&scores, &self.outside_views()),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
             views: scores,
         })
+    }
+
+    /// Returns for every view whether it is outside the rig of the training cameras; `false` for all if there are none.
+    fn outside_views(&self) -> Vec<bool> {
+        let rig = &self.scene.rig;
+        let training = rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera);
+        let training: BTreeSet<u32> = training.collect();
+        let cameras: Vec<Camera> = training.iter().map(|&camera| rig.cameras[camera as usize].clone()).collect();
+        let cone = RigCone::new(&cameras);
+        let is_outside = |view: &FrameView| !training.is_empty() && cone.is_outside(&rig.cameras[view.camera as usize]);
+        self.views.iter().map(is_outside).collect()
     }
 
     /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.

@@ -20,7 +20,8 @@ use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{policy_digest, policy_meta_element};
-use crate::model::{Rig, Split};
+use crate::model::{Camera, Rig, Split};
+use crate::scene::outside::{MIN_ANGLE, RigCone};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
@@ -78,6 +79,8 @@ pub struct PageScene {
     pub extent: f64,
     /// Mean upward direction of the cameras.
     pub up: [f64; 3],
+    /// Directions in which the training cameras see the scene; `None` if nothing is outside them.
+    pub rig: Option<PageRig>,
     /// Names of the files of the chunks (encoded groups of frames) to load, in order; empty if the page itself contains
     /// the chunks.
     pub files: Vec<String>,
@@ -85,6 +88,34 @@ pub struct PageScene {
     /// the JSON.
     #[serde(skip)]
     pub poster: Option<String>,
+}
+
+/// Directions in which the training cameras see the scene, by which the page tells where nothing was fitted.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PageRig {
+    /// Point where the optical axes of the cameras meet, in scene units.
+    focus: [f64; 3],
+    /// Inward unit normals of the faces of the cone of directions from this point to the cameras.
+    faces: Vec<[f64; 3]>,
+    /// Sine of the angle from which a direction counts as outside.
+    tolerance: f64,
+}
+
+/// Maximum number of training cameras whose cone is computed; of more cameras an even selection is taken.
+const RIG_CAMERAS: usize = 64;
+
+/// Returns the directions in which the training cameras of `rig` see the scene. Returns `None` if there are no such
+/// cameras, or if they are all around the scene.
+pub fn training_rig(rig: &Rig) -> Option<PageRig> {
+    let mut used: Vec<u32> =
+        rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera).collect();
+    used.sort_unstable();
+    used.dedup();
+    let step = used.len().div_ceil(RIG_CAMERAS).max(1);
+    let cameras: Vec<Camera> = used.iter().step_by(step).map(|&camera| rig.cameras[camera as usize].clone()).collect();
+    let cone = RigCone::new(&cameras);
+    let faces: Vec<[f64; 3]> = cone.faces().iter().map(|face| face.to_array()).collect();
+    (!faces.is_empty()).then(|| PageRig { focus: cone.focus().to_array(), faces, tolerance: MIN_ANGLE.sin() })
 }
 
 /// Camera on the player page.
@@ -287,6 +318,7 @@ mod tests {
             center: [0.0; 3],
             extent: 1.0,
             up: [0.0, 0.0, 1.0],
+            rig: None,
             files: Vec::new(),
             poster: None,
         }

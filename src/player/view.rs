@@ -11,7 +11,7 @@ use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
 use crate::player::lattice::{PlayerSteps, component_count};
-use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up};
+use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up, training_rig};
 use crate::player::poster::{self, render_poster};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::progress::Events;
@@ -133,6 +133,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         center: middle.to_array(),
         extent: if extent > 0.0 { extent } else { 1.0 },
         up: mean_up(&scene.rig).to_array(),
+        rig: if scene.has_cameras { training_rig(&scene.rig) } else { None },
         files: Vec::new(),
         poster: render_poster(scene.source(), &scene.rig, background, &limits)?,
     };

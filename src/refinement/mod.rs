@@ -194,9 +194,14 @@ impl RefineStage {
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
+        // With a deformation field, no reader is open while steps are made, and either two more states are held while
+        // states are evaluated again, or one per thread while views are rendered.
+        let is_deformed = work.input.jacobian > 0;
+        let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
+        let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
         let left = [
-            ("states", (6 + work.threads) * whole),
-            ("jacobians", (3 + work.threads) * work.input.jacobian),
+            ("states", states * whole),
+            ("jacobians", (2 + work.threads.max(2)) * work.input.jacobian),
             ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
@@ -206,7 +211,7 @@ impl RefineStage {
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
         // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.
         let phase = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
-            let parts = read.into_iter().chain(left).chain(more);
+            let parts = left_readers.into_iter().chain(left).chain(more);
             parts.map(|(name, bytes)| (name, bytes_of_survivors(part, bytes))).collect()
         };
         let (wanted, keyframe_count) = (self.target.unwrap_or(1.0).min(1.0), self.keyframes_for(work));
@@ -244,6 +249,10 @@ impl RefineStage {
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
         let stored = on_grid(self.stored_stride(work.pixels, first as usize));
+        // Whole views are rendered for validation, one per thread, with 6 bytes per pixel of the target view. Steps
+        // render pixels of a grid, and hold the image, its gradient and the target view.
+        let whole_views = work.threads * 24 * work.pixels;
+        let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {
             stage: NAME,
             reads: 2.0 * work.scattered_full_reads(frames, limits),
@@ -254,7 +263,7 @@ impl RefineStage {
             fixed: vec![
                 work.filling_blocks(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
-                ("views", (work.threads + 4) * 12 * work.pixels),
+                ("views", whole_views.max(views_of_steps)),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
             ],
         }
