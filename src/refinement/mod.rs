@@ -142,7 +142,7 @@ impl RefineStage {
     /// `first` Gaussians. It may be larger than [`RefineStage::stride`] allows for so many, because most of them will be
     /// removed by prune steps.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
-        let fewer = if self.cuts { first / 2 } else { first };
+        let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)
     }
 
