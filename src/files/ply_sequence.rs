@@ -63,7 +63,7 @@ impl PlySequence {
         Ok(PlySequence { frames, info, note: None, bytes, states })
     }
 
-    /// Sets the note for the user about the files of this sequence.
+    /// Returns this sequence with `note`, a note for the user about its files.
     pub fn with_note(self, note: String) -> PlySequence {
         PlySequence { note: Some(note), ..self }
     }

@@ -157,7 +157,7 @@ impl Assembly {
         Ok(())
     }
 
-    /// Returns the largest time stamp so far, or `least` if that is larger.
+    /// Returns the largest time stamp of the images added so far, or `least` if that is larger.
     pub(super) fn latest(&self, least: f64) -> f64 {
         self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
     }
@@ -233,7 +233,8 @@ impl MemoryCounter {
     }
 }
 
-/// Returns the error text for an image without a time although the first image has one (`timed`), or the reverse.
+/// Returns the error text for an image that has a time although the first image has none, or the reverse. `timed` says
+/// whether the first image has a time.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }

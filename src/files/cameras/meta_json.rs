@@ -69,7 +69,7 @@ impl<T> KeyedValues<T> {
     /// size of a value may be in use.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
-    /// Returns the index in `values` of the first value of `frame`.
+    /// Returns the index in `values` of the first value of frame `frame`.
     fn start(&self, frame: usize) -> usize {
         frame.checked_sub(1).map_or(0, |before| self.ends[before])
     }
@@ -96,7 +96,7 @@ struct Tables {
 }
 
 impl Tables {
-    /// Adds the value of key `KEYS[key]`, read from `own`, to the current frame.
+    /// Adds one value of the key `KEYS[key]` to the current frame. The value is read from the JSON object `own`.
     fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
@@ -110,7 +110,8 @@ impl Tables {
         Ok(())
     }
 
-    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the next frame.
+    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the
+    /// next frame.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),

@@ -8,7 +8,8 @@
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
-//! that reach 1 give the same times. For models whose time has another unit, times are used as they are ([`TimeConvention`]).
+//! that reach 1 give the same times. For models whose time has another unit, times are used as they are
+//! ([`TimeConvention`]).
 
 use std::path::{Path, PathBuf};
 
