@@ -47,7 +47,8 @@ impl PixelGradients {
     }
 }
 
-/// Computes the gradient sums of the splats of a tile; without `SHAPE` only those of their colors.
+/// Receiver of weights that computes the gradient sums of the splats of a tile. If `SHAPE` is false, it computes only
+/// the sums of their colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
     /// Gradient sums of each splat of the tile.
