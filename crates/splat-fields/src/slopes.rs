@@ -56,8 +56,8 @@ impl<'a> BilinearPatch<'a> {
         }
     }
 
-    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the bilinear sample and its derivatives with respect to
-    /// the normalized coordinates along a and b.
+    /// Returns the bilinearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
+    /// with respect to the normalized coordinate along a, then those along b.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 3] {
         let [ll, hl] = [channel_chunk(self.corners[0], first), channel_chunk(self.corners[1], first)];
@@ -83,8 +83,8 @@ struct TimeLineSegment<'a> {
 }
 
 impl TimeLineSegment<'_> {
-    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the interpolated sample and its derivative with respect
-    /// to the normalized coordinate.
+    /// Returns the linearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
+    /// with respect to the normalized coordinate.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 2] {
         let [low, high] = [channel_chunk(self.ends[0], first), channel_chunk(self.ends[1], first)];
