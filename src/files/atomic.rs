@@ -165,7 +165,7 @@ pub struct StagedFiles {
 impl StagedFiles {
     /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
     /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
-    /// the summary.
+    /// the summary (JSON file that describes the result).
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -248,8 +248,8 @@ impl StagedFolder {
         &self.content
     }
 
-    /// Adds the list of its files to the summary of the folder, if it has a summary, syncs everything to disk and gives
-    /// the folder its final name.
+    /// Adds the list of its files to the summary of the folder (`summary.json`), if it has a summary, syncs everything
+    /// to disk and gives the folder its final name.
     ///
     /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
     /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the

@@ -30,7 +30,7 @@ const MAX_LIST: u64 = 4 << 20;
 /// Maximum number of bytes of decoded arrays, in the scratch file, per byte of the archive; [`BASE_SCRATCH_BYTES`] are
 /// allowed in addition. Trained models need 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Number of bytes of decoded arrays that an archive of any size may have.
+/// Number of bytes of decoded arrays that are allowed in the scratch file for an archive of any size.
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;

@@ -142,7 +142,7 @@ enum OwnedIds {
 }
 
 impl OwnedIds {
-    /// Copies the indices `ids`.
+    /// Copies the indices `ids` into a value that owns them.
     fn from_ids(ids: Ids<'_>) -> OwnedIds {
         match ids {
             Ids::Range(range) => OwnedIds::Range(range),

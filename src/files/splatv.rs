@@ -2,9 +2,9 @@
 //! time, as read by the players splaTV and WebGS.
 //!
 //! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the JSON text, and the texture that this text
-//! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth`,
-//! `texheight` and `cameras`. The texture holds one row of [`ROW_BYTES`] bytes per Gaussian ([`SplatvGaussian`]), then
-//! zeros. Source: antmatter15/splaTV.
+//! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth` and
+//! `texheight` (columns and rows of the texture, in texels) and `cameras`. The texture holds one row of [`ROW_BYTES`]
+//! bytes per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
 
 pub mod rows;
 pub mod write;

@@ -280,7 +280,8 @@ pub(super) enum Refusal {
 }
 
 impl Leftover {
-    /// Takes over the workspace `name` in `parent` if this program created it for this user and its run has ended.
+    /// Locks and returns the workspace `name` in `parent` if this program created it for this user and its run has
+    /// ended; otherwise returns the reason for refusing it.
     pub(super) fn take(parent: &FolderHandle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;

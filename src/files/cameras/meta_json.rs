@@ -22,7 +22,7 @@ use crate::model::{Camera, Rig, Split};
 /// Names of the files of a data set, and the split that each file lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
-/// Keys whose values are lists by frame and camera.
+/// Keys whose values are lists of lists: one list per frame, with one value per camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
 /// Returns whether the document with the keys `outline` is in this format.

@@ -60,7 +60,7 @@ impl SmallValue {
         SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
-    /// Returns the elements if this is a list whose elements were all kept.
+    /// Returns the elements if this is a list whose elements were all kept; `None` for other values.
     pub(crate) fn elements(&self) -> Option<&[SmallValue]> {
         match self {
             SmallValue::List(kept, total) if kept.len() == *total => Some(kept),

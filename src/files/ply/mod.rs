@@ -89,7 +89,7 @@ pub struct Ply {
 struct PlyBody {
     /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
-    /// Offset in bytes of the tables in the map.
+    /// Offset in bytes, in `map`, of the first table.
     start: usize,
     /// For a text file, its length in bytes and its converted rows; `None` for a binary file.
     text: Option<(u64, TextRows)>,

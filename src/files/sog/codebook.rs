@@ -5,7 +5,8 @@ pub const ENTRIES: usize = 256;
 /// Number of equal bins into which the range of the values is divided to find the entries.
 const BINS: usize = 1 << 14;
 
-/// Codebook of 256 numbers in increasing order.
+/// Codebook of at most 256 numbers; a byte stands for the number with this index. [`Codebook::fit`] chooses 256 numbers
+/// in increasing order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Codebook {
     entries: Vec<f32>,

@@ -28,11 +28,11 @@ const MAX_ENTRIES: u64 = 1024;
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Number of images of a file that have a pixel per Gaussian and are decoded at the same time.
+/// Number of the images of a file that are in memory together and have one pixel per Gaussian.
 const IMAGES: u64 = 6;
 /// Maximum number of pixels of the image of palette entries: 65536 entries of degree 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
-/// Largest magnitude of a logarithmic coordinate: the coordinate must be finite as f32.
+/// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
 /// Largest magnitude of a stored SH coefficient and of the logarithm of a scale.
 const MAX_CODEBOOK_VALUE: f32 = 1e30;

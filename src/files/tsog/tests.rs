@@ -65,7 +65,7 @@ fn image(path: &Path, name: &str) -> RgbaImage {
     RgbaImage::from_webp(&bytes, 1 << 20).unwrap()
 }
 
-/// Writes the archive again with another `meta.json` and another method of compression.
+/// Writes the archive at `path` again, with the changes that `change` makes to `meta.json`, and compressed by `method`.
 fn rewrite(path: &Path, method: CompressionMethod, change: impl FnOnce(&mut Value)) {
     let (mut text, names) = meta(path);
     change(&mut text);
