@@ -1,8 +1,9 @@
 //! Data sets with one COLMAP folder `colmap_K` for each frame, as SpacetimeGaussians prepares them.
 //!
 //! The cameras do not move: every frame has the cameras of `sparse/0` in the first folder, as in the loader of
-//! SpacetimeGaussians. Frame j of n is at time j/n; its images are in folder K + j. A single frame has no time. Source:
-//! `readColmapSceneInfo` of the SpacetimeGaussians repository.
+//! SpacetimeGaussians. Frame j of n is at time j/n; its images are in the folder with the number K + j, where K is the
+//! number of the first folder. A single frame has no time. Source: `readColmapSceneInfo` of the SpacetimeGaussians
+//! repository.
 
 use std::fs;
 use std::path::{Path, PathBuf};

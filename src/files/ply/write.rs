@@ -123,8 +123,8 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     write_inria_with(gaussians, comments, &[], path)
 }
 
-/// Writes `gaussians` like [`write_inria`], with the further float properties `more` at the end of each row: names, and
-/// one value per Gaussian.
+/// Writes `gaussians` like [`write_inria`], with the float properties `more` appended to each row. Each of these
+/// properties is given by its name and one value per Gaussian.
 ///
 /// # Errors
 /// Fails like [`write_inria`].
