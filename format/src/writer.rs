@@ -42,7 +42,8 @@ pub struct Writer {
     times: Vec<f64>,
     /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
     index: File,
-    /// Number of tiles in the frame blocks appended so far; `written` is how many of them have been written.
+    /// Number of tiles in the frame blocks appended so far; `written` is the number of these tiles that have been
+    /// written.
     tiles: u64,
     written: u64,
     /// Last constant tile (all frames equal) written for each column and Gaussian block; empty before the first frame
@@ -294,8 +295,9 @@ impl Writer {
         Ok(digest.value())
     }
 
-    /// For a constant tile, returns the offset of equal stored bytes that are in the file already, if there are some.
-    /// Equal checksums are only a hint; the bytes are read back and compared.
+    /// Returns the offset in the file of stored bytes that equal `bytes`, if `record` is a constant tile (all frames
+    /// equal) and the last constant tile of `slot` (its column and Gaussian block) has such bytes. Equal checksums are
+    /// only a hint; the bytes are read back and compared.
     fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
         let Some(earlier) = self.constants[slot] else { return Ok(None) };
         if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {
