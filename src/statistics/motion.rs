@@ -31,9 +31,8 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Number of frames directly before the current one that have the same opacities as the frame before them, so that
-    /// the same Gaussians are alive. `steps`, `turns` and `history` do not count these frames yet. Used only by
-    /// `MotionParams::Runs`.
+    /// Number of the latest frames whose opacities equal those of the frame before them, so that the same Gaussians are
+    /// alive. `steps`, `turns` and `history` do not count these frames yet. Used only by `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,
@@ -71,8 +70,8 @@ impl MotionSums {
     }
 
     /// Adds a frame with these positions (`[3, len]`) and opacities. `steps` holds the durations of the latest time
-    /// step and of the one before, each divided by the mean duration of a step. `steady`: the opacities have been the
-    /// same in every frame so far, this one included.
+    /// step and of the one before, each divided by the mean duration of a step. `steady` is true if the opacities have
+    /// been the same in every frame so far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
@@ -125,7 +124,7 @@ impl MotionSums {
         }
     }
 
-    /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame with the opacities of all frames before. Which
+    /// Adds a frame like [`MotionSums::add_frame_of_runs`], if its opacities equal those of all frames before. Which
     /// steps and turns count is then known without reading the history, so half as much memory is accessed (`cargo
     /// bench --bench scan`).
     #[inline(always)]

@@ -42,7 +42,8 @@ impl BlockState {
     }
 
     /// Takes over the attributes `changed` of the next frame, and flags non-finite values and zero quaternions in them.
-    /// Axes are only needed for projection and are computed later, by [`BlockState::update_axes`].
+    /// The axes (rotation times scales) are needed only for projection. [`BlockState::update_axes`] computes them
+    /// later.
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
