@@ -30,9 +30,9 @@ pub(super) struct SampledPixels {
     x0: f64,
     /// Row in the image of the first pixel of the tile.
     y0: f64,
-    /// Offset of each column from the first one, pixels of the image.
+    /// Offset of each column of the tile from its first column, in pixels of the image.
     xs: TileLine,
-    /// Offset of each row from the first one, pixels of the image.
+    /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
     /// First and last value of `xs` (offset of a column, pixels of the image) in the left and in the right half of the
     /// tile, which have up to eight columns each.

@@ -81,7 +81,7 @@ impl PixelGrid {
     }
 }
 
-/// View of a camera, of which the pixels of a grid are rendered.
+/// View of a camera in which only the pixels of a grid are rendered.
 #[derive(Debug, Clone, Copy)]
 pub struct SampledView<'a> {
     /// Camera with the size of the full image.

@@ -107,8 +107,8 @@ pub(super) struct Splat {
     pub(super) shear: f32,
     /// Coefficient of dy² in the exponent of alpha, 1/pixels², where dy is the offset of a pixel row from the center.
     pub(super) falloff_y: f32,
-    /// Limit of the exponent (of 2) in alpha: pixels at which the exponent is below `−cutoff` are skipped, because
-    /// alpha is below 1/255 there.
+    /// Limit of the exponent (of 2) in the formula of alpha: pixels at which the exponent is below `−cutoff` are
+    /// skipped, because alpha is below 1/255 there.
     pub(super) cutoff: f32,
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
