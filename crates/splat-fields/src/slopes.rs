@@ -36,7 +36,7 @@ struct BilinearPatch<'a> {
     /// Channels of the texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b are the
     /// axes of the plane.
     corners: [&'a [f32]; 4],
-    /// Weights of the high texels along the axes a and b.
+    /// Weights of the texels with the higher index along the axes a and b.
     fractions: [f32; 2],
     /// Texels per unit of normalized coordinate along the axes a and b; 0 where coordinates are clamped.
     per_unit: [f32; 2],
