@@ -90,8 +90,8 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`: twice the bound, less what rounding the largest
-/// value to f32 may add to the error.
+/// Returns the quantization step for an error of at most `max_error`: twice the bound, minus the error that rounding
+/// the largest value to f32 may add.
 ///
 /// Values so large that their f32 spacing exceeds half the bound do not count; they may become exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
@@ -168,7 +168,7 @@ impl Multiples {
         self
     }
 
-    /// Returns the bits of all values as they are after decoding.
+    /// Returns the bits of all values as a decoder of the tile gets them.
     fn decoded(&self) -> Vec<u32> {
         let steps = [static_step(self.step, self.halvings), self.step];
         let tracks = self.moves.iter().cycle();
@@ -284,7 +284,7 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns the multiples of all tracks in the first frame, zigzag-coded.
+    /// Returns the multiples of the quantization step of all tracks in the first frame, zigzag-coded.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))

@@ -191,8 +191,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if it was written
-    /// before.
+    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if the tile was
+    /// written before.
     fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
@@ -213,8 +213,8 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error the writer is at
-    /// `start` again.
+    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error, the next record
+    /// is written at `start` again.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
