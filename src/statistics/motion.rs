@@ -191,8 +191,8 @@ impl MotionSums {
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
-    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if none of its turns counts. `life`
-    /// holds the number of frames in which each is alive.
+    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if no turn (second difference of its
+    /// positions) counts. `life` holds the number of frames in which each is alive.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()
@@ -238,9 +238,10 @@ fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns the square of the last step and the length of the turn about the previous frame, both per mean step. The
-/// positions are those in the current frame, the previous one and the one before. `step` and `step_before` are the
-/// durations of the last two steps, in mean steps. With fewer than three frames the values are meaningless.
+/// Returns the square of the last step and the length of the turn (second difference of the positions) about the
+/// previous frame, both per mean step. The positions are those in the current frame, the previous one and the one
+/// before. `step` and `step_before` are the durations of the last two steps, in mean steps. With fewer than three
+/// frames the values are meaningless.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);
