@@ -68,8 +68,8 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all their
-    /// proxies together, on all threads.
+    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all
+    /// proxies among them together, on all threads.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {

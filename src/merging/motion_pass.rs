@@ -42,7 +42,7 @@ pub struct PairMeter<'a> {
     /// Scan parameters. Used are `alpha_min`, the opacity from which a Gaussian is alive, and `motion`, which defines
     /// the steps between frames that count as motion.
     pub scan: &'a recipe::ScanParams,
-    /// Thresholds of test 3 (motion).
+    /// Thresholds of test 3 (motion) of merging.
     pub gate: MotionThresholds,
     /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
     /// time.

@@ -106,7 +106,7 @@ impl PointIndex {
 
 /// Returns the hash of the voxel with Morton code `number`. The eight voxels of a 2×2×2 cube follow one another in the
 /// table, so that the 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the
-/// highest bits first, so they are made different within a cube too.
+/// highest bits of hashes first, so these bits are made different within a cube too.
 fn hash(number: u64) -> u64 {
     let corner = number & 7;
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
