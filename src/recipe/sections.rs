@@ -133,9 +133,9 @@ pub struct SelectParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LowScorePolicy {
-    /// Gaussians that are not candidates are removed.
+    /// Gaussians that stage 1 does not choose as candidates are removed.
     Drop,
-    /// Stage 2 decides on Gaussians that are not candidates in the same way as on candidates.
+    /// Stage 2 decides on Gaussians that stage 1 does not choose in the same way as on the candidates that it chooses.
     Rescue,
 }
 
