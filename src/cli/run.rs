@@ -62,7 +62,7 @@ pub(super) fn run(cli: Cli) -> Result<()> {
     }
 }
 
-/// Runs `compress`; with `--list-stages` or `--dry-run`, prints the stages or the plan instead.
+/// Runs `compress`. With `--list-stages` or `--dry-run`, prints the stages or the plan instead and compresses nothing.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Most };
@@ -176,7 +176,7 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     print(&format!("{verdicts}{}\n", page.shown()))
 }
 
-/// Writes an HTML page and returns a line with its path, number of frames and size.
+/// Writes the HTML page that plays a model. Returns a line of text with its path, its number of frames and its size.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     tell_notes(&found.notes);
@@ -184,7 +184,7 @@ fn write_page(options: &ViewOptions) -> Result<String> {
     Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
 }
 
-/// Runs `convert`: writes an input in another format and prints what was written.
+/// Runs `convert`: writes an input in another format and prints a description of the output.
 fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let path =
         args.output.clone().or(args.output_option.clone()).ok_or_else(|| Error::internal("convert has no output"))?;
@@ -228,7 +228,7 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     print_as(args.json, || json_text(&converted), || converted.text())
 }
 
-/// Runs `info`: prints what an input holds, or checks or repairs a container.
+/// Runs `info`: prints the content of an input, or checks or repairs a container.
 fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
     let path = args.input.input.clone();
     if let Some(output) = args.repair {
@@ -289,7 +289,7 @@ fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
     Ok(())
 }
 
-/// Runs `selfcheck`. Fails if a case fails; the table is printed before.
+/// Runs `selfcheck`. Prints the table of its cases, then fails if a case failed.
 fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     let found = selfcheck::run();
     let printed = print_as(args.json, || json_text(&found), || found.text());
@@ -310,7 +310,7 @@ fn run_man(args: &Man) -> Result<()> {
     print(&format!("{}: {pages} pages\n", args.folder.shown()))
 }
 
-/// Returns the result of a complete run. For a run of one shard, prints which shard was computed and returns `None`.
+/// Returns the result of a complete run. If the run computed only one shard, prints the shard and returns `None`.
 fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
     match completion {
         Completion::Whole(found) => Ok(Some(found)),
