@@ -132,8 +132,8 @@ pub(super) struct ArchiveHeader {
 }
 
 impl ArchiveHeader {
-    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more, or the
-    /// whole file if it is shorter.
+    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more,
+    /// or the whole file if it is shorter.
     pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();

@@ -1,10 +1,10 @@
 //! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
 //! that keep the renders good, and entropy coded.
 //!
-//! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the
-//! content. Every quantized value is restored with an error of at most half a quantization step, every other byte
-//! exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors;
-//! tensors that nothing reads are restored as zeros.
+//! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back.
+//! Memory: twice the content. Every quantized value is restored with an error of at most half a quantization step,
+//! every other byte exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of
+//! their neighbors; tensors that nothing reads are restored as zeros.
 
 mod cloud;
 mod entropy;
@@ -91,7 +91,8 @@ struct Table {
     tensors: Vec<TensorEntry>,
     /// Number of extra bytes per Gaussian that belong to no attribute.
     beside: usize,
-    /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are stored.
+    /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are
+    /// stored.
     files: Vec<(String, usize)>,
 }
 

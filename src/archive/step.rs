@@ -32,8 +32,8 @@ pub fn step_size(k: i32) -> f64 {
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size` must be
-/// positive.
+/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size`
+/// must be positive.
 pub fn nearest_step_number(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }

@@ -1,8 +1,8 @@
-//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal: every frame whole, as textures
-//! that are compressed by LZ4.
+//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal: every frame whole, as
+//! textures that are compressed by LZ4.
 //!
-//! Layout, little-endian: "GSD1", u32 length of a JSON text, the JSON text, then for each frame u32 length and that many
-//! bytes of one LZ4 block. A block holds the textures of the table one after the other, each W × W pixels of four
+//! Layout, little-endian: "GSD1", u32 length of a JSON text, the JSON text, then for each frame u32 length and that
+//! many bytes of one LZ4 block. A block holds the textures of the table one after the other, each W × W pixels of four
 //! numbers, row by row. Bytes of a texture are shuffled: byte 0 of all pixels, then byte 1, and so on.
 //!
 //! | texture | numbers of a pixel | type | other pixels |

@@ -116,8 +116,8 @@ fn milliseconds(value: f64) -> String {
     format!("{value:.1} ms")
 }
 
-/// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more than
-/// 1% of the compressed model's bytes, as (name, bytes of the original, bytes of the compressed model). Returns an
+/// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more
+/// than 1% of the compressed model's bytes, as (name, bytes of the original, bytes of the compressed model). Returns an
 /// empty list if there are fewer than two such parts.
 pub(super) fn size_parts(size: &ByModel<ModelSize>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
