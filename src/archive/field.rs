@@ -18,8 +18,9 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Eighths of an octave by which the quantization step of a texel becomes finer when the squared interpolation weights
-/// of the Gaussians that read it double in sum. The squared error of the texel counts in proportion to this sum.
+/// Refinement of the quantization step of a texel that is read more, in eighths of an octave: the step becomes finer by
+/// this much when the squared interpolation weights, summed over the Gaussians that read the texel, double. The squared
+/// error of the texel counts in proportion to this sum.
 const FINER_PER_OCTAVE: i32 = 4;
 
 /// Class of a weight whose quantization step has no offset. The class of another weight is this number plus its offset

@@ -53,11 +53,11 @@ pub(super) struct Sections {
 /// Size of an archive in bytes, divided by purpose.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ArchiveSize {
-    /// Bytes of the Gaussians.
+    /// Number of bytes that the Gaussians take.
     pub cloud: u64,
-    /// Bytes of the deformation field.
+    /// Number of bytes that the deformation field takes.
     pub field: u64,
-    /// Bytes of everything else: header, table of contents, and bytes without entropy coding (`blobs`).
+    /// Number of bytes of everything else: header, table of contents, and bytes without entropy coding (`blobs`).
     pub rest: u64,
 }
 
