@@ -285,15 +285,15 @@ impl ContainerWriter {
 /// Change of a block of Gaussians within a frame block (consecutive frames). It decides which tiles are encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
-    /// Attributes that vary with time in the source are encoded for every frame. All others equal those of the frame
-    /// block before and are not encoded again.
+    /// Block that changes from frame to frame. Attributes that vary with time in the source are encoded for every
+    /// frame; the others equal those of the frame block before and are not encoded again.
     Varying,
-    /// All attributes are encoded, because they may differ from those of the frame block before: attributes that vary
-    /// with time in the source for every frame, others for the first frame.
+    /// Block that may differ from the frame block before in every attribute. Attributes that vary with time in the
+    /// source are encoded for every frame, the others for the first frame.
     New,
-    /// All frames of the frame block are equal, so only the first is encoded.
+    /// Block whose frames are all equal, so that only the first is encoded.
     Still,
-    /// All frames equal those of the frame block before, in which all frames were equal. No tile is encoded.
+    /// Block whose frames are all equal, and equal to those of the frame block before. No tile is encoded.
     Repeating,
 }
 

@@ -142,7 +142,7 @@ impl OutputKind {
     }
 }
 
-/// Checks that `path` can be the name of an output folder. `what`: the command that writes the folder, for messages.
+/// Checks that `path` can be the name of an output folder. `what` is the command that writes the folder, for messages.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] if the name has an ending like a file.
@@ -156,7 +156,7 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Checks that `path` can be the name of a container. `what`: the command that writes the container, for messages.
+/// Checks that `path` can be the name of a container. `what` is the command that writes the container, for messages.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] if the name has the ending of another kind of file.
