@@ -87,7 +87,7 @@ pub struct WorstPlace {
 /// Measurements and verdict of one failure mode: damage to one kind of Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FailureMode {
-    /// Name of the failure mode.
+    /// Name of the failure mode, as the page shows it.
     pub name: &'static str,
     /// Description of the kind of Gaussian that this failure mode concerns.
     #[serde(rename = "happens_to")]
