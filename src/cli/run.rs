@@ -89,7 +89,8 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     printed
 }
 
-/// Runs `score`.
+/// Runs the command `score`, which writes a table of statistics and scores. Prints its notes and the number of
+/// Gaussians that the recipe keeps.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
@@ -102,7 +103,8 @@ fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     ))
 }
 
-/// Runs `render`, with or without `--video`.
+/// Runs the command `render`, which writes images, or with `--video` a video. Prints its notes and a description of the
+/// output.
 fn run_render(mut args: Render, events: &Events) -> Result<()> {
     if let Some(output) = args.video.take() {
         let options = video_options(args, output, events);
@@ -124,7 +126,7 @@ fn run_render(mut args: Render, events: &Events) -> Result<()> {
     print(&format!("{}: {} view{plural}\n", options.output.shown(), rendered.views))
 }
 
-/// Runs `evaluate`.
+/// Runs the command `evaluate` and prints the comparison of the two models.
 fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     let as_json = args.json;
     let mut options =
@@ -135,21 +137,21 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     print_as(as_json, || json_text(&found), || found.text())
 }
 
-/// Runs `sweep`.
+/// Runs the command `sweep` and prints its measurements and the path of its page.
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(trade_off::PAGE_FILE));
     let found = sweep::sweep(&sweep_options(args, events))?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
-/// Runs `precision`.
+/// Runs the command `precision` and prints its measurements and the path of its page.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(report::precision::PAGE_FILE));
     let found = precision::precision(&precision_options(args, events)?)?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
-/// Runs `report`.
+/// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     let page = args.output.join(report::PAGE_FILE);
     let mut evaluate = evaluate_options(args.models, events);
@@ -184,7 +186,8 @@ fn write_page(options: &ViewOptions) -> Result<String> {
     Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
 }
 
-/// Runs `convert`: writes an input in another format and prints a description of the output.
+/// Runs the command `convert`: writes an input in another format and prints a description of the output. A frame stream
+/// on standard output is written without a description.
 fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let path =
         args.output.clone().or(args.output_option.clone()).ok_or_else(|| Error::internal("convert has no output"))?;
@@ -273,13 +276,13 @@ fn run_cache(args: &CacheFolder) -> Result<()> {
     print_as(args.json, || json_text(&listed), || cache::format_list(&listed))
 }
 
-/// Runs `demo`.
+/// Runs the command `demo` and prints its results.
 fn run_demo(args: Demo, events: &Events) -> Result<()> {
     let options = demo_options(args, events);
     print(&demo::run(&options)?.text(&options.output))
 }
 
-/// Runs `test-scene`.
+/// Runs the command `test-scene` and prints its results.
 fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
     let options = test_scene_options(args, events)?;
     print(&test_scene::run(&options)?.text())?;
@@ -297,14 +300,14 @@ fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     printed
 }
 
-/// Runs `completions`.
+/// Runs the command `completions`, which prints a completion script for a shell.
 fn run_completions(args: &Completions) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
     output::write(&script)
 }
 
-/// Runs `man`.
+/// Runs the command `man`, which writes manual pages. Prints their number.
 fn run_man(args: &Man) -> Result<()> {
     let pages = help::write_pages(&args.folder)?;
     print(&format!("{}: {pages} pages\n", args.folder.shown()))
