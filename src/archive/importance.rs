@@ -184,7 +184,7 @@ impl WeightLayer<'_> {
     }
 }
 
-/// Returns the mean square over all samples of each of the `width` values of a sample.
+/// Returns, for each of the `width` values that a sample has, its mean square over all samples.
 fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     let mut sums = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
@@ -194,7 +194,8 @@ fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     sums.iter().map(|sum| sum / count).collect()
 }
 
-/// Returns for each of the `width` values of a sample the fraction of samples in which it is above zero.
+/// Returns, for each of the `width` values that a sample has, the fraction of the samples in which this value is above
+/// zero.
 fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
     let mut counts = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
