@@ -185,7 +185,7 @@ fn half_bytes(value: f64) -> [u8; 2] {
     f16::from_f64(value.clamp(-most, most)).to_le_bytes()
 }
 
-/// Returns the Morton code of the position `place`, which is in scene units, within the bounds [`low`, `high`], which
+/// Returns the Morton code of the position `place`, which is in scene units, within the box from `low` to `high`, which
 /// are in centimeters.
 fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     let most = f64::from((1u32 << MORTON_BITS) - 1);

@@ -60,7 +60,8 @@ pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
 /// Writes the Gaussians `timed` to the file `path`, in the format `kind`. Returns notes for the user.
 ///
 /// # Errors
-/// Fails if the file cannot be written, or if `kind` cannot store when the Gaussians are visible ([`can_store`]).
+/// Fails if the file cannot be written, or if `kind` cannot store the kind of visibility that the Gaussians have
+/// ([`can_store`]).
 pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
     match kind {
         OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
