@@ -81,7 +81,8 @@ pub struct ReportOptions {
     pub overwrite: Replace,
 }
 
-/// Compares one or more compressed models with their original and writes the report.
+/// Compares one or more compressed models with their original and writes the report. Returns its data, unless the run
+/// computed only one shard (part of a divided stage).
 ///
 /// # Errors
 /// Fails if an input, the cameras, the photographs, the sweep or the output is invalid. Nothing is written then.
