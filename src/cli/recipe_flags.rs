@@ -52,7 +52,7 @@ impl RecipeFlags {
         RecipeRecord::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
     }
 
-    /// Checks that `path` exists, which the recipe file records as the value of `option`.
+    /// Checks that `path`, the value of `option` that the recipe file records, exists.
     ///
     /// # Errors
     /// Fails if the path does not exist; the message names the recipe file and the option.
