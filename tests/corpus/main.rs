@@ -22,7 +22,7 @@ static COUNTED: Mutex<()> = Mutex::new(());
 /// Number of copies of each saved input that are cut short (`CUTS`), and with changed bytes (`CHANGES`).
 const CUTS: u64 = 24;
 const CHANGES: u64 = 76;
-/// Number of times that this many damaged copies are made of each saved input named `whole`.
+/// Number of times that `CUTS` + `CHANGES` damaged copies are made of each saved input named `whole`.
 const ROUNDS_OF_WHOLE: u64 = 8;
 
 /// Returns path and content of each saved input of `entry`.
