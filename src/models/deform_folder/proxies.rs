@@ -106,8 +106,8 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for every Gaussian of `raw` the squared distance from the position that `wanted` returns, summed over
-/// `frames`.
+/// Returns for every Gaussian of `raw` the squared distance between its position and the position that `wanted` returns
+/// for it, summed over `frames`, in scene units squared.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -207,7 +207,8 @@ struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared differences between target and proxy in log scales and in unit quaternions, summed over frames.
+    /// Squared difference between target and proxy, in log scales and in unit quaternions, summed over frames and
+    /// components.
     off: f64,
 }
 

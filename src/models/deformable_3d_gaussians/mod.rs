@@ -18,13 +18,13 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Model folder of Deformable-3D-Gaussians.
+/// Model format of Deformable-3D-Gaussians: recognizes and opens a model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_network(found.path),
     open: |path, options| DeformFolder::open(path, options, DeformableMotion::new),
 };
 
-/// Attributes that are computed from the covariance.
+/// Attributes that are computed from the covariance of a deformed Gaussian: rotation and scales.
 const SHAPE: Attributes = Attributes::ROTATION.union(Attributes::LOG_SCALE);
 
 /// Motion model of Deformable-3D-Gaussians.

@@ -100,8 +100,8 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns `states` with quaternions of the same length as those of the leaders at the same frame. The field adds its
-/// delta to the stored quaternion, so the angle of rotation depends on the length.
+/// Returns the `states` of proxies with every quaternion scaled to the length that the quaternion of its leader has at
+/// the same frame. The field adds its delta to the stored quaternion, so the angle of rotation depends on the length.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);

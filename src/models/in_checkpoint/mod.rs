@@ -47,7 +47,7 @@ pub(super) trait ProxyRule: MotionModel {
     where
         Self: Sized;
 
-    /// Adds those settings to `hash` that determine the states of Gaussians but are not stored in the checkpoint.
+    /// Adds to `hash` the settings that determine the states of Gaussians but are not stored in the checkpoint.
     fn hash_settings(&self, hash: &mut Xxh3);
 
     /// Returns the motion model to use for frames at `times`; `None` if it does not depend on the times.
@@ -59,8 +59,8 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Returns the Gaussians `raw` in a form that files of players store without a fit; `None` if their motion has
-    /// another form.
+    /// Returns the Gaussians `raw` in the form in which player files (`.ftgs.ply`, `.tsog`) store motion, so that no
+    /// curves have to be fitted. Returns `None` if their motion does not have this form.
     fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
         let _ = raw;
         None

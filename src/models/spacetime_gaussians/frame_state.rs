@@ -101,8 +101,8 @@ impl MotionModel for Spacetime {
         Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY
     }
 
-    /// Returns the attributes that the optimizer can change: all, but for the full model without colors. Those are
-    /// computed from features, so no derivative leads to them.
+    /// Returns the attributes that the optimizer can change. These are all attributes for the lite model, and all but
+    /// the colors for the full model, because its colors are computed from features and have no derivatives.
     fn movable(&self) -> Attributes {
         if self.is_full { Attributes::all().difference(Attributes::SH) } else { Attributes::all() }
     }

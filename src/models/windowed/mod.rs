@@ -28,7 +28,7 @@ use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
 pub(super) use tsog::TSOG;
 
-/// Opened file of a player, whose Gaussians move as `L` says.
+/// Opened file of a player. The motion model `L` computes the states of its Gaussians.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
