@@ -45,7 +45,7 @@ pub(super) struct OpenTrack {
     pub(super) is_succeeded: bool,
 }
 
-/// Gaussian that may continue a track, and the cost of linking the two.
+/// Gaussian that may continue a track, and the cost of the link between the track and it.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) struct Candidate {
     pub(super) cost: f32,
@@ -103,8 +103,8 @@ impl OpenTrack {
         (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// Returns the Gaussians in `grid` that may continue the track. `round` limits their distance and difference: matching starts
-    /// with narrow limits and repeats with wider ones.
+    /// Returns the Gaussians in `grid` that may continue the track, because their cost by the rules of `round` is at
+    /// most 1.
     pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
         let mut candidates = Candidates::default();
         let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());
@@ -115,7 +115,7 @@ impl OpenTrack {
     }
 }
 
-/// The Gaussians that may continue a track at the least cost, in the order of cost.
+/// Gaussians that may continue a track, at most [`MAX_CANDIDATES`]: those with the lowest costs, in the order of cost.
 pub(super) struct Candidates {
     best: [Candidate; MAX_CANDIDATES],
 }
