@@ -192,8 +192,8 @@ pub struct CompressedModel {
 }
 
 impl CompressedModel {
-    /// Returns a model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with the exact
-    /// deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
+    /// Returns the compressed model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with
+    /// the exact deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
     pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
         CompressedModel {
             kept,
@@ -237,8 +237,8 @@ impl CompressedModel {
         self.kept.is_empty()
     }
 
-    /// Returns a model of only the Gaussians at the output indices `places` (increasing). The model must have no
-    /// proxies.
+    /// Returns the compressed model that consists of only the output Gaussians with the indices `places` (increasing).
+    /// The model must have no proxies.
     ///
     /// # Panics
     /// Panics if there is a proxy.
