@@ -334,12 +334,13 @@ pub struct ColumnInfo {
 pub(super) struct ModelFormat {
     /// Returns whether the input has this format, judged by the content of its files.
     pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame times
-    /// are set.
+    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame
+    /// times are set.
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
-/// Number of bytes at the start of a file by which its format is recognized; enough for the header of a `.compressed.ply`.
+/// Number of bytes at the start of a file by which its format is recognized; enough for the header of a
+/// `.compressed.ply`.
 const HEAD_BYTES: u64 = 512;
 
 /// Path that the user asked to open, with the facts by which its format is recognized.
@@ -407,7 +408,8 @@ pub struct TrainingConventions {
     /// Whether the rotations of 4D Gaussian Splatting use the convention from before 15 September 2024: the order of
     /// the axes of the 4D rotation matrix is not reversed.
     pub rot4d_unflipped: bool,
-    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means [`ZeroRotation::Drop`].
+    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means
+    /// [`ZeroRotation::Drop`].
     pub zero_rotation: Option<ZeroRotation>,
 }
 

@@ -1,5 +1,5 @@
-//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file, or a
-//! folder with one file per frame.
+//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file,
+//! or a folder with one file per frame.
 //!
 //! The files are decoded into PLY files in a temporary folder and opened there like PLY frames, so every command that
 //! reads PLY frames reads them too.

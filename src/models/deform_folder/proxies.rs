@@ -156,10 +156,11 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all stored parameters of the proxies `made` except their positions. Starts with the parameters of the leaders
-/// and, [`CORRECTIONS`] times, adds the mean over `frames` of target `wanted` minus state. One correction suffices if
-/// the network's output is simply added; quaternions that are not normalized need several. Each proxy keeps the scale
-/// and rotation with the smallest difference.
+/// Sets all stored parameters of the proxies `made` except their positions. The parameters start as those of the
+/// leaders. Then, [`CORRECTIONS`] times, the mean over `frames` of the target (returned by `wanted`) minus the proxy's
+/// state is added. One correction suffices if the network's output is simply added; quaternions that are not normalized
+/// need several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the
+/// target.
 fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,

@@ -188,7 +188,8 @@ impl NetworkMotionModel for DeformableMotion {
     }
 }
 
-/// Returns the position, the axis w and the translation v of a screw motion as vectors.
+/// Returns as vectors the position `x`, the axis w (the first three of the six network outputs) and the translation v
+/// (the last three) of a screw motion.
 fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }

@@ -16,7 +16,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Maximum number of frames over which the scales and opacities of proxies are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// Attributes that are constant in time.
+/// Attributes that are constant in time in this model format: scale and opacity.
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
 /// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. They are geometric means

@@ -139,9 +139,10 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in scene
-/// units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at the leader of
-/// the cluster (its most important member), the offset that the leader has from the mean at the reference frame is added.
+/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in
+/// scene units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at
+/// the leader of the cluster (its most important member), the offset that the leader has from the mean at the reference
+/// frame is added.
 fn deviations(
     model: &ModelFolder,
     reference: ReferenceFrame,

@@ -300,8 +300,8 @@ pub(super) fn write_frames<L: ProxyRule>(
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store the
-/// motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
+/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store
+/// the motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.

@@ -51,7 +51,8 @@ impl Sizes {
         self.frame_gaussians * self.file()
     }
 
-    /// Returns the number of frames that are packed into the container together; whole tiles if frames are small.
+    /// Returns the number of frames that are packed into the container at a time: the number that fits into
+    /// [`TOGETHER_BYTES`], at least 1, at most the frames of a tile.
     pub(super) fn frame_block(&self) -> usize {
         (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }

@@ -53,7 +53,7 @@ pub(super) struct Native {
     pub(super) period: f64,
 }
 
-/// Values of some Gaussians that do not depend on time.
+/// Values of a block of Gaussians that do not depend on time. They are computed once and used for every frame.
 #[derive(Debug)]
 pub(super) struct Slices {
     /// Velocity of each Gaussian, axis by axis, in scene units per unit of time.

@@ -36,7 +36,7 @@ struct WindowedModel<L: ProxyRule> {
     name: &'static str,
     /// Kind of output that has the format of this file.
     own: OutputKind,
-    /// Whether frames can be at any time.
+    /// Origin of the time stamps of frames: whether frames can be at any time.
     timing: TimeOrigin,
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
