@@ -38,7 +38,7 @@ pub(super) struct ComparedAppearance {
 }
 
 impl ComparedAppearance {
-    /// Returns the appearance of every Gaussian of a frame, in their order.
+    /// Returns the appearance of every Gaussian of the frame `state`, in the order of the Gaussians.
     pub(super) fn all_from_state(state: &Gaussians) -> Vec<ComparedAppearance> {
         (0..state.len())
             .into_par_iter()

@@ -85,8 +85,8 @@ impl LinkConfidence {
         }
     }
 
-    /// Removes the least certain links until the number of wrong ones among the rest is expected to be at most the
-    /// fraction [`MAX_WRONG`]. Returns the Gaussians whose links were removed.
+    /// Removes the least certain links until at most the fraction [`MAX_WRONG`] of the remaining links is expected to
+    /// be wrong. Returns the Gaussians whose links were removed.
     pub(super) fn drop_doubtful(mut self, links: &mut Links) -> Vec<u32> {
         self.doubtful.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let count = links.count();

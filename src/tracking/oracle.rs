@@ -246,8 +246,8 @@ impl SlowLinker {
 /// For each track a map from each frame in which it was seen to its Gaussian at that frame.
 pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
 
-/// Returns the position of a track at a frame after its first, observed or extrapolated, and the number of frames since
-/// it was last seen.
+/// Returns the position of a track at `frame`, observed or extrapolated, in scene units, and the number of frames since
+/// the track was last seen. `frame` must not be before the first frame of the track.
 fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
     let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
     let mut velocity: Option<[f64; 3]> = None;

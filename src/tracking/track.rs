@@ -28,8 +28,8 @@ pub(super) struct Round {
     pub(super) includes_missing: bool,
 }
 
-/// Track that may still continue: it had a Gaussian in the last frame or in one of the [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames
-/// before.
+/// Track that may still continue: it had a Gaussian in the frame that was linked last or in one of the
+/// [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames before that.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
