@@ -3,10 +3,11 @@
 //!
 //! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
 //! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … overlapping
-//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the visible time, and each width is three quarters of the spacing. The
-//! sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the
-//! opacity, add up where Gaussians overlap. So the depth of the Gaussian is distributed among the curves, by
-//! multiplicative updates that keep all depths positive (Richardson 1972, Lucy 1974).
+//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the
+//! visible time, and each width is three quarters of the spacing. The sum of such windows is 1 with an error of at most
+//! 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the
+//! depth of the Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive
+//! (Richardson 1972, Lucy 1974).
 
 use super::least_squares::polynomial;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
@@ -146,8 +147,9 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
 }
 
 /// Returns one curve whose logarithm of opacity is the parabola that fits the visible frames best, weighted by squared
-/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does not
-/// open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is long.
+/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does
+/// not open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is
+/// long.
 fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     let (first, last) = (track.times[0], track.times[track.len() - 1]);
     let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));

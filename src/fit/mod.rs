@@ -17,16 +17,17 @@ pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 /// Maximum error of a fit at every frame in which the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Maximum distance between positions, in units of the Gaussian's middle scale (of three).
+    /// Maximum distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale
+    /// (of three).
     pub position: f64,
-    /// Maximum angle between rotations, radians. Ignored for a nearly round Gaussian, whose log scales all differ by
-    /// less than 0.1.
+    /// Maximum angle between the rotations of the fit and of the Gaussian, radians. Ignored for a nearly round
+    /// Gaussian, whose log scales all differ by less than 0.1.
     pub rotation: f64,
-    /// Maximum difference of log scales (natural logarithms).
+    /// Maximum difference between the log scales (natural logarithms) of the fit and of the Gaussian.
     pub log_scale: f64,
-    /// Maximum difference of opacities, which are in [0, 1].
+    /// Maximum difference between the opacities, in [0, 1], of the fit and of the Gaussian.
     pub opacity: f64,
-    /// Maximum difference of SH coefficients.
+    /// Maximum difference between the SH coefficients of the fit and of the Gaussian.
     pub sh: f64,
     /// Opacity from which on all tolerances hold as given; 0 if they hold for every Gaussian. For a Gaussian of a lower
     /// opacity α, all of them but the tolerance of opacity are larger by the factor `full_opacity`/α. Used by
@@ -62,7 +63,8 @@ const FAR: [f64; 2] = [1.0, 0.1];
 pub struct FitError {
     /// Number of compared states (Gaussians × visible frames).
     pub states: u64,
-    /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
+    /// Sum, over all compared states, of the squared distance between the positions of the fit and of the Gaussian, in
+    /// units of the Gaussian's middle scale squared.
     squares: f64,
     /// Sum, over all compared states, of the squared difference between the opacity of the fit and that of the
     /// Gaussian.
@@ -71,9 +73,9 @@ pub struct FitError {
     visible: f64,
     /// Sum of the Gaussian's opacity over the compared states in which the fit is off by more than [`FAR`].
     far: f64,
-    /// Largest distance between positions, in units of the Gaussian's middle scale.
+    /// Largest distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale.
     pub position: f64,
-    /// Largest difference between the opacities of fit and Gaussian.
+    /// Largest difference between the opacities of the fit and of the Gaussian.
     pub opacity: f64,
 }
 
@@ -105,7 +107,8 @@ impl FitError {
         }
     }
 
-    /// Returns the root mean square distance between positions, in units of the Gaussian's middle scale.
+    /// Returns the root mean square distance between the positions of the fit and of the Gaussian, over all compared
+    /// states, in units of the Gaussian's middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
     }
@@ -117,7 +120,8 @@ impl FitError {
         self.far / self.visible.max(f64::MIN_POSITIVE)
     }
 
-    /// Returns the root mean square difference between the opacities of fit and Gaussian.
+    /// Returns the root mean square difference between the opacities of the fit and of the Gaussian, over all compared
+    /// states.
     pub fn opacity_rms(&self) -> f64 {
         (self.opacity_squares / self.states.max(1) as f64).sqrt()
     }
