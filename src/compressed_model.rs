@@ -18,12 +18,12 @@ pub struct ReferenceFrame {
 /// Cluster of input Gaussians that are merged into one output Gaussian, the proxy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cluster {
-    /// Index of the proxy in the output.
+    /// Index in the output of the proxy that replaces this cluster.
     pub output: u32,
-    /// Id of the leader, the member to which the others were joined.
+    /// Id of the leader: the member of this cluster to which the others were joined.
     pub leader: u32,
-    /// Ids of all members in increasing order, including the leader, each with its weight in the proxy. Weights sum to
-    /// 1.
+    /// Id and weight of each member of this cluster, in increasing order of ids, including the leader. A weight is the
+    /// share of the member in the proxy; the weights sum to 1.
     pub members: Vec<(u32, f64)>,
 }
 
