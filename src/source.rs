@@ -201,7 +201,8 @@ pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the attributes with derivatives: those that [`Deformation::jacobian`] can differentiate.
+    /// Returns the attributes of the stored parameters that an optimizer can change, because [`Deformation::jacobian`]
+    /// can differentiate by them.
     fn movable(&self) -> Attributes;
 
     /// Computes the state at `frame` of Gaussians with the parameters `stored`. Writes only the attributes `want` to

@@ -120,7 +120,8 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the merge class of Gaussian `id`. Gaussians of different classes are never merged.
+    /// Returns the merge class of Gaussian `id`, such as foreground or background. Gaussians of different classes are
+    /// never merged.
     fn class(&self, id: u32) -> u8 {
         let _ = id;
         0
@@ -316,7 +317,7 @@ pub struct ColumnInfo {
     pub max_error: f64,
     /// Number of tiles (blocks of Gaussians × frames) of the column.
     pub tiles: usize,
-    /// Number of tiles of the column that store one frame, as their values are the same in all frames.
+    /// Number of tiles of the column that store only one frame, because their values are the same in all frames.
     pub constant_tiles: usize,
     /// Number of tiles of the column that are stored without compression.
     pub raw_tiles: usize,

@@ -127,7 +127,8 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds the Gaussian if its cost is at most 1 and among the lowest costs so far.
+    /// Adds the Gaussian to the candidates if its cost is at most 1 and among the [`MAX_CANDIDATES`] lowest costs so
+    /// far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

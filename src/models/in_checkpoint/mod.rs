@@ -323,7 +323,7 @@ fn is_small(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= MAX_COPIED_BYTES)
 }
 
-/// Returns the paths of the small YAML files in the folder `root`, sorted by name.
+/// Returns the paths of the YAML files of at most [`MAX_COPIED_BYTES`] bytes in the folder `root`, sorted by name.
 pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     let is_small_yaml = |path: &Path| {
         path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)
