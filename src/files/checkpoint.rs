@@ -28,7 +28,7 @@ use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
 /// Maximum size in bytes of the pickle of a checkpoint. A pickle that describes ten thousand tensors has about one
-/// million.
+/// million bytes.
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;

@@ -76,7 +76,7 @@ pub(crate) struct Float {
 }
 
 impl Float {
-    /// The type that can be read without decoding: little-endian float32.
+    /// Type of values that can be read without decoding: little-endian float32.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
     /// Returns the type of the values if the header describes floating-point numbers in C order, else `None`.

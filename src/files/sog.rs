@@ -63,7 +63,7 @@ pub(crate) struct CodebookEntry {
     files: [String; 1],
 }
 
-/// Member `quats` of `meta.json`: name of an image that needs no range and no codebook.
+/// Member `quats` of `meta.json`: name of the image of rotations, whose bytes need no range and no codebook.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct ImageEntry {
     files: [String; 1],

@@ -44,7 +44,7 @@ pub(super) struct ListedImage {
 pub(super) struct Assembly {
     rig: Rig,
     memory_counter: MemoryCounter,
-    /// Indices in `rig.cameras`, hashed by the values of the camera.
+    /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, under its values.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
     /// (Camera index, split) pairs for which an image without a time has been added.

@@ -187,7 +187,8 @@ fn scale_intrinsics(
     (requested, [fx * x, fy * y, cx * x, cy * y])
 }
 
-/// Builds a camera from the name, image size and parameters of its COLMAP model.
+/// Builds a camera from the `name` of its COLMAP camera model, the image size in pixels and the parameters `values` of
+/// the model. `wrong` builds an error from the expected and the found value.
 ///
 /// # Errors
 /// Fails if the model is unknown, has distortion, or has another number of parameters than given, or if the image size

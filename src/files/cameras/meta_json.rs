@@ -122,7 +122,7 @@ impl Tables {
     }
 }
 
-/// Adds the images of `file` to `assembly`. Returns the number of frames of the file.
+/// Adds the images that `file` lists to `assembly`, as images of `split`. Returns the number of frames of the file.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;

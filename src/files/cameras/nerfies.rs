@@ -119,8 +119,8 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// Returns for every image of `ids` the splits to which it belongs: mostly one, for images that are not used none.
-/// `val` lists the test images and `train` the training images.
+/// Returns, for every image of `ids`, the splits to which the image belongs: usually one, and an empty list for an
+/// image that is not used. `val` lists the test images and `train` the training images.
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);

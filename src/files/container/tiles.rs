@@ -71,9 +71,9 @@ pub(super) struct TileReader<'a> {
     plan: ReadPlan,
     /// Last frame block for which the operating system was told which tiles will be read next.
     announced_block: Option<u32>,
-    /// Values kept of each column, in the order of [`Container::places`].
+    /// For each column (attribute), the values that this reader keeps in memory, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
-    /// Index of the frame block of the raw tiles in `raw_in_use`.
+    /// Index of the frame block that was read last; the pages in `raw_in_use` belong to its tiles.
     entered: u32,
     /// Mapped pages of raw (uncompressed) tiles in use, to be released when another frame block is entered.
     raw_in_use: TouchedPages,

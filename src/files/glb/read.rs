@@ -14,7 +14,8 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficients};
 
 /// Maximum length in bytes of the JSON text; the text of our own files takes 5 kB.
 const MAX_TEXT_BYTES: usize = 1 << 20;
-/// Smallest opacity and smallest standard deviation, so that their logarithms are finite.
+/// Minimum opacity, and (`MIN_SCALE`) minimum standard deviation in scene units, of a Gaussian after reading. Smaller
+/// values of the file are raised to the minimum, so that their logarithms are finite.
 const MIN_OPACITY: f64 = 1e-6;
 const MIN_SCALE: f64 = 1e-7;
 

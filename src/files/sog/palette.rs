@@ -11,7 +11,7 @@ use rayon::prelude::*;
 pub const MAX_ENTRIES: usize = 1 << 16;
 /// Number of iterations of k-means.
 const ITERATIONS: usize = 6;
-/// Number of vectors per group from which the groups are computed.
+/// Number of sampled vectors per group. The centroids of the groups are computed from this sample.
 const SAMPLES_PER_GROUP: usize = 64;
 
 /// Palette of vectors, and the index of the entry of each Gaussian.

@@ -23,12 +23,12 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Maximum number of files in an archive, and of bytes of its list of files.
+/// Maximum number of files in an archive, and (`MAX_LIST_BYTES`) maximum length in bytes of the list of these files.
 const MAX_ENTRIES: u64 = 1024;
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Number of the images of a file that are in memory together and have one pixel per Gaussian.
+/// Maximum number of images with one pixel per Gaussian that are in memory together while a file is read.
 const IMAGES: u64 = 6;
 /// Maximum number of pixels of the image of palette entries: 65536 entries of degree 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;

@@ -18,7 +18,7 @@ const GZIP: [u8; 2] = [0x1f, 0x8b];
 const HEADER_BYTES: usize = 16;
 /// Maximum SH degree of the format.
 const MAX_DEGREE: u8 = 4;
-/// Bit of the flags that says that extensions follow.
+/// Bit of the flags in the header that says that the file has extensions (optional data, which this reader skips).
 const HAS_EXTENSIONS: u8 = 2;
 /// Maximum number of bytes between the header and the table of streams of version 4.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;

@@ -138,7 +138,8 @@ fn windows_and_velocities_are_within_half_a_step() {
     assert!(all.iter().copied().eq(0..COUNT as u32), "{all:?}");
 }
 
-/// Returns the end of the pointer to component `axis` of a range: velocities have one more list around them.
+/// Returns the end of the JSON pointer to component `axis` of a range in `meta.json`. `member` is the beginning of the
+/// pointer. The range of velocities has one more list around it than other ranges.
 fn index(member: &str, axis: usize) -> String {
     if member.starts_with("/temporal") { format!("/0/{axis}") } else { format!("/{axis}") }
 }
