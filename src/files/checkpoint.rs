@@ -84,7 +84,7 @@ impl ValueType {
         })
     }
 
-    /// Returns the name that PyTorch gives the type.
+    /// Returns PyTorch's name of the value type, such as `float16`.
     pub(crate) fn name(self) -> &'static str {
         match self {
             ValueType::F16 => "float16",

@@ -182,7 +182,7 @@ impl FrameFiles {
         Ok(FrameFiles { frames, others })
     }
 
-    /// Returns the frames. Messages name `folder`.
+    /// Returns the paths of the frames in natural order. `folder` is the folder that was listed, for messages.
     ///
     /// # Errors
     /// Fails if the numbers of the frames have a gap or if an entry is not a file, unless `allow_gaps` is true.

@@ -216,7 +216,8 @@ pub(super) struct MemoryCounter {
 }
 
 impl MemoryCounter {
-    /// Counts `bytes` of memory that will be used for `what`, read from `place` in the file at `path`.
+    /// Adds `bytes`, a number of bytes that will be allocated, to the counted memory. Messages name the file `path`,
+    /// the `place` in it, and `what` the memory is for.
     ///
     /// # Errors
     /// Fails if the memory limit for reading would be exceeded.

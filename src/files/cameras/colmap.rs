@@ -298,7 +298,8 @@ impl<'a> Binary<'a> {
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }
 
-    /// Returns an error about the bytes at the present position of the file.
+    /// Returns an error that says which content was `expected` at the present position of the file, and which was
+    /// `found`.
     fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("byte {}", self.at), expected, found)
     }

@@ -45,7 +45,7 @@ pub(super) struct FrameValues {
 }
 
 impl FrameValues {
-    /// Returns the index, along the first axis of `values`, of the values for `frame`.
+    /// Returns the index, along the first axis of `values`, of the values for `frame`; `None` if they are not stored.
     fn place(&self, frame: usize) -> Option<usize> {
         match self.frames[..] {
             [] if self.block.contains(&frame) => Some(0),

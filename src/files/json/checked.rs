@@ -33,7 +33,7 @@ pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Number of bytes of the buffer that the parser has taken, and (`checked`) that have been checked.
+    /// Number of bytes of the buffer that the parser has taken, and (`checked`) number of bytes that have been checked.
     taken: usize,
     checked: usize,
     /// Number of bytes of the buffer that have been read from the file. Up to 3 bytes of an incomplete character may

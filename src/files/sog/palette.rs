@@ -14,10 +14,10 @@ const ITERATIONS: usize = 6;
 /// Number of sampled vectors per group. The centroids of the groups are computed from this sample.
 const SAMPLES_PER_GROUP: usize = 64;
 
-/// Palette of vectors, and the index of the entry of each Gaussian.
+/// Palette of vectors (SH coefficients), and for each Gaussian the index of its palette entry.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Palette {
-    /// Number of components of a vector.
+    /// Number of components of a vector (palette entry).
     pub width: usize,
     /// Entries one after the other, `width` numbers each.
     pub centroids: Vec<f32>,

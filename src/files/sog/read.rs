@@ -246,7 +246,8 @@ struct DecodedPalette {
     values: Vec<f32>,
 }
 
-/// Decodes the image `image` of palette entries, which `entry` describes.
+/// Decodes the palette of SH coefficients. `image` holds the palette entries, and `entry` is the member of `meta.json`
+/// that describes them. Fails if the image does not fit the description. Messages call the archive `path`.
 fn read_palette(entry: &PaletteEntry, image: &RgbaImage, path: &Path) -> Result<DecodedPalette> {
     let name = &entry.files[0];
     let degree = (1..=MAX_SH_DEGREE).find(|&degree| image.width == 64 * (sh_coefficients(degree) - 1));

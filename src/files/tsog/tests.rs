@@ -86,7 +86,8 @@ fn rewrite(path: &Path, method: CompressionMethod, change: impl FnOnce(&mut Valu
     out.finish().unwrap();
 }
 
-/// Returns the row of `found` for each row of `written`, by the nearest position; files are in Morton order.
+/// Returns, for each Gaussian of `written`, the index of the Gaussian of `found` with the nearest position. The order
+/// differs because files are written in Morton order.
 fn matched(written: &TimedGaussians, found: &TimedGaussians) -> Vec<u32> {
     let nearest = |row: usize| {
         let at = written.params.gaussians.position.row::<3>(row);
