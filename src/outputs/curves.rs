@@ -15,8 +15,8 @@ use crate::passes::{gather_all, map_tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Writes all frames of `source` to the `.splatv` file `path`. Returns a message with the errors of positions and
-/// opacities.
+/// Writes all frames of `source` to the `.splatv` file `path`. Returns a message with the errors of the fitted
+/// positions and opacities.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.

@@ -1,4 +1,5 @@
-//! Tests of `sweep`: every point is what `compress` and `evaluate` give, and only the curves remain.
+//! Tests of `sweep`: every point has the figures that `compress` and `evaluate` give, and the output folder has only
+//! the curves.
 
 use std::fs;
 

@@ -59,8 +59,8 @@ pub(super) struct Head {
     pub(super) output: Linear,
 }
 
-/// Deformation field of a 4DGaussians model. It can be evaluated for any block of Gaussians at any time. The results
-/// for a Gaussian have the same bits in every block.
+/// Deformation field of a 4DGaussians model. It can be evaluated for any block of Gaussians at any time. The result for
+/// a Gaussian has the same bits whichever other Gaussians are in its block.
 #[derive(Debug, Clone)]
 pub struct Field {
     pub(super) config: FieldConfig,

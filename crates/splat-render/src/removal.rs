@@ -33,8 +33,8 @@ impl RemovalError {
     /// 320×256 pixels.
     pub const SUM_UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. `contrast_floor` is the field of
-    /// this name.
+    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. For `contrast_floor` see
+    /// [`RemovalError::contrast_floor`].
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
@@ -69,7 +69,8 @@ impl RemovalError {
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds the removal errors in `other`. Gaussian k of `other` is Gaussian `rows[k]` of `self`.
+    /// Adds the removal errors of `other`, which holds only some of the Gaussians: Gaussian k of `other` is Gaussian
+    /// `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -84,7 +85,7 @@ impl RemovalError {
     }
 }
 
-/// Computes the removal error of every splat of a tile while the tile is blended.
+/// Receiver of weights that computes the removal error of every splat of a tile while the tile is blended.
 pub(super) struct RemovalSink<'a> {
     /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
     /// them times the transmittance.
@@ -96,7 +97,8 @@ pub(super) struct RemovalSink<'a> {
 }
 
 impl BlendSink for RemovalSink<'_> {
-    /// Color of a splat, and the sum of squared pixel changes so far.
+    /// Color of a splat, and the sum so far of the squared changes of pixels that the removal of this splat would
+    /// cause.
     type Accumulator<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {

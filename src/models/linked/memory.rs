@@ -13,7 +13,8 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
 /// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
-/// Bytes of memory per Gaussian of a frame for the list of its rows, and for a copy of this list for sorting.
+/// Bytes of memory per Gaussian of a frame for its entry (track and row) in a list, and for a copy of this list for
+/// sorting.
 const BYTES_PER_ROW: u64 = 16;
 /// Number of frames of which renders are compared before and after tracks are joined or attributes are made constant.
 pub(super) const SAMPLED_FRAMES: usize = 3;
@@ -50,7 +51,8 @@ impl Sizes {
         self.frame_gaussians * self.file()
     }
 
-    /// Returns the number of frames that are packed into the container together; whole tiles if frames are small.
+    /// Returns the number of frames that are packed into the container at a time: the number that fits into
+    /// [`TOGETHER_BYTES`], at least 1, at most the frames of a tile.
     pub(super) fn frame_block(&self) -> usize {
         (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }

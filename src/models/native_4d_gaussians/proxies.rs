@@ -107,8 +107,8 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Returns, for each fitted value (one SH coefficient of one color channel over time), the least-squares coefficients of the
-    /// constant and of the first `terms` cosine waves; the other coefficients are 0.
+    /// Returns, for each fitted value (one SH coefficient of one color channel over time), the least-squares
+    /// coefficients of the constant and of the first `terms` cosine waves; the other coefficients are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];

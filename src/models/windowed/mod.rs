@@ -28,7 +28,7 @@ use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
 pub(super) use tsog::TSOG;
 
-/// Opened file of a player, whose Gaussians move as `L` says.
+/// Opened file of a player. The motion model `L` computes the states of its Gaussians.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
@@ -36,7 +36,7 @@ struct WindowedModel<L: ProxyRule> {
     name: &'static str,
     /// Kind of output that has the format of this file.
     own: OutputKind,
-    /// Whether frames can be at any time.
+    /// Origin of the time stamps of frames: whether frames can be at any time.
     timing: TimeOrigin,
     /// Repairs and guesses made while opening.
     notes: Vec<String>,

@@ -255,8 +255,8 @@ impl FrameSource for ModelFolder {
         }))
     }
 
-    /// Returns a reader that computes the Gaussians block by block: a model computes each frame on its own, so that a reader
-    /// of all Gaussians has nothing to keep in memory.
+    /// Returns a reader that computes the Gaussians block by block: a model computes each frame on its own, so that a
+    /// reader of all Gaussians has nothing to keep in memory.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
