@@ -90,10 +90,11 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`: twice the bound, minus the error that rounding
+/// Returns the quantization step for an error of at most `max_error`: twice `max_error`, minus the error that rounding
 /// the largest value to f32 may add.
 ///
-/// Values so large that their f32 spacing exceeds half the bound do not count; they may become exceptions.
+/// Values so large that their f32 spacing exceeds half of `max_error` do not count as the largest value. They may be
+/// stored unquantized, as exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -298,8 +299,9 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile. `multiples` holds
-    /// the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile.
+    /// `multiples` holds the quantized value of each track in this frame, in quantization steps; `bytes` are the
+    /// decompressed bytes of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);

@@ -192,9 +192,9 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the result of
-    /// a range of units. Without a work folder the results go to a scratch file in the folder `scratch`. Returns the
-    /// units of every shard with the file content that holds their result.
+    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the
+    /// result of a range of units. Without a work folder the results go to a scratch file in the folder `scratch`.
+    /// Returns the units of every shard with the file content that holds their result.
     ///
     /// # Errors
     /// Fails where [`Cache::compute_in_shards`] fails.
@@ -238,12 +238,12 @@ impl Cache {
         }
     }
 
-    /// Returns the number n of shards in which the caller must compute and join `stage`, whose full result is not
-    /// stored. Shards that are stored already need not be computed. If n is 1, the caller computes the whole stage.
+    /// Decides how the caller obtains the result of `stage`, whose full result is not stored, and returns the number n
+    /// of shards to join. The caller computes those of the n shards that are not stored. n = 1 is the whole stage.
     ///
-    /// A run that is limited to one shard of several gets such a number only if all shards of a division are stored, or
-    /// if there is no work folder. Otherwise this function computes and stores the requested shard with `make`, unless
-    /// `find` finds it stored, and fails with [`Error::ShardDone`].
+    /// If the run is limited to one of several shards, this function returns n only if all n shards are stored, or 1 if
+    /// there is no work folder. Otherwise it computes and stores the requested shard with `make`, unless `find` finds
+    /// it stored, and fails with [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,

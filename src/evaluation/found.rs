@@ -149,8 +149,8 @@ pub struct Evaluation {
     /// Scores of the compressed model against the original.
     #[serde(flatten)]
     pub loss: Comparison,
-    /// Scores inside and outside the rig of the training cameras; `None` if no view is outside, or if the cameras have no
-    /// training views.
+    /// Mean scores of the views from directions between the training cameras, and of the views outside; `None` if no
+    /// view is outside, or if the cameras have no training views.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rig_sides: Option<RigSides>,
     /// Scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
@@ -229,8 +229,8 @@ impl Comparison {
 }
 
 impl RigSides {
-    /// Averages the scores `views`. `is_outside` states for each view whether it is outside the rig. Returns `None` if
-    /// none is.
+    /// Averages the scores `views` on each side of the rig. `is_outside` states for each view whether it is outside.
+    /// Returns `None` if no view is outside.
     pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<RigSides> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);

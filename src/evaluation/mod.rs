@@ -11,7 +11,6 @@ pub mod method;
 pub mod precision;
 pub mod trade_off;
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -30,13 +29,13 @@ use crate::journal::records::RenderTime;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, MemoryPlan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, FrameView, Gaussians, Split};
+use crate::model::{Camera, FrameView, Gaussians};
 use crate::models::InputModel;
 use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch};
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
-use crate::scene::outside::RigCone;
+use crate::scene::outside::{RigCone, training_cameras};
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
@@ -190,7 +189,8 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and ends.
+    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and
+    /// ends.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -318,12 +318,8 @@ impl ModelPair {
     /// Returns for every view whether it is outside the rig of the training cameras; `false` for all if there are none.
     fn outside_views(&self) -> Vec<bool> {
         let rig = &self.scene.rig;
-        let training = rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera);
-        let training: BTreeSet<u32> = training.collect();
-        let cameras: Vec<Camera> = training.iter().map(|&camera| rig.cameras[camera as usize].clone()).collect();
-        let cone = RigCone::new(&cameras);
-        let is_outside = |view: &FrameView| !training.is_empty() && cone.is_outside(&rig.cameras[view.camera as usize]);
-        self.views.iter().map(is_outside).collect()
+        let cone = RigCone::new(&training_cameras(rig));
+        self.views.iter().map(|view| cone.is_outside(&rig.cameras[view.camera as usize])).collect()
     }
 
     /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.

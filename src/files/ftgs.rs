@@ -86,7 +86,7 @@ pub struct FtgsHeader {
     /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the
     /// sequence.
     pub min_deviation: f64,
-    /// Minimum opacity of a Gaussian at any time.
+    /// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower.
     pub opacity_floor: f64,
     /// Whether the velocities are used; if not, the Gaussians do not move.
     uses_velocity: bool,

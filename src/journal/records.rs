@@ -61,7 +61,7 @@ pub enum SavedCost {
     },
     /// Values of attributes that are the same in every frame and were therefore not read again.
     Values {
-        /// Number of bytes of these values.
+        /// Number of bytes of the values that were not read again.
         bytes: u64,
     },
 }
@@ -200,7 +200,7 @@ pub struct ShDegreeSummary {
     /// Mean PSNR of renders with all SH degrees compared with renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
-    /// Minimum PSNR that a lower degree in `tried` needed to be used, dB.
+    /// PSNR, dB, below which an SH degree in `tried` was rejected.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }

@@ -60,8 +60,7 @@ pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
 /// Writes the Gaussians `timed` to the file `path`, in the format `kind`. Returns notes for the user.
 ///
 /// # Errors
-/// Fails if the file cannot be written, or if `kind` cannot store the kind of visibility that the Gaussians have
-/// ([`can_store`]).
+/// Fails if the file cannot be written, or if the format cannot store when the Gaussians are visible ([`can_store`]).
 pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
     match kind {
         OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
@@ -222,6 +221,7 @@ mod tests {
     use crate::files::splatv::rows::ZeroRotation;
     use crate::files::tsog::read::read_tsog;
     use crate::limits::ReadLimit;
+    use crate::outputs::tests::{blended, opacities_near};
     use crate::passes::gather_all;
 
     /// Evaluates the formulas of the player: returns position and opacity of every Gaussian at the time `time`.
@@ -253,19 +253,10 @@ mod tests {
             let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             let lines = shown(&file, frame as f64 / 29.0);
             for id in 0..300 {
-                let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
-                if visible < 0.1 {
-                    continue;
-                }
-                let at = state.position.row::<3>(id).map(f64::from);
-                let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
-                let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
-                let near = lines.iter().filter(|(place, _)| distance(*place) < 0.5);
-                let depth: f64 = near.clone().map(|(_, alpha)| (1.0 - alpha).ln()).sum();
+                let Some((visible, near)) = opacities_near(&state, id, &lines) else { continue };
                 seen += 1;
-                missing += i32::from(near.filter(|(_, alpha)| *alpha > MIN_VISIBLE_OPACITY).count() == 0);
-                // Other Gaussians may lie there too, so the test can detect only a missing contribution.
-                too_faint += i32::from(1.0 - depth.exp() < visible - 0.1);
+                missing += i32::from(near.iter().all(|&alpha| alpha <= MIN_VISIBLE_OPACITY));
+                too_faint += i32::from(blended(&near) < visible - 0.1);
             }
         }
         assert!(seen > 3000 && 100 * missing < seen && 20 * too_faint < seen, "{missing} {too_faint} of {seen}");

@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{policy_digest, policy_meta_element};
 use crate::model::{Camera, Rig, Split};
-use crate::scene::outside::{MIN_ANGLE, RigCone};
+use crate::scene::outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
@@ -107,13 +107,9 @@ const RIG_CAMERAS: usize = 64;
 /// Returns the directions in which the training cameras of `rig` see the scene. Returns `None` if there are no such
 /// cameras, or if they are all around the scene.
 pub fn training_rig(rig: &Rig) -> Option<PageRig> {
-    let mut used: Vec<u32> =
-        rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera).collect();
-    used.sort_unstable();
-    used.dedup();
-    let step = used.len().div_ceil(RIG_CAMERAS).max(1);
-    let cameras: Vec<Camera> = used.iter().step_by(step).map(|&camera| rig.cameras[camera as usize].clone()).collect();
-    let cone = RigCone::new(&cameras);
+    let all = training_cameras(rig);
+    let step = all.len().div_ceil(RIG_CAMERAS).max(1);
+    let cone = RigCone::new(&all.into_iter().step_by(step).collect::<Vec<Camera>>());
     let faces: Vec<[f64; 3]> = cone.faces().iter().map(|face| face.to_array()).collect();
     (!faces.is_empty()).then(|| PageRig { focus: cone.focus().to_array(), faces, tolerance: MIN_ANGLE.sin() })
 }
@@ -263,8 +259,8 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the HTML of the page up to its chunks. `chunks` has the digests of scripts that the content security policy
-/// allows besides the scripts of the page itself.
+/// Returns the HTML of the page before its chunks (scripts with encoded frames). `chunks` has the digests of the
+/// chunks, which the content security policy allows besides the scripts of the page itself.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();

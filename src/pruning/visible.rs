@@ -40,8 +40,9 @@ impl VisibilityStage {
         looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false })
     }
 
-    /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan,
-    /// contribution C and peak W of every Gaussian, and the views being rendered.
+    /// Estimates the memory and time that this stage needs for the input `work`. Memory holds the statistics of the
+    /// scan, the contribution C and the peak W (largest weight in one pixel) of every Gaussian, and the views being
+    /// rendered.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (mut per_gaussian, mut fixed) =
             work.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
@@ -61,9 +62,8 @@ impl VisibilityStage {
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
         let stride = self.pixel_stride(work.pixels, work.gaussians as usize);
-        let on_grid = Workload { pixels: work.pixels / u64::from(stride.get()).pow(2), ..*work };
         let seconds = work.reading_seconds(work.gaussian_count(), frames as f64)
-            + on_grid.render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
+            + work.on_grid(stride).render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
         ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 

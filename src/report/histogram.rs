@@ -31,7 +31,7 @@ pub struct ByFate<T> {
 }
 
 impl<T> ByFate<T> {
-    /// Returns a mutable reference to the value for `fate`.
+    /// Returns a mutable reference to the value for the Gaussians with the fate `fate` (kept, merged or dropped).
     pub fn get_mut(&mut self, fate: Fate) -> &mut T {
         match fate {
             Fate::Kept => &mut self.kept,

@@ -1,13 +1,14 @@
 //! Cameras outside the rig of a scene: viewing directions that none of its cameras, and no path between two of them,
 //! has. In a player or in VR, people move there.
 
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 
 use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
 use super::between::{SplitMix64, cameras_between, meeting_point};
-use crate::model::{Camera, ViewSchedule};
+use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of the views from cameras outside the rig, which no data set has.
 const VIEW_NUMBER: u32 = u32::MAX;
@@ -56,8 +57,8 @@ impl RigCone {
         self.focus
     }
 
-    /// Returns the inward unit normals of the flat faces of the cone. A direction is inside if its dot product with none
-    /// of them is negative. Takes time in proportion to the cube of the number of cameras.
+    /// Returns the inward unit normals of the flat faces of the cone. A direction is inside if its dot product with
+    /// none of them is negative. Takes time in proportion to the cube of the number of cameras.
     pub fn faces(&self) -> Vec<DVec3> {
         let all = &self.directions;
         let pairs = (0..all.len()).flat_map(|i| (0..all.len()).filter(move |&j| j != i).map(move |j| (i, j)));
@@ -135,9 +136,10 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
 }
 
 /// Returns at most `count` cameras outside the rig of `cameras`. Each is one of `cameras`, or a camera between two of
-/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from the
-/// mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly anything
-/// outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every run.
+/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from
+/// the mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly
+/// anything outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in
+/// every run.
 pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
     let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
@@ -162,6 +164,13 @@ pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec
     found
 }
 
+/// Returns the cameras of `rig` that took training views.
+pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
+    let training = rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera);
+    let training: BTreeSet<u32> = training.collect();
+    training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
+}
+
 /// Returns `camera` turned by `turn` about the point `focus`. The scene looks from there as it does from `camera` after
 /// a turn the other way.
 fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
@@ -176,15 +185,14 @@ impl Scene {
     /// 1 + `reach`, and every frame gets `reach` times as many views outside the rig as it has inside. Adds none if
     /// `reach` is 0 or the rig has no outside (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
-        let most = self.schedule.max_views_per_frame();
-        let cameras = match reach > 0.0 {
-            true => cameras_outside(&self.rig_cameras(), (CAMERAS_PER_VIEW * most).min(MAX_CAMERAS), 1.0 + reach),
-            false => Vec::new(),
-        };
+        if reach == 0.0 {
+            return;
+        }
+        let rig_cameras = self.rig_cameras();
+        let count = (CAMERAS_PER_VIEW * self.schedule.max_views_per_frame()).min(MAX_CAMERAS);
+        let cameras = cameras_outside(&rig_cameras, count, 1.0 + reach);
         if cameras.is_empty() {
-            if reach > 0.0 {
-                self.notes.push("outside: the cameras leave no views outside their rig to be added".to_owned());
-            }
+            self.notes.push("outside: the cameras leave no views outside their rig to be added".to_owned());
             return;
         }
         let (first, count) = (self.schedule.cameras.len(), cameras.len());
@@ -196,8 +204,8 @@ impl Scene {
             let outside = more.map(|k| (VIEW_NUMBER, (first + k % count) as u32));
             schedule.push_frames(1, &views.iter().copied().chain(outside).collect::<Vec<_>>());
         }
-        let of_rig = self.rig_cameras().len();
-        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {of_rig}"));
+        let rig_count = rig_cameras.len();
+        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {rig_count}"));
         (self.schedule, self.outside) = (schedule, reach);
         self.depend_on_views();
     }

@@ -116,8 +116,8 @@ impl ScanView {
     }
 }
 
-/// Adds the coverage of one view to `sums`, [`BLOCK_LANES`] Gaussians at a time. The compiler inlines this function
-/// into every function that is compiled for one instruction set.
+/// Adds the covered pixels times opacity of each Gaussian in one view to `sums`, [`BLOCK_LANES`] Gaussians at a time.
+/// Inlined, so that each instruction set has its own compiled version.
 #[inline(always)]
 fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let n = planes.opacity.len();

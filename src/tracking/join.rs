@@ -31,7 +31,7 @@ const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 /// after the [`Linker`] has linked it.
 pub struct Joiner([JoinedTracks; 2]);
 
-/// Pairs of tracks that are or may be joined by one of the two rules.
+/// Pairs of tracks that are or may be joined by one of the two [`RULES`].
 struct JoinedTracks {
     rule: &'static Round,
     /// Pairs of tracks that may still be joined, in the order of the later track, then of cost.

@@ -41,7 +41,7 @@ pub struct FieldConfig {
 /// Source of the mask, a factor on all stored attributes of a Gaussian except the rotation.
 #[derive(Debug, Clone)]
 pub(super) enum Mask {
-    /// The field has no mask; stored attributes are used as they are.
+    /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
     None,
     /// The last head of the field computes the mask, which varies with time.
     Head,

@@ -72,8 +72,8 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means ended)
-    /// for others.
+    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means
+    /// ended) for others.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -104,8 +104,8 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the accumulator with which the blending of `splat` begins.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a group
-    /// covers the groups after it as well.
+    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a
+    /// group covers the groups after it as well.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
@@ -152,7 +152,7 @@ impl BlendSink for ColorSink {
 pub(super) struct Weight {
     /// Sum of the weights over the sampled pixels: at most 256 terms, added in f32 in a fixed order.
     pub(super) sum: f32,
-    /// Largest weight in any sampled pixel.
+    /// Largest weight alpha · transmittance of the splat in any sampled pixel.
     pub(super) max: f32,
 }
 
@@ -322,7 +322,8 @@ impl TileFootprint {
         footprint
     }
 
-    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is drawn.
+    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is
+    /// drawn.
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));

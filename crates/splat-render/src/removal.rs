@@ -13,15 +13,17 @@ use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
 /// Removal error of N Gaussians, summed over any number of views: Σ over pixels of w²·(‖c − b‖² + floor²), where w is
-/// the weight of the Gaussian in the pixel, c its color, and b the color behind it.
+/// the weight of the Gaussian in the pixel, c its color, and b the color behind it. The floor
+/// ([`RemovalError::contrast_floor`]) is a minimum color difference, so that removing a Gaussian in front of its own
+/// color counts as an error too.
 ///
 /// With a floor of 0 this is the squared error of renders without that Gaussian, except for alphas clamped at 0.99 and
 /// pixels that end early. Errors do not depend on the order of views or the number of threads. Memory: 8 bytes per
 /// Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
-    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed per
-    /// 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
+    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed
+    /// per 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
     /// Floor: color difference (norm over red, green, blue) whose square is added to the squared difference between a
     /// Gaussian and what is behind it.

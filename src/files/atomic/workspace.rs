@@ -37,7 +37,7 @@ pub(super) const CONTENT: &str = "content";
 /// Name, in the workspace, of an earlier output folder that is being replaced. Files in it that its summary does not
 /// list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name, in the workspace, of files and folders that only have to be deleted.
+/// Name, in the workspace, that a file or folder gets when it only has to be deleted.
 pub(super) const DISCARDED: &str = "discarded";
 /// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
@@ -49,7 +49,8 @@ const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 /// moves a result to its final name holds the guard, so that a signal is handled either before or after the move.
 static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
-/// Locks and returns the table of the workspaces of this process.
+/// Locks the table of the hidden output folders (workspaces) of this process and returns it: the identity of each
+/// folder by its path.
 pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
     // The table is consistent even if a thread panicked while holding the lock.
     LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)

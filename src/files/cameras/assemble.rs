@@ -51,7 +51,7 @@ pub(super) struct Assembly {
     untimed: HashSet<(u32, Split)>,
     /// Path of every camera file, and the index in `rig.shots` of its first image.
     files: Vec<(PathBuf, usize)>,
-    /// Number of images added so far from the file begun last.
+    /// Number of images added so far from the camera file that is being read (the last of `files`).
     taken: usize,
     /// Whether every image so far has a stated view number.
     are_views_stated: bool,

@@ -209,9 +209,9 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`: those that
-/// `expected` lists for it, or its old ones if it is not listed. The check fails if two tensors share one shape object
-/// and only one of them changes.
+/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. For tensors
+/// in `expected` the listed ones are right, for others the old ones. Both cannot hold if two tensors share one object
+/// for their shape and only one of them changes; then the check fails.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

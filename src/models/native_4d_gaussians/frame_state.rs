@@ -71,7 +71,7 @@ pub(super) struct Slices {
 /// Velocity, variance in time and spatial covariance of one four-dimensional Gaussian.
 pub(super) struct Slice {
     pub(super) velocity: [f64; 3],
-    /// Variance in time, Σ_tt, without `prefilter`.
+    /// Variance in time, Σ_tt, before the constant `prefilter` is added.
     pub(super) variance: f64,
     /// Spatial covariance Σ: xx xy xz yy yz zz; `None` if it follows from the stored scales and rotation.
     pub(super) covariance: Option<[f64; 6]>,

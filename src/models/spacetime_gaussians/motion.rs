@@ -119,7 +119,8 @@ pub(super) struct TargetState {
     pub(super) time: f64,
     pub(super) weight: f64,
     pub(super) position: [f64; 3],
-    /// Quaternion wxyz; the caller chooses its sign.
+    /// Rotation at this time, quaternion wxyz. q and −q are the same rotation but are fitted differently; the caller
+    /// chooses the sign that is nearest to the mean motion.
     pub(super) rotation: [f64; 4],
 }
 

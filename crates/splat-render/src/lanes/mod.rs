@@ -151,8 +151,8 @@ pub(super) trait EvenOddSums: Copy {
     fn combined(self) -> Self::Sums;
 }
 
-/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps the pair
-/// after all groups with even index, and again after all with odd index.
+/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps
+/// the pair after all groups with even index, and again after all with odd index.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]
@@ -169,7 +169,7 @@ impl<V: Sums> EvenOddSums for [V; 2] {
     }
 }
 
-/// Eight sums: sum k adds lane k of every group that was added.
+/// Eight sums, one per SIMD lane: sum k is the total of lane k over all groups of eight values that were added.
 pub(super) trait Sums: Copy {
     /// Returns sums that are all 0.
     fn zero() -> Self;
