@@ -201,17 +201,29 @@ pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the attributes of the stored parameters that an optimizer can change, because [`Deformation::jacobian`]
-    /// can differentiate by them.
+    /// Returns the attributes of the stored parameters that an optimizer can change, because
+    /// [`DeformedGaussians::jacobian`] can differentiate by them.
     fn movable(&self) -> Attributes;
 
-    /// Computes the state at `frame` of Gaussians with the parameters `stored`. Writes only the attributes `want` to
-    /// `out`, and resizes these.
-    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()>;
+    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. What does not depend on
+    /// time is computed here, once.
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a>;
+}
+
+/// Gaussians with given stored parameters, whose states a [`Deformation`] computes at any frame.
+pub trait DeformedGaussians {
+    /// Computes the state of all Gaussians at `frame`. Writes only the attributes `want` to `out`, and resizes these.
+    ///
+    /// # Errors
+    /// Fails if there is no such frame or the model cannot be evaluated.
+    fn state(&self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
     /// Returns the derivatives of the attributes `want` of the state at `frame` with respect to the same attributes of
-    /// `stored`.
-    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian>;
+    /// the stored parameters.
+    ///
+    /// # Errors
+    /// Fails if there is no such frame or the model cannot be evaluated.
+    fn jacobian(&self, frame: usize, want: Attributes) -> Result<Jacobian>;
 }
 
 /// Decoder of features that take the place of colors. Features are blended without a background, and the decoder

@@ -267,6 +267,11 @@ pub struct MemoryProfile {
     /// Bytes of memory per Gaussian of the derivative (Jacobian) of frame states with respect to stored parameters; 0
     /// if states change by as much as stored parameters do.
     pub jacobian: u64,
+    /// Bytes of memory per Gaussian of the values that [`Deformation::with_params`] computes once for all frames; 0 if
+    /// it computes none.
+    ///
+    /// [`Deformation::with_params`]: crate::source::Deformation::with_params
+    pub prepared: u64,
     /// Bytes per Gaussian of a memory-mapped file that is read as a whole.
     pub file: u64,
     /// Bytes of memory that do not depend on the number of Gaussians.
@@ -293,6 +298,7 @@ impl MemoryProfile {
             reader: 8,
             reduced: 0,
             jacobian: 0,
+            prepared: 0,
             file: 0,
             fixed: 0,
             frame_block,

@@ -168,6 +168,7 @@ impl InputModel for PlySequence {
             reader: 4,
             reduced: 0,
             jacobian: 0,
+            prepared: 0,
             // Besides its attributes, a Gaussian has normals and other extra properties in the file: about 24 bytes.
             file: state_bytes(self.info().sh_degree, Attributes::all()) + 24,
             fixed: 0,

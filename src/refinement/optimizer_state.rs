@@ -221,13 +221,15 @@ impl<'a> OptimizerState<'a> {
         let Some(deformation) = self.deformation else { return Ok(()) };
         self.bake_delta();
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
+        let gaussians = deformation.with_params(&self.stored);
         for &frame in &self.frames {
             let want = if linearized.is_empty() { Attributes::all() } else { self.varying };
             self.now.present = None;
-            deformation.state(frame, &self.stored, want, &mut self.now.state)?;
-            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.step_params.columns)?;
+            gaussians.state(frame, want, &mut self.now.state)?;
+            self.now.jacobian = gaussians.jacobian(frame, self.step_params.columns)?;
             linearized.push(&mut self.now)?;
         }
+        drop(gaussians);
         self.linearized = linearized.finish()?;
         (self.steps, self.reevaluated) = (0, true);
         Ok(())

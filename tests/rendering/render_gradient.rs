@@ -301,7 +301,7 @@ fn stored_positions_get_gradients_through_the_field() {
     let stored = deformation.stored();
     let state_of = |stored: &StoredParams| {
         let mut state = Gaussians::zeros(0, stored.gaussians.sh_degree());
-        deformation.state(frame, stored, Attributes::all(), &mut state).unwrap();
+        deformation.with_params(stored).state(frame, Attributes::all(), &mut state).unwrap();
         state
     };
     let state = state_of(stored);
@@ -319,7 +319,7 @@ fn stored_positions_get_gradients_through_the_field() {
         ..*picture
     });
     let direct = found.clone();
-    deformation.jacobian(frame, stored, Attributes::all()).unwrap().pull_back(&mut found);
+    deformation.with_params(stored).jacobian(frame, Attributes::all()).unwrap().pull_back(&mut found);
 
     let loss = |stored: &StoredParams| -> f64 {
         // A step of the position changes other attributes through the field, which the derivative by the position head

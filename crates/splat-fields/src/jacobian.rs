@@ -9,7 +9,7 @@
 //! [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
-use super::field::{Field, Head, LayerBuffers, Mask, add_frequencies, position_time_features};
+use super::field::{Field, Head, LayerBuffers, Mask, PreparedPositions, add_frequencies, position_time_features};
 use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
@@ -32,7 +32,8 @@ impl Field {
     /// Computes the derivative ∂state/∂raw at `time`, for the attributes `want` of a block of Gaussians. The state is
     /// the attributes at that time: the stored ones `raw` plus the delta that the field predicts.
     ///
-    /// `raw` must contain positions, and rotations if `want` contains them. A derivative that is not finite becomes 0;
+    /// `raw` must contain positions, and rotations if `want` contains them. `prepared` is what [`Field::prepare`]
+    /// returned for these positions. A derivative that is not finite becomes 0;
     /// for a position, whose derivative is I + ∂delta/∂position, this concerns only ∂delta/∂position.
     ///
     /// If the field has a mask (option `static_mlp` or `empty_voxel`), masks and deltas count as constant: the position
@@ -40,7 +41,13 @@ impl Field {
     ///
     /// # Errors
     /// Fails if `time` is not finite.
-    pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Attributes) -> Result<Jacobian> {
+    pub fn jacobian(
+        &self,
+        raw: &Gaussians,
+        prepared: &PreparedPositions,
+        time: f64,
+        want: Attributes,
+    ) -> Result<Jacobian> {
         if !time.is_finite() {
             return Err(Error::internal(format!(
                 "time of a deformation field: expected a finite number, found {time}"
@@ -61,7 +68,7 @@ impl Field {
         };
         if !held.is_empty() {
             let mut deltas = Deltas::new(raw.sh_degree());
-            self.deltas(&self.prepare(&raw.position), time, held, &mut LayerBuffers::default(), &mut deltas)?;
+            self.deltas(prepared, time, held, &mut LayerBuffers::default(), &mut deltas)?;
             deltas.jacobian(&raw.rotation, &mut found);
         }
         Ok(found)

@@ -308,7 +308,7 @@ fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
 /// stored attributes `raw`.
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
-    field.jacobian(raw, time, gradients.columns()).unwrap().pull_back(&mut pulled);
+    field.jacobian(raw, &field.prepare(&raw.position), time, gradients.columns()).unwrap().pull_back(&mut pulled);
     pulled
 }
 
@@ -398,15 +398,16 @@ fn derivative_of_masked_positions_is_the_mask() {
 fn derivatives_do_not_depend_on_blocks() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain_config() }, 2);
     let raw = random_gaussians(300);
-    let whole = field.jacobian(&raw, 0.6, Attributes::all()).unwrap();
+    let whole = field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::all()).unwrap();
     for block in [1, 16, 37] {
         let rows: Vec<u32> = (0..300).collect();
         for ids in rows.chunks(block) {
-            let found = field.jacobian(&raw.pick(ids), 0.6, Attributes::all()).unwrap();
+            let raw = raw.pick(ids);
+            let found = field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::all()).unwrap();
             assert!(found == whole.pick(ids), "blocks of {block}");
         }
     }
-    assert!(field.jacobian(&raw, 0.6, Attributes::SH).unwrap() == Default::default());
+    assert!(field.jacobian(&raw, &field.prepare(&raw.position), 0.6, Attributes::SH).unwrap() == Default::default());
 }
 
 #[test]

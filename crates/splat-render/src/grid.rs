@@ -3,7 +3,6 @@
 use std::num::NonZeroU32;
 
 use super::convention::TILE;
-use super::project::TileRect;
 use splat_core::Camera;
 
 /// Grid of pixels of an image: those whose column and row have given remainders modulo the stride.
@@ -52,32 +51,28 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Converts the rectangle `rect` of tiles of the image to tiles of the grid, which have 16×16 pixels of the grid
-    /// each. Returns the tiles that contain a pixel of the grid that lies in `rect`, at most `half[0]` pixels from `at`
-    /// horizontally and at most `half[1]` vertically. `size` is the size of the image in pixels. The result may be
-    /// empty.
-    pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
-        if self.stride == 1 {
-            return rect;
-        }
-        let range = |axis: usize, start: u32, end: u32| {
-            // A float-to-integer cast saturates: values below 0 become 0.
-            let first = start.saturating_mul(TILE).max((at[axis] - half[axis]).ceil() as u32);
-            let last = end
-                .saturating_mul(TILE)
-                .min(size[axis])
-                .min(((at[axis] + half[axis]).floor() as u32).saturating_add(1));
-            let [first, last] = [first, last].map(|pixel| self.count_before(axis, pixel));
-            (first / TILE, if first < last { last.div_ceil(TILE) } else { first / TILE })
-        };
-        let (x0, x1) = range(0, rect.x0, rect.x1);
-        let (y0, y1) = range(1, rect.y0, rect.y1);
-        TileRect { x0, x1, y0, y1 }
+    /// Converts the range `[start, end]` of tiles of the image along one axis (0: columns, 1: rows) to tiles of the
+    /// grid, which have 16×16 pixels of the grid each; ends are exclusive. Returns the tiles that contain a pixel of the
+    /// grid that lies in the range and at most `half` pixels from `at`. `size` is the size of the image along the axis,
+    /// in pixels. The result is empty if its end does not exceed its start.
+    ///
+    /// Tiles are integers, given as f64 so that the compiler vectorizes the calling loop.
+    #[inline(always)]
+    pub(super) fn tiles(self, axis: usize, [start, end]: [f64; 2], at: f64, half: f64, size: u32) -> [f64; 2] {
+        let tile = f64::from(TILE);
+        // NaN becomes 0.
+        let first_pixel = (at - half).ceil().max(start * tile);
+        let end_pixel = ((at + half).floor().max(0.0) + 1.0).min(end * tile).min(f64::from(size));
+        let [first, end] = [first_pixel, end_pixel].map(|pixel| self.count_before(axis, pixel));
+        let first_tile = (first / tile).floor();
+        [first_tile, if first < end { (end / tile).ceil() } else { first_tile }]
     }
 
     /// Returns the number of columns (`axis` 0) or rows (`axis` 1) of the grid before column or row `pixel` of the image.
-    fn count_before(self, axis: usize, pixel: u32) -> u32 {
-        pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
+    /// `pixel` is an integer; the result is exact below 2⁵².
+    #[inline(always)]
+    fn count_before(self, axis: usize, pixel: f64) -> f64 {
+        ((pixel - f64::from(self.phase[axis])) / f64::from(self.stride)).ceil().max(0.0)
     }
 }
 

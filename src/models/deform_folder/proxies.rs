@@ -116,7 +116,7 @@ fn squared_distances<L: NetworkMotionModel>(
 ) -> Result<Vec<f64>> {
     let (mut off, mut state) = (vec![0.0; raw.len()], Gaussians::zeros(0, 0));
     for (k, &frame) in frames.iter().enumerate() {
-        Deformation::state(model, frame, raw, Attributes::POSITION, &mut state)?;
+        model.with_params(raw).state(frame, Attributes::POSITION, &mut state)?;
         for (row, off) in off.iter_mut().enumerate() {
             *off += (position(&state, row) - wanted(k, row)).length_squared();
         }
@@ -134,8 +134,8 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
     for (&frame, wanted) in frames.iter().zip(wanted) {
-        Deformation::state(model, frame, raw, Attributes::POSITION, &mut state)?;
-        let slopes = Deformation::jacobian(model, frame, raw, Attributes::POSITION)?;
+        model.with_params(raw).state(frame, Attributes::POSITION, &mut state)?;
+        let slopes = model.with_params(raw).jacobian(frame, Attributes::POSITION)?;
         let slopes = slopes.column(Attributes::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
             // Plane 3·i + j holds the derivative of component i by component j, so reading columns gives the transpose.
@@ -177,7 +177,7 @@ fn shape<L: NetworkMotionModel>(
         let mut all = vec![StateDifference::default(); made.len()];
         let mut state = Gaussians::zeros(0, own.sh_degree());
         for (&frame, wanted) in frames.iter().zip(wanted) {
-            Deformation::state(model, frame, made, Attributes::all(), &mut state)?;
+            model.with_params(made).state(frame, Attributes::all(), &mut state)?;
             all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
             if wanted.sh.len() == made.len() {
                 // SH coefficients are compared at one frame only: their change over time is the same at all frames.

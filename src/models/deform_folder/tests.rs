@@ -305,10 +305,10 @@ fn jacobian_agrees_with_finite_differences() {
     for (_, model) in &models {
         let deformation = model.source().deformation().unwrap();
         let (stored, want) = (deformation.stored(), deformation.movable());
-        let jacobian = deformation.jacobian(3, stored, want).unwrap();
+        let jacobian = deformation.with_params(stored).jacobian(3, want).unwrap();
         let state = |raw: &crate::model::StoredParams| {
             let mut out = Gaussians::zeros(0, 1);
-            deformation.state(3, raw, want, &mut out).unwrap();
+            deformation.with_params(raw).state(3, want, &mut out).unwrap();
             out
         };
         // The step is small compared to 1/512 and large compared to the f32 error of a difference.

@@ -70,6 +70,7 @@ impl InputModel for Params {
             // Scales and opacities of proxies (Gaussians that replace merged ones), and their indices.
             reduced: state_bytes(0, Attributes::all()) + 16,
             jacobian: 0,
+            prepared: 0,
             file: 0,
             fixed: 0,
             frame_block: 0,

@@ -193,6 +193,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
             reader: whole + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+            prepared: 0,
             // The training stores two optimizer values per parameter in addition.
             file: 3 * whole,
             fixed: 0,

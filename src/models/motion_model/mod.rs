@@ -17,7 +17,9 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
-use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
+use crate::source::{
+    BlockReader, Deformation, DeformedGaussians, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads, SharedCounter,
+};
 
 pub(super) use proxies::propose_proxies;
 
@@ -284,7 +286,6 @@ impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
     }
 }
 
-/// Computes frame states from stored parameters, a block of Gaussians at a time.
 impl<L: MotionModel> Deformation for MotionModelFrames<L> {
     fn stored(&self) -> &StoredParams {
         &self.raw
@@ -294,34 +295,49 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
         self.motion_model.movable()
     }
 
-    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        let time = self.frame_time(frame)?;
-        let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let parts = BlockSlices::split(out, want, ids.len());
-        ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
-            || Gaussians::zeros(0, self.info.sh_degree),
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a> {
+        Box::new(MovingGaussians { model: self, stored, ids: (0..stored.len() as u32).collect() })
+    }
+}
+
+/// Gaussians with given stored parameters. Computes their states a block of Gaussians at a time, and keeps nothing
+/// between frames.
+struct MovingGaussians<'a, L> {
+    model: &'a MotionModelFrames<L>,
+    stored: &'a StoredParams,
+    /// Indices of all Gaussians.
+    ids: Vec<u32>,
+}
+
+impl<L: MotionModel> MovingGaussians<'_, L> {
+    /// Returns the Gaussians `ids`, prepared for evaluation.
+    fn block(&self, ids: &[u32]) -> PreparedBlock<L> {
+        PreparedBlock::new(self.model.motion_model(), self.stored.pick(ids))
+    }
+}
+
+impl<L: MotionModel> DeformedGaussians for MovingGaussians<'_, L> {
+    fn state(&self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+        let time = self.model.frame_time(frame)?;
+        let parts = BlockSlices::split(out, want, self.ids.len());
+        self.ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
+            || Gaussians::zeros(0, self.model.info.sh_degree),
             |state, (ids, parts)| {
-                PreparedBlock::new(self.motion_model(), stored.pick(ids)).state(
-                    self.motion_model(),
-                    time,
-                    want,
-                    state,
-                )?;
+                self.block(ids).state(self.model.motion_model(), time, want, state)?;
                 parts.write(state, want);
                 Ok::<_, Error>(())
             },
         )
     }
 
-    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian> {
-        let time = self.frame_time(frame)?;
-        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+    fn jacobian(&self, frame: usize, want: Attributes) -> Result<Jacobian> {
+        let time = self.model.frame_time(frame)?;
         let of_block = |ids: &[u32]| {
-            let PreparedBlock { raw, prepared } = PreparedBlock::<L>::new(self.motion_model(), stored.pick(ids));
-            self.motion_model.jacobian(time, &raw, &prepared, want)
+            let PreparedBlock { raw, prepared } = self.block(ids);
+            self.model.motion_model.jacobian(time, &raw, &prepared, want)
         };
-        let blocks: Vec<Jacobian> = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect::<Result<_>>()?;
-        Ok(Jacobian::joined(&blocks, ids.len()))
+        let blocks: Vec<Jacobian> = self.ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect::<Result<_>>()?;
+        Ok(Jacobian::joined(&blocks, self.ids.len()))
     }
 }
 

@@ -70,7 +70,7 @@ fn every_reader_returns_the_same_bits() {
     assert_eq!(some, all.pick(&ids));
     assert_eq!(gather(&model, &ids, 2, Attributes::all()).unwrap(), some);
     let mut stored = Gaussians::zeros(0, 0);
-    Deformation::state(&model, 2, model.stored(), Attributes::all(), &mut stored).unwrap();
+    model.with_params(model.stored()).state(2, Attributes::all(), &mut stored).unwrap();
     assert_eq!(stored, all);
     let id = GAUSSIANS_PER_BLOCK + 5;
     let [x, v] = [model.raw().gaussians.position.row::<3>(id), model.raw().format_specific.row::<3>(id)];

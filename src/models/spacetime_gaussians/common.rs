@@ -17,6 +17,7 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
         reader: whole + 16 + 8,
         reduced: 2 * whole,
         jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+        prepared: 0,
         file: whole + 24,
         fixed: 0,
         frame_block: 0,

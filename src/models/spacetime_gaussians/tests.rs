@@ -173,11 +173,11 @@ fn opacity_jacobian_agrees_with_finite_differences() {
         let mut raw = deformation.stored().clone();
         raw.gaussians.opacity_logit.planes_mut().iter_mut().for_each(|x| *x += by);
         let mut state = Gaussians::zeros(COUNT, 0);
-        deformation.state(frame, &raw, Attributes::OPACITY, &mut state).unwrap();
+        deformation.with_params(&raw).state(frame, Attributes::OPACITY, &mut state).unwrap();
         state.opacity_logit
     };
     for frame in 0..TIMES.len() {
-        let found = deformation.jacobian(frame, deformation.stored(), Attributes::all()).unwrap();
+        let found = deformation.with_params(deformation.stored()).jacobian(frame, Attributes::all()).unwrap();
         assert_eq!(found.column(Attributes::POSITION).width(), 0);
         let (more, less) = (at(frame, step), at(frame, -step));
         for i in 0..COUNT {

@@ -13,7 +13,7 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 use crate::passes::{BlockSlices, BlockwiseReader, GAUSSIANS_PER_BLOCK};
-use crate::source::{BlockReader, Deformation, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
+use crate::source::{BlockReader, Deformation, DeformedGaussians, FrameSource, Ids, ReadPlan, Reads, SharedCounter};
 use rayon::prelude::*;
 
 use super::cfg_args::ModelConfig;
@@ -270,7 +270,6 @@ impl FrameSource for ModelFolder {
     }
 }
 
-/// Computes frame states from stored parameters, a block of Gaussians at a time.
 impl Deformation for ModelFolder {
     fn stored(&self) -> &StoredParams {
         &self.canonical
@@ -282,18 +281,44 @@ impl Deformation for ModelFolder {
         if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
 
-    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        let time = self.frame_time(frame)?;
+    fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a> {
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let nothing = || Gaussians::zeros(0, self.info.sh_degree);
-        let parts = BlockSlices::split(out, want, ids.len());
-        ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(parts).try_for_each_init(
-            || (nothing(), nothing(), LayerBuffers::default(), Deltas::new(self.info.sh_degree)),
-            |(raw, state, scratch, deltas), (ids, parts)| {
-                for column in (want | Attributes::POSITION).iter() {
-                    *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
-                }
-                self.field.deltas(&self.field.prepare(&raw.position), time, want, scratch, deltas)?;
+        let position = &stored.gaussians.position;
+        let prepare = |ids: &[u32]| self.field.prepare(&position.pick(ids));
+        let prepared = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(prepare).collect();
+        Box::new(PreparedModel { model: self, stored, ids, prepared })
+    }
+}
+
+/// Gaussians with given stored parameters. Computes their states a block of Gaussians at a time.
+struct PreparedModel<'a> {
+    model: &'a ModelFolder,
+    stored: &'a StoredParams,
+    /// Indices of all Gaussians.
+    ids: Vec<u32>,
+    /// What the field computes without time, for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians.
+    prepared: Vec<PreparedPositions>,
+}
+
+impl PreparedModel<'_> {
+    /// Copies the attributes `want` of the stored parameters of the Gaussians `ids` to `raw`.
+    fn copy_stored(&self, ids: &[u32], want: Attributes, raw: &mut Gaussians) {
+        for column in want.iter() {
+            *raw.column_mut(column) = self.stored.gaussians.column(column).pick(ids);
+        }
+    }
+}
+
+impl DeformedGaussians for PreparedModel<'_> {
+    fn state(&self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+        let (field, sh_degree, time) = (&self.model.field, self.model.info.sh_degree, self.model.frame_time(frame)?);
+        let nothing = || Gaussians::zeros(0, sh_degree);
+        let parts = BlockSlices::split(out, want, self.ids.len());
+        self.ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(&self.prepared).zip(parts).try_for_each_init(
+            || (nothing(), nothing(), LayerBuffers::default(), Deltas::new(sh_degree)),
+            |(raw, state, scratch, deltas), ((ids, prepared), parts)| {
+                self.copy_stored(ids, want | Attributes::POSITION, raw);
+                field.deltas(prepared, time, want, scratch, deltas)?;
                 deltas.apply(raw, want, state);
                 parts.write(state, want);
                 Ok::<_, Error>(())
@@ -301,18 +326,16 @@ impl Deformation for ModelFolder {
         )
     }
 
-    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian> {
-        let time = self.frame_time(frame)?;
-        let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let of_block = |ids: &[u32]| {
-            let mut raw = Gaussians::zeros(0, self.info.sh_degree);
-            for column in (want & Attributes::ROTATION | Attributes::POSITION).iter() {
-                *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
-            }
-            self.field.jacobian(&raw, time, want)
+    fn jacobian(&self, frame: usize, want: Attributes) -> Result<Jacobian> {
+        let time = self.model.frame_time(frame)?;
+        let of_block = |(ids, prepared): (&[u32], &PreparedPositions)| {
+            let mut raw = Gaussians::zeros(0, self.model.info.sh_degree);
+            self.copy_stored(ids, want & Attributes::ROTATION | Attributes::POSITION, &mut raw);
+            self.model.field.jacobian(&raw, prepared, time, want)
         };
-        let blocks: Vec<Jacobian> = ids.par_chunks(GAUSSIANS_PER_BLOCK).map(of_block).collect::<Result<_>>()?;
-        Ok(Jacobian::joined(&blocks, ids.len()))
+        let blocks = self.ids.par_chunks(GAUSSIANS_PER_BLOCK).zip(&self.prepared);
+        let blocks: Vec<Jacobian> = blocks.map(of_block).collect::<Result<_>>()?;
+        Ok(Jacobian::joined(&blocks, self.ids.len()))
     }
 }
 

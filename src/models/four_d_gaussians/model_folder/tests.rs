@@ -273,11 +273,11 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
-    let jacobian = model.jacobian(1, model.stored(), Attributes::all()).unwrap();
+    let jacobian = model.with_params(model.stored()).jacobian(1, Attributes::all()).unwrap();
     jacobian.pull_back(&mut by_raw);
     for threads in [1, 2, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let again = pool.install(|| model.jacobian(1, model.stored(), Attributes::all())).unwrap();
+        let again = pool.install(|| model.with_params(model.stored()).jacobian(1, Attributes::all())).unwrap();
         assert!(again == jacobian, "{threads} threads");
     }
     for column in Attributes::all().difference(Attributes::POSITION).iter() {
@@ -313,5 +313,5 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
     // derivative is not unique.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
-    assert!(model.jacobian(3, model.stored(), Attributes::all()).is_err(), "there are three frames");
+    assert!(model.with_params(model.stored()).jacobian(3, Attributes::all()).is_err(), "there are three frames");
 }
