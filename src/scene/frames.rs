@@ -7,8 +7,9 @@ use crate::model::SequenceInfo;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
 impl Scene {
-    /// Makes the Gaussians `ids` (in increasing order) invisible in all later reads of the scene's frames, and makes
-    /// visible all that were hidden before. The cache keys of stage results include these ids.
+    /// Makes the Gaussians with the ids `ids` (in increasing order) invisible in all later reads of the scene's frames.
+    /// Gaussians that an earlier call made invisible become visible again, unless they are in `ids`. The cache keys of
+    /// stage results include these ids.
     pub fn set_absent(&self, ids: &[u32]) {
         self.work.set_absent(ids);
         self.absent.set(ids);
