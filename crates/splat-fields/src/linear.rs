@@ -34,7 +34,8 @@ pub(super) struct Linear {
 
 impl Linear {
     /// Reads the layer from the tensors `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`. If `outputs`
-    /// is `None`, any number of outputs is accepted. Messages about malformed tensors show `why`.
+    /// is `None`, any number of outputs is accepted. Errors show `why`, the reason why the tensors are expected with
+    /// these shapes.
     pub(super) fn load(
         lookup: Lookup<'_>,
         name: &str,

@@ -94,7 +94,7 @@ struct NetworkScratch {
 }
 
 impl PredictedMotion {
-    /// Returns the motion of the attribute `which` for writing.
+    /// Returns a mutable reference to the predicted motion of the attribute `which`.
     fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
             Attributes::POSITION => &mut self.warp,
@@ -440,8 +440,8 @@ fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
     }
 }
 
-/// Returns the derivative with respect to the position along `axis`, from the derivatives `gradient` with respect to
-/// the encoded position.
+/// Returns the derivative of a network output with respect to the position along `axis`, from its derivatives
+/// `gradient` with respect to the encoded position.
 #[inline(always)]
 fn axis_derivative(axis: usize, position_encoding: &[CacheLine], gradient: &[CacheLine]) -> CacheLine {
     let mut sum = gradient[axis];

@@ -103,7 +103,8 @@ pub(super) struct PreparedPlanes {
 }
 
 impl FeaturePlane {
-    /// Reads a plane from the tensor `name`. Returns the plane and its number of channels.
+    /// Reads a plane from the tensor `name`. Returns the plane and its number of channels. If `channels` is `None`, any
+    /// number of channels is accepted.
     fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
         let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
         let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];

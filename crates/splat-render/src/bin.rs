@@ -70,8 +70,8 @@ impl Bins {
         self.next_tile = 0;
     }
 
-    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are kept in
-    /// memory.
+    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are in memory
+    /// already and are not computed again.
     pub(super) fn rewind(&mut self) {
         self.next_tile = 0;
     }

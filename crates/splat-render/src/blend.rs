@@ -72,8 +72,8 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means
-    /// ended) for others.
+    /// Returns the transmittance of each pixel before any splat is blended: 1 for pixels of the render, and a negative
+    /// value for the others, which marks them as ended.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -81,7 +81,7 @@ impl SampledPixels {
     }
 }
 
-/// Values of one splat at the pixels of one vector.
+/// Values of one splat at neighboring pixels, one pixel per vector lane.
 #[derive(Clone, Copy)]
 pub(super) struct Fragment<V: Lanes> {
     /// Alpha (opacity of the splat at the pixel), at most 0.99.
@@ -90,7 +90,7 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) blended: V::Mask,
     /// Weight of the splat in the pixel, alpha · transmittance; 0 where the splat is not blended.
     pub(super) weight: V,
-    /// Transmittance behind the splat, never 0. May be negative where the weight is 0.
+    /// Transmittance behind the splat, never 0. Negative in pixels that have ended, where the weight is 0.
     pub(super) transmittance_after: V,
     /// Offset along x of the pixel from the largest alpha of the splat in this row, pixels: dx − shear·dy of [`Splat`].
     pub(super) offset_x: V,
@@ -104,8 +104,8 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the accumulator with which the blending of `splat` begins.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a
-    /// group covers the groups after it as well.
+    /// Adds `fragment`, the values of the splat at the [`LANES`] pixels of group `group`, to the accumulator, and
+    /// returns the accumulator. A vector that is wider than a group also has the pixels of the following groups.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
@@ -273,8 +273,8 @@ impl BlendKernel {
 /// the memory that it reads.
 const LOOKAHEAD: usize = 16;
 
-/// Footprint of one splat in the rows of a tile. In each row, alpha is the opacity times 2 to the power of `level −
-/// falloff_x·(x − middle)²`.
+/// Footprint of one splat in the rows of a tile. In a row, alpha at the column x is the opacity times 2 to the power of
+/// `level − falloff_x·(x − middle)²`, with `level` and `middle` of this row.
 #[derive(Clone, Copy, Default)]
 struct TileFootprint {
     /// Index of the splat in the list of splats of the tile.

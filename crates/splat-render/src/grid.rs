@@ -6,7 +6,7 @@ use super::convention::TILE;
 use super::project::TileRect;
 use splat_core::Camera;
 
-/// Grid of pixels of an image: those whose column and row have given remainders modulo the stride.
+/// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the stride.
 ///
 /// A render of a grid has the same values as the render of all pixels at these pixels: footprints are those of the full
 /// image.
@@ -21,12 +21,13 @@ impl PixelGrid {
     /// Grid of all pixels.
     pub const ALL: PixelGrid = PixelGrid { stride: 1, phase: [0; 2] };
 
-    /// Creates the grid of the pixels whose column is `phase[0]` and whose row is `phase[1]` modulo `stride`.
+    /// Creates the grid of the pixels whose column and row have the remainders `phase[0]` and `phase[1]` when divided
+    /// by `stride`.
     pub fn new(stride: NonZeroU32, phase: [u32; 2]) -> PixelGrid {
         PixelGrid { stride: stride.get(), phase: phase.map(|phase| phase % stride) }
     }
 
-    /// Creates the grid of the pixels whose column and row are `stride / 2` modulo `stride`.
+    /// Creates the grid of the pixels whose column and row have the remainder `stride / 2` when divided by `stride`.
     pub fn centered(stride: NonZeroU32) -> PixelGrid {
         PixelGrid::new(stride, [stride.get() / 2; 2])
     }

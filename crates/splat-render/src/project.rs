@@ -120,8 +120,8 @@ pub(super) struct Splat {
     pub(super) color: [f32; 3],
     /// Index of the Gaussian in the frame.
     pub(super) id: u32,
-    /// Tiles of the full image in which the splat is drawn: first and end column, then first and end row (both ends
-    /// exclusive). The splat is not drawn outside of them, although its alpha may exceed 1/255 there.
+    /// Tiles of the full image in which the splat is drawn, as `[x0, x1, y0, y1]`: columns from x0 to below x1, rows
+    /// from y0 to below y1. The splat is not drawn outside of them, although its alpha may exceed 1/255 there.
     /// [`Splat::UNBOUNDED`] if no pixel is excluded this way. Used only in renders of a grid of pixels, whose tiles are
     /// larger than those of the image.
     pub(super) drawn_tiles: [u16; 4],
@@ -420,9 +420,9 @@ pub(super) fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Returns the range of tiles along one axis that a splat centered at `at` (pixels) can change: the tiles that the
-/// original CUDA rasterizer counts for `at ± radius`, without those whose pixels are all further than `half` from `at`.
-/// `tiles` is the number of tiles of the image.
+/// Returns the range of tiles (first, end) along one axis that a splat centered at `at` (pixels) can change: the tiles
+/// that the original CUDA rasterizer counts for `at ± radius`, without those whose pixels are all further than `half`
+/// from `at`. `tiles` is the number of tiles of the image.
 #[inline(always)]
 fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let tile = f64::from(TILE);

@@ -389,7 +389,7 @@ mod tests {
         }
     }
 
-    /// Returns the grids with strides from 2 to 5 of all phases along x, and of several along y.
+    /// Returns grids with strides from 2 to 5, with all phases along x and several along y.
     fn grids() -> impl Iterator<Item = PixelGrid> {
         (2..6).flat_map(|stride| {
             (0..stride).map(move |phase| PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 3 * phase + 1]))

@@ -96,8 +96,8 @@ impl Renderer {
     }
 
     /// Computes the gradient sums of every splat from the derivative `pixel_gradient` of the loss with respect to
-    /// `image`. If `SHAPE` is false, computes only the sums of its color. Tiles run in parallel, then splats; each
-    /// splat adds the sums of its tiles in a fixed order.
+    /// `image`. If `SHAPE` is false, computes only the sums for the gradients of colors. First, tiles are processed in
+    /// parallel; then, for each splat in parallel, the sums of its tiles are added in a fixed order.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();

@@ -27,8 +27,8 @@ pub(super) fn add(
 ) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// Adds the gradients like [`add_blocks`], compiled for AVX2. Operations are not fused, so results have the
-        /// same bits as without AVX2.
+        /// Does the same as [`add_blocks`], compiled for AVX2. Multiply-adds are not fused, so results have the same
+        /// bits as without AVX2.
         #[target_feature(enable = "avx2")]
         fn add_avx2(
             gaussians: &Gaussians,
@@ -39,7 +39,7 @@ pub(super) fn add(
         ) {
             add_blocks(gaussians, splats, sums, view, out);
         }
-        /// Adds the gradients like [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
+        /// Does the same as [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
         #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
         fn add_avx512(
             gaussians: &Gaussians,
