@@ -49,8 +49,8 @@ pub struct Rig {
     pub origin: String,
 }
 
-/// Maximum difference between the time of a view and the time of its frame, as a fraction of the time span of the
-/// sequence. Allows for times that a file rounded, and still distinguishes a million frames.
+/// Maximum allowed difference between the time of a view and the time of its frame, as a fraction of the time span of
+/// the sequence. Allows for times that a file rounded, and still distinguishes a million frames.
 const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
@@ -91,8 +91,8 @@ impl Rig {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
-    /// Returns the maximum difference between the time of a view and the time of its frame, in the unit of the times.
-    /// The sequence is assumed to cover the same time span as the views.
+    /// Returns the maximum allowed difference between the time of a view and the time of its frame, in the unit of the
+    /// times. The sequence is assumed to cover the same time span as the views.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }

@@ -114,7 +114,8 @@ impl FolderHandle {
         fs::rename(self.entry_path(from)?, to.entry_path(name)?)
     }
 
-    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder.
+    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder of
+    /// the process.
     ///
     /// # Errors
     /// Fails if there is no entry `from` or the system refuses.
