@@ -24,10 +24,12 @@ use std::io;
 
 use crate::codec::{TileStats, order_at, predict, shuffle_into, stats, zigzag};
 
-/// Error bounds that a column may have. For all of them the quantization step is a finite number above zero.
+/// Range of the error bounds that a column may have. For each bound in it, the quantization step is a finite number
+/// above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
-/// Length in bytes of the fields before the exceptions of a tile: step, number of exceptions, and how often the step is
-/// halved for static tracks.
+/// Length in bytes of the fields at the start of a stored tile: the quantization step, the number of exceptions (values
+/// stored with their original bits), and how often the step is halved for static tracks. The exceptions follow these
+/// fields.
 const HEAD_BYTES: usize = 16;
 /// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
 /// in another encoding.
@@ -50,8 +52,8 @@ pub(crate) struct BoundedTile {
 /// Encodes `values`, which are frames of `plane` values each, with an error of at most `max_error`. `level` is the zstd
 /// level.
 ///
-/// Returns `None` if this encoding does not pay: too many values are exceptions, or the result takes 4 bytes per value
-/// or more.
+/// Returns `None` if this encoding does not pay: too many values have to be stored with their original bits, or the
+/// result takes 4 bytes per value or more.
 pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -> io::Result<Option<BoundedTile>> {
     let step = step(values, max_error);
     let whole = Multiples::new(values, plane, max_error, step, 0);
@@ -90,11 +92,11 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`: twice `max_error`, minus the error that rounding
-/// the largest value to f32 may add.
+/// Returns the quantization step with which values have an error of at most `max_error`: twice `max_error`, minus the
+/// error that rounding the decoded value of the largest magnitude to f32 may add.
 ///
-/// Values so large that their f32 spacing exceeds half of `max_error` do not count as the largest value. They may be
-/// stored unquantized, as exceptions.
+/// Values whose neighboring f32 values are more than half of `max_error` apart are left out of this maximum. If their
+/// error exceeds `max_error`, they are stored with their original bits, as exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -162,14 +164,14 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Returns the multiples and exceptions of the first frame only.
+    /// Drops the multiples and exceptions (values stored with their original bits) of all frames but the first.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
         self
     }
 
-    /// Returns the bits of all values as a decoder of the tile gets them.
+    /// Returns the f32 bits of all values as a decoder reads them from the tile.
     fn decoded(&self) -> Vec<u32> {
         let steps = [static_step(self.step, self.halvings), self.step];
         let tracks = self.moves.iter().cycle();
@@ -180,14 +182,16 @@ impl Multiples {
         values
     }
 
-    /// Returns the prediction error of track `track` at frame `frame`, zigzag-coded; `frame` must not be the first.
+    /// Returns the prediction error of track `track` (one component of one Gaussian) at frame `frame`, zigzag-coded.
+    /// `frame` must not be the first.
     fn residual(&self, order: u8, track: usize, frame: usize) -> u32 {
         let order = order_at(order, frame);
         let at = |back: usize| self.values[(frame - back) * self.plane + track];
         zigzag(at(0).wrapping_sub(predict(order, at(1), at(order.into()))))
     }
 
-    /// Returns the prediction errors of all moving tracks at all frames but the first, track by track.
+    /// Returns the prediction errors of all moving tracks (components of Gaussians that change in the tile) at all
+    /// frames but the first, track by track.
     fn residuals(&self, order: u8) -> impl Iterator<Item = u32> + '_ {
         let moving = (0..self.plane).filter(|&track| self.moves[track]);
         let frames = self.values.len() / self.plane;
@@ -201,7 +205,8 @@ impl Multiples {
         if cost(2) < cost(1) { 2 } else { 1 }
     }
 
-    /// Returns the bytes that zstd compresses: the mask of moving tracks, the first frame, and the prediction errors.
+    /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving, the
+    /// multiples of the first frame, and the prediction errors.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {
@@ -232,8 +237,8 @@ pub(crate) struct BoundedTracks {
 }
 
 impl BoundedTracks {
-    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame. An error says
-    /// what was found instead.
+    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame. The error of a
+    /// malformed tile says what was found instead.
     pub(crate) fn read_head<'a>(
         &mut self,
         stored: &'a [u8],
@@ -271,8 +276,8 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks by the mask at the start of the decompressed `bytes`, and checks the length of `bytes`.
-    /// An error says what was found.
+    /// Counts the moving tracks in the mask (one bit per track) at the start of the decompressed `bytes`, and checks
+    /// the length of `bytes`. An error says what was found.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -291,7 +296,8 @@ impl BoundedTracks {
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
     }
 
-    /// Returns for frame `frame`, which must not be the first, each moving track with its prediction error.
+    /// Returns the moving tracks at frame `frame`, which must not be the first: the index of each track, with its
+    /// prediction error.
     pub(crate) fn residuals<'a>(&self, bytes: &'a [u8], frame: usize) -> impl Iterator<Item = (usize, u32)> + 'a {
         let from = self.mask_bytes() + 4 * self.plane;
         let (after_first, values) = (self.frames - 1, self.moving * (self.frames - 1));
@@ -299,9 +305,9 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile.
-    /// `multiples` holds the quantized value of each track in this frame, in quantization steps; `bytes` are the
-    /// decompressed bytes of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per track (component of a Gaussian). `multiples`
+    /// holds the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes
+    /// of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);
@@ -319,13 +325,13 @@ impl BoundedTracks {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask that tells which tracks move (one bit per track).
+    /// Returns the length in bytes of the mask that tells which tracks are moving (one bit per track).
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }
 }
 
-/// Returns whether the track `track` moves, according to the mask at the start of `bytes`.
+/// Returns whether the track `track` is moving, according to the mask at the start of `bytes`.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }

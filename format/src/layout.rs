@@ -327,7 +327,8 @@ fn is_column_name(name: &str) -> bool {
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_')
 }
 
-/// Reads the little-endian fields of a header one after the other. The first byte of the slice is byte 0 of the file.
+/// Reader of the little-endian fields of a header, one after the other. The first byte of the slice is byte 0 of the
+/// file.
 struct Fields<'a> {
     bytes: &'a [u8],
     at: usize,

@@ -26,7 +26,7 @@ pub struct TileFrames {
     counted: Counted,
 }
 
-/// Part of a raw tile (plain f32) that has been counted as read.
+/// Part of a raw tile (plain f32) that has been counted as read, so that it is not counted twice.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
 enum Counted {
     #[default]
