@@ -39,8 +39,8 @@ impl<'a> RenderedSource<'a> {
         RenderedSource { source, ids: None, columns: Attributes::all() }
     }
 
-    /// Returns the decoder that computes pixel colors from the source's features, if the source has one and all
-    /// Gaussians are rendered.
+    /// Returns the decoder that computes the colors of pixels from blended features of the Gaussians (values that take
+    /// the place of colors). Returns `None` if the source has no such decoder, or if only some Gaussians are rendered.
     fn decoder(&self) -> Option<&'a dyn FeatureDecoder> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
@@ -101,7 +101,8 @@ pub struct ViewStates<'a, const S: usize> {
     pub camera: &'a Camera,
     /// Gaussians of each subject at the view's frame.
     pub states: [&'a Gaussians; S],
-    /// Decoder and features of each subject whose colors are computed from features; `None` for the others.
+    /// Decoder, and features of the Gaussians at the view's frame, of each subject whose pixel colors are computed from
+    /// features; `None` for the others.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
@@ -112,7 +113,8 @@ impl<const S: usize> ViewStates<'_, S> {
         self.render_as(subject, self.states[subject], self.features(subject), background)
     }
 
-    /// Returns the features of the subject with index `subject`; `None` if its colors are not computed from features.
+    /// Returns the features (values that take the place of colors) of the Gaussians of the subject with index
+    /// `subject`; `None` if its colors are not computed from features.
     pub fn features(&self, subject: usize) -> Option<&AttributeValues> {
         self.decoded[subject].map(|(_, features)| features)
     }
@@ -149,7 +151,8 @@ impl<const S: usize> ViewStates<'_, S> {
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
-    /// Features of each subject whose colors are computed from features; empty for the others.
+    /// Features (values that take the place of colors) of the Gaussians of each subject that has them; empty for the
+    /// others.
     features: [AttributeValues; S],
 }
 

@@ -15,7 +15,8 @@ impl Scene {
         self.absent.set(ids);
     }
 
-    /// Returns the source of the scene's frames, in which absent Gaussians are invisible.
+    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_absent`]) are invisible in
+    /// it.
     pub fn source(&self) -> &dyn FrameSource {
         if self.absent.is_empty() { self.input.source() } else { self }
     }

@@ -1,4 +1,4 @@
-//! Options for opening an input together with its cameras.
+//! Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,14 +13,14 @@ use crate::models;
 use crate::models::{InputModel, LinkMode, OpenOptions, TrainingConventions};
 use crate::progress::Events;
 
-/// Options for opening an input together with its cameras.
+/// Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
 #[derive(Debug, Clone, Default)]
 pub struct InputOptions {
     /// Model folder, folder of PLY files, .ply or .gseq file; `-`: a frame stream on standard input.
     pub path: PathBuf,
     /// Training iteration to read from a model folder; `None`: the latest one found.
     pub iteration: Option<u32>,
-    /// Training conventions that the files of a model do not state.
+    /// Conventions of the training, such as the period of colors, that the files of some model formats do not state.
     pub conventions: TrainingConventions,
     /// Whether a folder with one PLY file per frame may lack frames.
     pub allow_gaps: bool,

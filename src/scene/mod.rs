@@ -32,7 +32,8 @@ pub use stream::{FrameQuota, frame_quota, is_linked, link_stream, open_stream, r
 pub use work::open_cache;
 pub(crate) use work::stamps;
 
-/// Input together with its cameras, the schedule of its views, and the memory limits, folders and cache of the run.
+/// Input (a model or a sequence of frames) together with its cameras, the schedule of its views, and the memory limits,
+/// folders and cache of the run.
 pub struct Scene {
     /// Path of the input as the user gave it.
     pub path: PathBuf,
@@ -139,7 +140,7 @@ impl Scene {
     /// takes.
     ///
     /// # Errors
-    /// Fails if a file does not exist any more.
+    /// Fails if a file of the input does not exist any more.
     pub fn full_read(&self) -> Result<Reads> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;

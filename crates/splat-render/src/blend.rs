@@ -125,7 +125,8 @@ pub(super) trait BlendSink {
     fn end<V: Lanes>(&mut self, accumulator: Self::Accumulator<V>, pair: usize);
 }
 
-/// Receiver of weights that accumulates the colors of the pixels of a tile, one plane per color channel.
+/// Receiver of weights (alpha · transmittance of each splat) that accumulates the colors of the pixels of a tile, one
+/// plane per color channel.
 pub(super) struct ColorSink {
     pub(super) planes: [TilePlane; 3],
 }
@@ -156,8 +157,8 @@ pub(super) struct Weight {
     pub(super) max: f32,
 }
 
-/// Receiver of weights that stores, in `pairs`, the sum and the largest value of the weights of each splat of the tile.
-/// Every entry of `pairs` must be zero at the start.
+/// Receiver of weights (alpha · transmittance of each splat) that stores, in `pairs`, the sum and the largest value of
+/// the weights of each splat of the tile. Every entry of `pairs` must be zero at the start.
 pub(super) struct WeightSink<'a> {
     pub(super) pairs: &'a mut [Weight],
 }

@@ -87,7 +87,8 @@ impl RemovalError {
     }
 }
 
-/// Receiver of weights that computes the removal error of every splat of a tile while the tile is blended.
+/// Receiver of weights (alpha · transmittance of each splat) that computes the removal error of every splat of a tile
+/// while the tile is blended.
 pub(super) struct RemovalSink<'a> {
     /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
     /// them times the transmittance.

@@ -47,8 +47,8 @@ impl PixelGradients {
     }
 }
 
-/// Receiver of weights that computes the gradient sums of the splats of a tile. If `SHAPE` is false, it computes only
-/// the sums for the gradients of colors.
+/// Receiver of weights (alpha · transmittance of each splat) that computes the gradient sums of the splats of a tile.
+/// If `SHAPE` is false, it computes only the sums for the gradients of colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
     /// Gradient sums of each splat of the tile.
