@@ -51,8 +51,8 @@ pub enum SpzVersion {
     V4,
 }
 
-/// Writes the Gaussians `state` to an `.spz` file at `path`. Returns the largest error of a position in the file, in
-/// scene units.
+/// Writes the Gaussians `state` to an `.spz` file of the version `version` at `path`. Returns the largest error of a
+/// position in the file, in scene units.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),

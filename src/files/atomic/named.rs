@@ -193,7 +193,7 @@ fn is_folder(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_dir())
 }
 
-/// Splits an output path into its folder and its name. Fails if it has no name.
+/// Splits the output path `target` into its folder and its name. Fails if it has no name.
 pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
         return Err(Error::usage(format!(

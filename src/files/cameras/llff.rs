@@ -53,7 +53,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, origin)
 }
 
-/// Returns one image per camera and frame, ordered by frame, then by camera.
+/// Returns one image for each of `cameras` at each of `frames` frames, ordered by frame, then by camera.
 fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
     let listed_image = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),

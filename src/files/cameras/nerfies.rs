@@ -92,7 +92,8 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
     Ok(names)
 }
 
-/// Reads the `warp_id` (time index) of each image in `ids`.
+/// Reads the `warp_id` (time index) of each image in `ids` from `file`, the `metadata.json` of the data set. `counter`
+/// limits the memory.
 fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
     counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
     // Give each distinct name one index, because a name may occur twice in `ids`.

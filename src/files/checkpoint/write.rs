@@ -209,9 +209,10 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. For tensors
-/// in `expected` the listed ones are right, for others the old ones. Both cannot hold if two tensors share one object
-/// for their shape and only one of them changes; then the check fails.
+/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. A tensor that
+/// is a key of `expected` must have the shape, strides and offset given there; every other tensor must have those of
+/// the old pickle. The check fails if two tensors share one shape object in the pickle although only one of them gets a
+/// new shape.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

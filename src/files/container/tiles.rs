@@ -57,10 +57,10 @@ impl FrameValues {
 /// Reader of some Gaussians of a container.
 ///
 /// Memory in bytes per Gaussian, for each column (attribute) that varies over time: 4 × width (number of components) ×
-/// frames kept. The frames kept are those of a frame block that will be read, but at most the number given by
-/// [`ReadPlan::keeping_at_most`]. If this is a whole frame block, add 8 × width. Raw (uncompressed) tiles that are read
-/// whole take the same amount of mapped memory if a whole frame block may be kept, else none. No memory is used if only
-/// one frame is kept, for columns that do not vary, and for tiles that the container keeps in memory.
+/// frames kept. The frames kept are the frames of one frame block that the read plan lists, but at most the number
+/// given by [`ReadPlan::keeping_at_most`]. If a whole frame block is kept, add 8 × width. Raw (uncompressed) tiles that
+/// are read whole take the same amount of mapped memory if a whole frame block may be kept, else none. No memory is
+/// used if only one frame is kept, for columns that do not vary, and for tiles that the container keeps in memory.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
@@ -82,7 +82,7 @@ pub(super) struct TileReader<'a> {
 }
 
 impl<'a> TileReader<'a> {
-    /// Returns a reader of the Gaussians with the indices `ids`.
+    /// Returns a reader of the Gaussians `ids` of the container `source`.
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();

@@ -40,7 +40,7 @@ pub(crate) struct Object {
 }
 
 impl Object {
-    /// Returns the value under `key`, or the last such value if the key is repeated.
+    /// Returns the value under `key`, or the last such value if the key is repeated; `None` without such a key.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
@@ -84,7 +84,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns the value under `key` if this is an object with this key.
+    /// Returns the value under `key` if this is an object with this key; otherwise `None`.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         match self {
             SmallValue::Object(object) => object.get(key),

@@ -23,7 +23,8 @@ struct AllocationCounter {
 }
 
 impl AllocationCounter {
-    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them.
+    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them. Fails if
+    /// the memory limit would be exceeded.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
@@ -33,8 +34,8 @@ impl AllocationCounter {
         Ok(())
     }
 
-    /// Reserves memory for `more` elements of `list`. While the list grows, the old and the new buffer exist together;
-    /// both are counted.
+    /// Reserves memory for `more` elements of `list`. Fails if the memory limit would be exceeded; the error names the
+    /// byte `at` of the pickle. While the list grows, the old and the new buffer exist together; both are counted.
     fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
         let (needed, old) = (list.len() + more, list.capacity());
         if needed > old {
@@ -196,8 +197,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Executes an instruction that pushes a number, a text or other bytes without structure. Refuses unknown
-    /// instructions.
+    /// Executes the instruction `instruction`, found at byte `start`, if it pushes a number, a text or other bytes
+    /// without structure. Fails for other instructions.
     fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
         match instruction {
             b'N' => self.push(Node::None, 0)?,
@@ -232,7 +233,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node to the object tree and pushes it onto the stack.
+    /// Adds `node` to the object tree and pushes it onto the stack. `depth` is its nesting depth, 0 for a scalar.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
         self.allocations.reserve(&mut self.nodes, 1, self.at)?;
         self.allocations.reserve(&mut self.depths, 1, self.at)?;
@@ -243,14 +244,14 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node to the object tree and inserts it into the stack at index `place`.
+    /// Adds `node` to the object tree and inserts it into the stack at index `place`.
     fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
         self.push(node, 1)?;
         self.stack[place..].rotate_right(1);
         Ok(())
     }
 
-    /// Pushes an integer onto the stack, with the byte range of its instruction, which began at `start`.
+    /// Pushes the integer `value` onto the stack, with the byte range of its instruction, which began at byte `start`.
     fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
@@ -269,7 +270,8 @@ impl<'a> PickleMachine<'a> {
         Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
-    /// Begins a container by recording the present height of the stack.
+    /// Begins a container by recording the present height of the stack. `start` is the byte at which the instruction
+    /// began. Fails if too many containers are open.
     fn mark(&mut self, start: usize) -> Result<(), Wrong> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
@@ -298,7 +300,8 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index of the first of the last `count` values. Fails unless there is another value below them.
+    /// Returns the stack index of the first of the last `count` values. Fails unless the innermost open container has
+    /// another value below them.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
@@ -309,7 +312,7 @@ impl<'a> PickleMachine<'a> {
         Ok(mark.min(self.stack.len()))
     }
 
-    /// Replaces the values from stack index `first` on by one container that holds them.
+    /// Replaces the values from stack index `first` on by one container that holds them; `make` builds it.
     fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
@@ -322,8 +325,8 @@ impl<'a> PickleMachine<'a> {
         self.push(make(elements), depth)
     }
 
-    /// Returns the container that lies on the stack directly below index `first`. Raises the depth of the container
-    /// above the depths of the values from `first` on.
+    /// Returns the node index of the container that lies on the stack directly below index `first`. Raises the depth of
+    /// the container above the depths of the values from `first` on.
     fn container(&mut self, first: usize) -> Result<usize, Wrong> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
@@ -332,7 +335,8 @@ impl<'a> PickleMachine<'a> {
         Ok(top)
     }
 
-    /// Removes the values from stack index `first` on and appends them to the list below them.
+    /// Removes the values from stack index `first` on and appends them to the list below them. Objects that behave like
+    /// lists lose these values. Fails for other values below; the error names byte `start` of the pickle.
     fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
@@ -347,7 +351,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Removes the keys and values from stack index `first` on and adds them to the dict below them.
+    /// Removes the keys and values from stack index `first` on and adds them to the dict, or the object that behaves
+    /// like one, below them. Fails for other values below; the error names byte `start` of the pickle.
     fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         let (pairs, rest) = self.stack[first..].as_chunks::<2>();
@@ -374,7 +379,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Pushes the node that is stored in the memo under `key`.
+    /// Pushes the node that is stored in the memo (table of nodes for later reference) under `key`. Fails if there is
+    /// none.
     fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
         let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;

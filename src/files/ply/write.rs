@@ -114,8 +114,8 @@ pub(crate) fn write_rows_like(
     })
 }
 
-/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as comment lines (line
-/// breaks in them become spaces). f32 values keep their bits.
+/// Writes `gaussians` to the file `path` in the INRIA layout: binary little-endian f32, zero normals, `comments` as
+/// comment lines (line breaks in them become spaces). f32 values keep their bits.
 ///
 /// # Errors
 /// Fails if the file cannot be written, or if the number of SH coefficients belongs to no degree from 0 to 3.
@@ -164,7 +164,7 @@ pub(crate) fn write_inria_with(
 }
 
 /// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`,
-/// followed by the properties `more`.
+/// followed by the properties `more`. `comments` become comment lines.
 fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl Iterator<Item = &'a str>) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
@@ -237,7 +237,8 @@ pub(crate) fn write_rows(
     })
 }
 
-/// Returns the byte ranges of a row that hold extra properties (those that are no attribute of a Gaussian).
+/// Returns the byte ranges, in a row with the properties `properties`, of the extra properties: those that `layout`
+/// does not use for an attribute of a Gaussian.
 fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
     for column in Attributes::all().iter() {
@@ -286,6 +287,7 @@ fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &
 }
 
 /// Replaces the attributes in the bytes `row` of a row by those of the Gaussian with index `proxy` in `proxies`.
+/// `layout` locates the attributes, and `big_endian` states the byte order.
 fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
@@ -310,14 +312,16 @@ fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     }
 }
 
-/// Returns the value of `property` in the bytes `row` of a row, rounded to the nearest f32.
+/// Returns the value of `property` in the bytes `row` of a row, rounded to the nearest f32. `big_endian` states the
+/// byte order.
 pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
     let mut value = [0.0];
     read_plane(row, &[0], property, big_endian, &mut value);
     value[0]
 }
 
-/// Writes `value` as `property` into the bytes `row` of a row, in the type of the property.
+/// Writes `value` as `property` into the bytes `row` of a row, in the type of the property. `big_endian` states the
+/// byte order.
 pub(crate) fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
     let rounded = value.round();
     let mut bytes = [0; 8];

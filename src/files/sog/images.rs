@@ -121,8 +121,8 @@ pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
     [0, 1, 2].map(|c| u16::from_le_bytes([low[c], high[c]]))
 }
 
-/// Returns the ranges of the logarithmic coordinates of `position`, and the two images of their low and their high
-/// bytes. Pixel i holds the Gaussian `order[i]`.
+/// Returns the ranges of the logarithmic coordinates of `position`, and two images: the low and the high bytes of the
+/// coordinates as 16-bit numbers. Pixel i holds the Gaussian `order[i]`.
 pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u32]) -> (Range3, [RgbaImage; 2]) {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
     let range = Range3::from_rows(order.iter().map(|&row| logs(row as usize)));
@@ -133,8 +133,8 @@ pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u3
     (range, images)
 }
 
-/// Returns the position, in scene units, whose logarithmic coordinates have the low bytes `low` and the high bytes
-/// `high`.
+/// Returns the position, in scene units, that is stored as the low bytes `low` and the high bytes `high` of its
+/// logarithmic coordinates within `range`.
 pub fn decode_position(range: &Range3, low: [u8; 4], high: [u8; 4]) -> [f32; 3] {
     let codes = decode_16_bit(low, high);
     [0, 1, 2].map(|axis| from_log_coordinate(range.decode(axis, codes[axis])) as f32)

@@ -19,7 +19,7 @@ use crate::limits::ReadLimit;
 use crate::model::{Attributes, Gaussians, color_from_sh, opacity};
 use crate::passes::gather_all;
 
-/// Returns `count` Gaussians without any symmetry, with SH degree `degree`.
+/// Returns `count` Gaussians with SH degree `degree`, whose values differ along all axes.
 fn gaussians(count: usize, degree: usize) -> Gaussians {
     let mut state = gaussians_with_sh(count, degree);
     let plain = gather_all(&DemoScene::new(count, 1), 0, Attributes::SH).unwrap();

@@ -161,8 +161,8 @@ pub(crate) fn encode(
     Ok((meta, images, SogErrors { position: accuracy.position_error(), sh }))
 }
 
-/// Adds the images of the SH coefficients above degree 0 to `images`. Returns the member `shN` of `meta.json`, and the
-/// root of the mean squared error of these coefficients; `None` if there are no such coefficients.
+/// Adds the images of the SH coefficients of `state` above degree 0 to `images`. Returns the member `shN` of
+/// `meta.json`, and the root of the mean squared error of these coefficients; `None` if there are no such coefficients.
 fn encode_sh(
     state: &Gaussians,
     size: ImageSize,

@@ -79,7 +79,7 @@ impl TensorValues {
 }
 
 impl StoredTensor {
-    /// Returns a tensor whose `values` are contiguous, with the last axis fastest.
+    /// Returns the tensor `name` of the shape `shape`, whose `values` are contiguous, with the last axis fastest.
     pub(crate) fn dense(name: String, shape: Vec<usize>, values: TensorValues) -> StoredTensor {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
@@ -89,7 +89,7 @@ impl StoredTensor {
     }
 }
 
-/// Writes a state dict of `tensors`, in the given order.
+/// Writes a state dict of `tensors`, in the given order, to the file `path`.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

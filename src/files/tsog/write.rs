@@ -97,8 +97,8 @@ fn narrowed(params: &StoredParams) -> StoredParams {
     params
 }
 
-/// Adds the two images that hold the frame of each Gaussian to `images`, and returns the member `timeline` of
-/// `meta.json`.
+/// Adds two images to `images` that hold the frame in which each Gaussian of `params` is seen, and returns the member
+/// `timeline` of `meta.json`.
 fn encode_frames(
     params: &StoredParams,
     frames: usize,
@@ -116,8 +116,8 @@ fn encode_frames(
     TimelineEntry { kind: 0, frames: Some(frames as u64), delta: Some(delta as u64), mins: None, maxs: None, files }
 }
 
-/// Adds the two images that hold the time window of each Gaussian to `images`, and returns the member `timeline` of
-/// `meta.json`.
+/// Adds two images to `images` that hold the time window of each Gaussian of `params`, and returns the member
+/// `timeline` of `meta.json`.
 fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images: &mut NamedImages) -> TimelineEntry {
     let window = |row: usize| {
         let deviation =
@@ -134,7 +134,8 @@ fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images:
     TimelineEntry { kind: 1, frames: None, delta: None, mins, maxs, files }
 }
 
-/// Adds the image or the two images of the velocities to `images`, with 8 bits if these are accurate enough, else with
+/// Adds the image or the two images of the velocities of `params` to `images`, with 8 bits if these are accurate
+/// enough, else with
 /// 16. Returns the member `temporal` of `meta.json`; `None` if nothing moves.
 fn encode_velocities(
     params: &StoredParams,
