@@ -19,7 +19,8 @@ mod tile_frames;
 
 pub use tile_frames::{TileFrames, TouchedPages};
 
-/// Maximum distance, in bytes of the file, of two tiles whose pages are prefetched or released in one call.
+/// Maximum gap, in bytes of the file, between two tiles whose pages are prefetched or released in one call of the
+/// system.
 const MERGE_GAP_BYTES: u64 = 1 << 12;
 
 /// Open container, from which tiles are read.

@@ -144,7 +144,7 @@ impl Statistic {
         self.declaration().meaning
     }
 
-    /// Returns the property of a Gaussian that this statistic measures.
+    /// Returns a short text that names the property of a Gaussian that this statistic measures, such as "motion".
     pub fn measured_property(self) -> &'static str {
         self.declaration().property
     }

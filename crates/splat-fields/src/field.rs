@@ -71,7 +71,7 @@ pub struct Field {
     pub(super) mask: Mask,
 }
 
-/// Results for one block of Gaussians that do not depend on time: the first part of evaluating a field.
+/// Time-independent results for one block of Gaussians, which are the first part of evaluating a field.
 #[derive(Debug, Clone)]
 pub struct PreparedPositions {
     rows: usize,
@@ -80,7 +80,7 @@ pub struct PreparedPositions {
     voxel: Option<Vec<f32>>,
 }
 
-/// The part of the input of the trunk (first MLP) that does not depend on time: plane features, or positions.
+/// Time-independent part of the input of the trunk (first MLP): plane features, or positions.
 #[derive(Debug, Clone)]
 enum PreparedInput {
     Planes(PreparedPlanes),

@@ -92,7 +92,7 @@ pub struct Tap {
     pub fraction: f32,
 }
 
-/// The part of the HexPlane features of a block of Gaussians that does not depend on time.
+/// Time-independent part of the HexPlane features of a block of Gaussians.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
     /// Products of the samples of the three planes without time, `[rows, width]` with one row per Gaussian.

@@ -151,7 +151,8 @@ impl BlendSink for ColorSink {
 /// Weights alpha · transmittance of one splat in one tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Weight {
-    /// Sum of the weights over the sampled pixels: at most 256 terms, added in f32 in a fixed order.
+    /// Sum of the weights alpha · transmittance of the splat over the sampled pixels: at most 256 terms, added in f32
+    /// in a fixed order.
     pub(super) sum: f32,
     /// Largest weight alpha · transmittance of the splat in any sampled pixel.
     pub(super) max: f32,
@@ -180,7 +181,7 @@ impl BlendSink for WeightSink<'_> {
     }
 }
 
-/// Instruction set with which tiles are blended. All of them give the same bits.
+/// Instruction set with which tiles are blended. All variants give results with the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BlendKernel {
     Portable,

@@ -230,7 +230,8 @@ struct ProjectedSplats {
     sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Coefficients of the exponent of alpha: the fields of these names in [`Splat`].
+    /// Coefficients of the exponent of alpha, one per Gaussian of the block, as in the fields of [`Splat`] with the
+    /// same names.
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],

@@ -21,7 +21,7 @@ pub struct DeepVariant {
     pub all_heads: bool,
 }
 
-/// Variants to test: each option is on in one and off in another.
+/// Variants to test. Each option is on in at least one variant and off in another.
 pub const ALL_VARIANTS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },

@@ -2,8 +2,8 @@
 //! an open folder.
 //!
 //! Each operation first checks that the path still leads to the folder that was opened, without a link. Another program
-//! may replace the folder between this check and the operation; Linux and macOS exclude that. No folder counts as one
-//! of this user, so the program reuses and removes only folders that this process has created.
+//! may replace the folder between this check and the operation; the implementation for Linux and macOS excludes this.
+//! No folder counts as one of this user, so the program reuses and removes only folders that this process has created.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions};
