@@ -16,7 +16,7 @@ use rayon::prelude::*;
 /// Number of parallel rounds after which the remaining nodes are decided sequentially. Scenes need 5 to 8 rounds; a
 /// chain of Gaussians sorted along a line would need one round for every second one.
 const MAX_ROUNDS: usize = 32;
-/// Number of undecided nodes below which deciding them sequentially is faster than another parallel round.
+/// Number of undecided nodes below which it is faster to decide them sequentially than in another parallel round.
 const FEW: usize = 64;
 
 /// Leader of every node, and statistics of how the leaders were found.
@@ -120,7 +120,8 @@ impl Predecessors {
     }
 }
 
-/// Undoes all joins except the first `limit` in sequential order. Returns the number of joins that remain.
+/// Undoes all joins in `leader_of` except the first `limit` in sequential order: by the `rank` of the leader, then of
+/// the member. Without `limit`, undoes none. Returns the number of joins that remain.
 fn truncate(rank: &[u32], leader_of: &mut [u32], limit: Option<usize>) -> usize {
     let joined = |(node, &leader): (usize, &u32)| (node as u32 != leader).then_some(node as u32);
     let all = leader_of.iter().enumerate().filter_map(joined).count();

@@ -40,8 +40,9 @@ pub struct MergedSequence<'a> {
 
 impl<'a> MergedSequence<'a> {
     /// Creates the sequence of the Gaussians `survivors` of `source`, in which proxies replace some of them. `clusters`
-    /// yields for each proxy its index in `survivors`, and the ids and weights of its members. A proxy is placed at the
-    /// mean of its members; because its trajectory is explicit, it need not be at its leader's position.
+    /// yields for each proxy its index in `survivors`, and the ids and weights of its members. Proxies are computed by
+    /// the parameters `merge`. A proxy is placed at the mean of its members; because its trajectory is explicit, it
+    /// need not be at its leader's position.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -69,7 +70,7 @@ impl<'a> MergedSequence<'a> {
 
 impl MergedSequence<'_> {
     /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all
-    /// proxies among them together, on all threads.
+    /// proxies among them together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
@@ -78,7 +79,8 @@ impl MergedSequence<'_> {
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
-    /// Returns how many Gaussians of the source Gaussian `place` of this sequence replaces; 1 if it is not a proxy.
+    /// Returns the number of source Gaussians that the Gaussian with index `place` of this sequence replaces: the
+    /// members of its cluster if it is a proxy, otherwise 1.
     pub fn member_count(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -144,8 +146,8 @@ impl MergedMembers {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
-    /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state` and writes them to
-    /// `out`.
+    /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state`, by the parameters
+    /// `merge` for proxies, and writes them to `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));

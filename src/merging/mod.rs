@@ -200,8 +200,8 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
-/// Returns the rank of every group: by the descending sum of the contributions C of its Gaussians, ties by the hash of
-/// the leader's id.
+/// Returns the rank of each of `groups`. Groups are ranked by the sum of the contributions C of their Gaussians,
+/// largest first; ties are broken by the hash of the leader's id.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -364,7 +364,7 @@ fn each_candidate<E>(
     Ok(truncated)
 }
 
-/// Returns whether all attribute values of the Gaussian in row `row` are finite.
+/// Returns whether all attribute values of the Gaussian in row `row` of `states` are finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
     let columns = Attributes::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))

@@ -125,7 +125,8 @@ impl PairMeter<'_> {
         Ok(pairs.iter().zip(measured).map(by_row).collect())
     }
 
-    /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in the order of voxels of side `reach`.
+    /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in the order of voxels of side `reach` around
+    /// their positions `reference`. Fails if the source cannot be read or the scratch file cannot be written.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);

@@ -81,9 +81,9 @@ impl Importance<'_> {
     }
 }
 
-/// Returns the weights of the members of a cluster, given as rows of `states`. Weights are proportional to contribution
-/// × visibility (C·Vis) and sum to 1. If this sum is not positive and finite, they are proportional to opacity × area;
-/// if that fails too, all are equal.
+/// Returns the weights of the `members` of a cluster, which are rows of `states`. Weights are proportional to
+/// contribution × visibility (C·Vis, from `importance`) and sum to 1. If the sum of the products C·Vis is not positive
+/// and finite, weights are proportional to opacity × area; if that fails too, all are equal.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
     let weighted_contribution = |&i: &u32| importance.weighted_contribution(i);
     let opaque_area = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
@@ -148,8 +148,8 @@ pub fn merge_state(
     }
 }
 
-/// Computes the proxy of every group of more than one Gaussian. The result has one row for each such group, in the
-/// order of the groups.
+/// Computes the proxy of every group in `groups` that has more than one Gaussian, from the Gaussians `states` and their
+/// `importance`, by the parameters `merge`. The result has one row for each such group, in the order of the groups.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,
@@ -214,7 +214,8 @@ fn mean_area(scales: DVec3) -> f64 {
     std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
 }
 
-/// Returns the opacity of the proxy of `members` by the rule `rule`, clamped so that its logit is finite.
+/// Returns the opacity of the proxy of `members` (rows of `states` with weights) by the rule `rule`, clamped so that
+/// its logit is finite.
 fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
     let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
     let opacity = match rule {

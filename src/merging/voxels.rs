@@ -2,9 +2,9 @@
 //! computer oriented geodetic data base", 1966).
 //!
 //! Gaussians in this order that are close in space are mostly close in the list. A consecutive part of the list,
-//! together with all Gaussians within one voxel side of it (its ghosts), contains all pairs led from that part. The
-//! order affects only the speed of reading, never a result.
-//! Memory while sorting: 20 bytes per Gaussian beside the output.
+//! together with all Gaussians within one voxel side of it (its ghosts), contains all pairs whose leader is in that
+//! part. The order affects only the speed of reading, never a result. Memory while sorting: 20 bytes per Gaussian
+//! beside the output.
 
 use rayon::prelude::*;
 
@@ -61,7 +61,8 @@ impl VoxelGrid {
     }
 }
 
-/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their positions.
+/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their
+/// positions. `at` returns the position of a row.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
     VoxelGrid::around(rows.iter().map(|&row| at(row)), side).sort_rows(rows, at)
 }
