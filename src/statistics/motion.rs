@@ -69,9 +69,10 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame with these positions (`[3, len]`) and opacities. `steps` holds the durations of the latest time
-    /// step and of the one before, each divided by the mean duration of a step. `steady` is true if the opacities have
-    /// been the same in every frame so far, this one included.
+    /// Adds a frame with the positions `position` (`[3, len]`) and the opacities `opacity`. A Gaussian is alive if its
+    /// opacity is at least `alpha_min`. `steps` holds the durations of the latest time step and of the one before, each
+    /// divided by the mean duration of a step. `steady` is true if the opacities have been the same in every frame so
+    /// far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,

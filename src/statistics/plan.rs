@@ -86,8 +86,8 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If they turn out
-    /// to be, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
+    /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If the frames
+    /// turn out to be evenly spaced, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
@@ -127,8 +127,8 @@ impl ScanPlan {
     }
 }
 
-/// Returns the durations of the time steps, divided by their mean; entry 0 is unused. Returns an empty list if all
-/// count as 1.
+/// Returns the durations of the steps between the frames at `times`, divided by their mean. Entry t is the step into
+/// frame t; entry 0 is unused. Returns an empty list if all steps count as equal.
 fn uneven_steps(times: &[f64]) -> Vec<f64> {
     let [first, .., last] = times else { return Vec::new() };
     let mean = (last - first) / (times.len() - 1) as f64;

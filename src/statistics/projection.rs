@@ -82,7 +82,7 @@ pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageSca
     project_planes(&view, planes, scale, sums);
 }
 
-/// Adds coverage like [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
+/// Does the same as [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
@@ -211,7 +211,8 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Adds the covered area inside the image, times the opacity, of each Gaussian to the sums.
+    /// Adds the covered area inside the image (pixels) times the opacity of each Gaussian to `coverage`, in fixed
+    /// point. Counts in `touched` the Gaussians that are alive and whose bounding box overlaps the image.
     #[inline(always)]
     fn accumulate(
         &self,
@@ -241,7 +242,8 @@ impl<const N: usize> ProjectedBlock<N> {
 }
 
 /// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate with respect to
-/// the position: f/z·(w − slope·w₂), with the camera axis w of this coordinate and the viewing axis w₂.
+/// the position: f/z·(w − slope·w₂). `focal_over_depth` is f/z, `w` the camera axis of this coordinate, `w2` the
+/// viewing axis.
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))

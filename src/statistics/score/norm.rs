@@ -32,7 +32,8 @@ pub enum PercentilePasses {
 }
 
 impl Norm {
-    /// Computes the normalization of the values that `values` iterates over. NaN and infinities are ignored.
+    /// Computes the normalization of the values that `values` iterates over, with the ε and the clipping of `recipe`.
+    /// `passes` states how the percentiles are found. NaN and infinities are ignored.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,

@@ -61,7 +61,7 @@ impl FloatSketch {
     }
 
     /// Returns the key of the bucket that contains the `p`-th percentile, and the percentile's rank within the bucket,
-    /// counted from 0.
+    /// counted from 0. Returns `None` if there are no finite values.
     fn locate(&self, p: f64) -> Option<(u32, usize)> {
         // Multiplying before dividing is exact for whole p, so the 1st percentile of 100 values is the smallest.
         let mut rank = ((p * self.finite as f64 / 100.0).ceil() as u64).max(1) - 1;
