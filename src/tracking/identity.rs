@@ -34,8 +34,9 @@ pub struct OrderDifference {
     pub is_common: bool,
 }
 
-/// Compares two frames with equally many Gaussians, index by index, at up to 4096 indices. The order always holds if
-/// there are fewer than 16 Gaussians, or if Gaussians at the same index differ by no more than rounding.
+/// Compares the frames `before` and `after`, which have equally many Gaussians, index by index, at up to 4096 indices.
+/// The frames always count as being in the same order if there are fewer than 16 Gaussians, or if Gaussians at the same
+/// index differ by no more than rounding.
 pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let (before, after) = (ComparedAppearance::all_from_state(before), ComparedAppearance::all_from_state(after));
     let count = before.len().min(after.len());
@@ -56,7 +57,7 @@ pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     }
 }
 
-/// Returns the distance between the positions of two Gaussians, divided by the smaller of their sizes.
+/// Returns the distance between the positions of `a` and `b`, divided by the smaller of their sizes.
 fn distance(a: &ComparedAppearance, b: &ComparedAppearance) -> f64 {
     let squared: f64 = (0..3).map(|c| f64::from(a.position[c] - b.position[c]).powi(2)).sum();
     squared.sqrt() / f64::from(a.size.min(b.size))

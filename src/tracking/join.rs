@@ -133,8 +133,9 @@ impl Joiner {
         }
     }
 
-    /// Ends the joining; to be called after the last frame. Returns a pair for each rule (`ALIKE` first): for every
-    /// track, in the order in which tracks began, the index of its joined track; and the number of joined tracks.
+    /// Ends the joining; to be called after the last frame. Returns two values for each rule (`ALIKE` first): a list
+    /// that holds, for every track in the order in which tracks began, the index of its joined track; and the number of
+    /// joined tracks. `linker` is the linker of the last frame.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
     }

@@ -94,9 +94,10 @@ impl Linker {
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. Each Gaussian without
-    /// a link begins a track. `in_doubt` lists the Gaussians whose link was removed because it was probably wrong; the
-    /// tracks that they begin are marked ([`OpenTrack::is_in_doubt`]).
+    /// Advances the open tracks by a frame, whose Gaussians have the given `appearances` and `links` to tracks. Returns
+    /// the number of the track of every Gaussian. Each Gaussian without a link begins a track. `in_doubt` lists the
+    /// Gaussians whose link was removed because it was probably wrong; the tracks that they begin are marked
+    /// ([`OpenTrack::is_in_doubt`]).
     fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
@@ -124,8 +125,8 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the indices in `tracks` of the tracks that are missing for the first time although a Gaussian at their
-    /// expected position looks like them.
+    /// Returns the indices in `tracks` of the tracks that `links` leaves without a Gaussian for the first time although
+    /// one of the Gaussians with the given `appearances` lies at the track's expected position and looks like it.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::MAX_GAP_FRAMES;
 use crate::model::{Gaussians, SH_C0, opacity};
 
-/// Returns the size of Gaussian `i`: the root mean square of its three scales, scene units.
+/// Returns the size of Gaussian `i` of `state`: the root mean square of its three scales, scene units.
 pub(super) fn rms_size(state: &Gaussians, i: usize) -> f64 {
     let squares = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
     (squares.iter().sum::<f64>() / 3.0).sqrt()
@@ -100,8 +100,11 @@ impl SlowTrack {
 }
 
 impl SlowLinker {
-    /// Returns, for every track that a round has linked, the probability that its link is wrong. `candidates` holds all
-    /// possible links of the round as (cost, track, Gaussian).
+    /// Returns (probability that the link is wrong, track) for every track that a round has linked. `candidates` holds
+    /// all possible links of the round as (cost, track, Gaussian). `gaussian_of` holds the Gaussian of every linked
+    /// track, and `taken` the track of every linked Gaussian. `cost` returns the cost of a link between a track and a
+    /// Gaussian. `are_duplicates` gets a candidate track and Gaussian and the partners that both have now, and returns
+    /// whether the candidate is no rival because of near-duplicates.
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
@@ -346,7 +349,8 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Joins the later track of each cheapest pair to the earlier track if that one has ended, until nothing changes.
+/// Finds the cheapest pair of each later track in `pairs`. Joins the two tracks of this pair if the earlier one has
+/// ended, and repeats this until nothing changes. `predecessor` and `has_successor` record the joins of each track.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

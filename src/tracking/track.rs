@@ -71,8 +71,8 @@ impl OpenTrack {
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost of linking the track to a Gaussian of this appearance; if it is above 1, a link is impossible.
-    /// If the distance term alone exceeds 1, returns only this term.
+    /// Returns the cost, by the rules of `round`, of linking the track to a Gaussian of this appearance; if it is above
+    /// 1, a link is impossible. If the distance term alone exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
@@ -91,7 +91,8 @@ impl OpenTrack {
         std::array::from_fn(|c| self.appearance.position[c] + (self.frames_since_seen - 1) as f32 * velocity[c])
     }
 
-    /// Continues the track with a Gaussian of the next frame, and updates the track's velocity.
+    /// Continues the track with a Gaussian of the next frame, which has the appearance `appearance`, and updates the
+    /// track's velocity.
     pub(super) fn extend(&mut self, appearance: ComparedAppearance) {
         let step: [f32; 3] = std::array::from_fn(|c| {
             (appearance.position[c] - self.appearance.position[c]) / self.frames_since_seen as f32
@@ -127,8 +128,8 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds the Gaussian to the candidates if its cost is at most 1 and among the [`MAX_CANDIDATES`] lowest costs so
-    /// far.
+    /// Adds the Gaussian with the number `gaussian` to the candidates if its cost is at most 1 and among the
+    /// [`MAX_CANDIDATES`] lowest costs so far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });
