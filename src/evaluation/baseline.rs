@@ -19,11 +19,11 @@ use crate::scene::{InputOptions, open_scene};
 /// of the id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
-    /// Opacity.
+    /// Ranking by opacity, largest first.
     Opacity,
-    /// Largest of the three scales.
+    /// Ranking by the largest of the three scales of a Gaussian, largest first.
     Scale,
-    /// Hash of the id of the Gaussian, which gives a random order.
+    /// Ranking in random order: by a hash of the id of the Gaussian.
     Random,
 }
 

@@ -60,7 +60,7 @@ pub struct ViewScores {
 /// Mean scores over a set of views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct QualityMeans {
-    /// Number of (frame, view) pairs.
+    /// Number of (frame, view) pairs over which scores are averaged.
     pub pairs: usize,
     /// Mean PSNR, dB.
     pub psnr: f64,

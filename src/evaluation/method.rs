@@ -27,7 +27,7 @@ pub enum Method {
     Opacity,
     /// Pruning by the largest of the three scales.
     Scale,
-    /// Pruning at random.
+    /// Pruning in random order.
     Random,
 }
 
@@ -67,7 +67,7 @@ impl Method {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
-    /// Returns the means by which this method compresses: a recipe and the stages of it that run, or a baseline.
+    /// Returns how this method compresses: by a recipe, of which given stages run, or by a baseline.
     ///
     /// # Errors
     /// Fails only if a built-in preset does not parse.
@@ -108,7 +108,8 @@ impl Method {
     }
 }
 
-/// Means by which a method compresses: a recipe with the stages (pruning, merging) that run, or a baseline.
+/// Recipe or baseline by which a method compresses. A recipe comes with the stages of it that run: pruning, merging or
+/// both.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),

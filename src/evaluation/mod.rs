@@ -3,7 +3,8 @@
 //! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. For the
 //! temporal error (flicker between two frames of a view), the last images of every view that occurs again are kept: 12
 //! bytes per pixel and image, with two images per view (renders of both models), or three with photographs. A run that
-//! computes only a shard (a range of the views) first renders the images that precede its range again.
+//! computes only a shard (a range of the (frame, view) pairs) first renders again, for each view in its range, the last
+//! image before the range.
 
 pub mod baseline;
 pub mod cost;
@@ -331,8 +332,8 @@ impl ModelPair {
         self.views.iter().map(|view| cone.is_outside(&rig.cameras[view.camera as usize])).collect()
     }
 
-    /// Returns the cache key of the scores: the compressed model, the photographs, the views, the background, and whether
-    /// FLIP is computed. The cache adds the original and its cameras to the key.
+    /// Returns the cache key of the scores. It contains the compressed model, the photographs, the views, the
+    /// background, and whether FLIP is computed. The cache adds the original and its cameras to the key.
     fn key(&self) -> Result<CacheKey> {
         if !self.scene.work.is_enabled() {
             return Ok(CacheKey::NONE);

@@ -109,7 +109,7 @@ pub struct PrecisionCurve {
 /// Measurements at one value of a parameter ("setting").
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
-    /// Value of the parameter.
+    /// Value of the varied parameter.
     pub value: f64,
     /// Step size h that belongs to this value: an error of order p grows as h^p. If sums over frames cause the error, h
     /// is the number of frames.
@@ -118,8 +118,8 @@ pub struct PrecisionSetting {
     pub cost: Cost,
     /// Errors of the results with this setting, by the name of the error; [`axis_label`] describes the names.
     pub errors: BTreeMap<String, f64>,
-    /// Mean PSNR in dB on the views that judge the settings, against renders of the whole model; `None` if the setting
-    /// yields no model.
+    /// Mean PSNR in dB, against renders of the whole model, on the views by which settings are judged; `None` if the
+    /// setting yields no model.
     pub psnr: Option<f64>,
 }
 
@@ -131,12 +131,12 @@ pub struct ObservedOrder {
     pub error: String,
     /// Observed order: slope of log error against log step size, fitted by least squares.
     pub observed: f64,
-    /// Order of convergence that theory predicts; `None` if it predicts none.
+    /// Order of convergence of this error that theory predicts; `None` if theory predicts none.
     pub expected: Option<f64>,
 }
 
-/// Error name: root mean square error of renders of the model that a setting yields, against renders of the whole model.
-/// Color values are in [0, 1].
+/// Error name: root mean square error of renders of the model that a setting yields, against renders of the whole
+/// model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
 /// Error name: error that a setting adds to renders, relative to the error [`RENDER_ERROR`] of the finest setting,
 /// which counts as the error of the compressed model itself (see [`added_error`]).
@@ -244,7 +244,7 @@ pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
 }
 
 impl PrecisionDiagram {
-    /// Returns the result as indented JSON.
+    /// Returns all measurements as indented JSON.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');

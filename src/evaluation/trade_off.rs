@@ -72,7 +72,7 @@ pub struct EffortCurve {
 /// Measurements at one value of the parameter of an [`EffortCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortSetting {
-    /// Value of the parameter.
+    /// Value of the varied parameter.
     pub value: u32,
     /// Method, fraction of kept Gaussians, and measurements.
     #[serde(flatten)]

@@ -107,7 +107,7 @@ impl Orders {
     }
 }
 
-/// Returns the position `place`, counted from 1 (the argument is counted from 0), divided by `kept`, the number of
+/// Returns (`place` + 1) / `kept`: the position of a Gaussian in an order, counted from 1, divided by the number of
 /// Gaussians that the stage keeps. If the stage keeps none, divides by one half: every quotient then exceeds 1, and the
 /// order is unchanged.
 fn rank_over(place: u32, kept: usize) -> f64 {

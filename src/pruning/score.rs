@@ -73,7 +73,7 @@ pub struct Scored {
     pub frames_to_cover: usize,
     /// Normalization of every term of the scores: percentiles and weight.
     pub terms: Vec<Term>,
-    /// Numbers of Gaussians with unusual values, such as NaN, by the kind of value.
+    /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
     pub flags: FlagSummary,
     /// Selected Gaussians and ranking, with the user's overrides applied.
     pub selection: Selection,
@@ -233,7 +233,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
-/// Counts the Gaussians with unusual values, by the kind of value.
+/// Counts the Gaussians with unusual values, such as NaN, for each kind of unusual value.
 fn flags(rows: &Rows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {

@@ -90,11 +90,11 @@ pub(super) struct LinearizedFramesWriter {
 }
 
 impl LinearizedFramesWriter {
-    /// Creates a writer to which no frame has been written yet. The attributes `varying` are stored for every frame,
-    /// all others for the first frame only.
+    /// Creates a writer without frames; the scratch file is created in the folder `scratch`. The attributes `varying`
+    /// are stored for every frame, all others for the first frame only.
     ///
     /// # Errors
-    /// Fails if no scratch file can be created in `scratch`.
+    /// Fails if the scratch file cannot be created.
     pub(super) fn new(scratch: &Path, varying: Attributes) -> Result<LinearizedFramesWriter> {
         Ok(LinearizedFramesWriter {
             file: SpillWriter::new(scratch)?,

@@ -205,7 +205,7 @@ impl<'a> OptimizerState<'a> {
         TrajectoryDelta::keyframe_weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
-    /// Returns for each Gaussian whether it is excluded from optimization.
+    /// Returns for each Gaussian whether it is excluded from optimization because it is protected.
     pub(super) fn fixed(&self) -> &[bool] {
         &self.fixed
     }

@@ -199,12 +199,12 @@ struct BestState<Delta, Trajectory> {
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
-    /// Number of deltas that were averaged.
+    /// Number of deltas in the mean.
     count: u32,
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Includes `next` in the mean.
+    /// Adds the delta `next` to the deltas of which this is the mean.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -356,7 +356,7 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Returns the name of the cache entry that holds the checkpoint.
+    /// Returns the name of the cache entry that holds the checkpoint of this refinement.
     fn checkpoint_name(&self) -> String {
         format!("{}-steps", self.stage)
     }

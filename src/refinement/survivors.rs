@@ -13,8 +13,8 @@ const CANDIDATES: f64 = 1.6;
 /// Gaussians are removed in order of increasing error; of equal errors, the higher index goes first. A removed Gaussian
 /// protects its nearest neighbor: each error assumes that all other Gaussians remain, so two neighbors that cover for
 /// each other would otherwise both be removed. Only the Gaussians with the smallest errors are candidates,
-/// [`CANDIDATES`] times as many as have to be removed. If too few of them are unprotected, Gaussians are then removed in
-/// the same order without regard to protection.
+/// [`CANDIDATES`] times as many as have to be removed. If too few of them are unprotected, Gaussians are then removed
+/// in the same order without regard to protection.
 pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &AttributeValues) -> Vec<u32> {
     let removed_count = errors.len().saturating_sub(count);
     let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();

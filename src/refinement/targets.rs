@@ -53,8 +53,8 @@ pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
 }
 
 /// Target views: renders of the original model, in a scratch file. Their cameras are the cameras by which Gaussians are
-/// scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a training view
-/// only the pixels of a grid are rendered; validation and test views are whole.
+/// scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a training
+/// view only the pixels of a grid are rendered; validation and test views are whole.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
