@@ -40,8 +40,9 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens a scene and sets its limits within the memory budget. `plan` makes the plan of the run from facts about the
-/// scene. A stream is measured while it arrives, see [`receive_measured`]; then its statistics are returned as well.
+/// Opens the scene that `options` describe and sets its limits within the memory budget. `plan` makes the plan of the
+/// run from facts about the scene. Returns the scene, the plan of the run, and, if the input is a stream that was
+/// measured while it arrived (see [`receive_measured`]), the statistics of the Gaussians.
 ///
 /// # Errors
 /// Fails if the input, the cameras or the budget is invalid, or if `plan` fails. `plan` is called before any frame of a
@@ -79,7 +80,9 @@ pub fn open_to_measure(
     Ok((scene, stages, None))
 }
 
-/// Sends the plan of the run and the time forecast as messages, if the user asked for them.
+/// Sends the plan of the run and the forecast of its time and memory as messages, if the user asked for them. Also
+/// stores the forecast in `journal`. A run of only one shard (part of a divided stage) has no forecast. `measured`:
+/// kinds of statistics that were already computed while the input, a stream, arrived.
 fn send_forecast(
     scene: &mut Scene,
     plan: &MemoryPlan,
@@ -102,9 +105,11 @@ fn send_forecast(
     Ok(())
 }
 
-/// Packs a stream into a scratch container. If memory suffices, also computes statistics of the frames as they arrive.
-/// `loaded` holds the user's cameras, if any. Returns the statistics unless the assumptions about the times of the
-/// stream (see the module) proved wrong.
+/// Packs a stream into a scratch container. If memory suffices, also computes the statistics of the Gaussians while the
+/// frames arrive. `loaded` holds the user's cameras, if any. `plan` makes the plan of the run from facts about the
+/// scene. Returns the scene, the plan of the run, and the statistics. The statistics are `None` if memory did not
+/// suffice, if an assumption about the times of the stream (see the module) proved wrong, or if Gaussians with NaN or
+/// infinity have to be dropped.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -197,9 +202,9 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about the limits of a stream, if the user asked for the plan or the forecast. `peak`: maximum
-/// memory, bytes. `most`: number of frames that fit the memory limit. `to_measure`: number of frames that can be
-/// measured as they arrive.
+/// Sends a message about the memory that a stream takes or the number of its frames that fit, if the user asked for the
+/// plan or the forecast. `peak`: maximum memory, bytes. `most`: maximum number of frames that fit the memory limit.
+/// `to_measure`: maximum number of frames that can be measured while they arrive.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
@@ -213,8 +218,9 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Returns the statistics that were computed while the frames arrived. Returns `None`, and adds a note to the scene, if
-/// an assumption about the times of the stream proved wrong or Gaussians have to be dropped.
+/// Completes the statistics that were computed while the frames arrived, and returns them. Returns `None`, and adds a
+/// note to the scene, if an assumption about the times of the stream proved wrong, or if Gaussians with NaN or infinity
+/// have to be dropped.
 fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
@@ -238,13 +244,13 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &m
     }
 }
 
-/// Returns a virtual rig (cameras placed by the program) around the first of the frames `held` in memory.
+/// Returns a virtual rig (cameras placed by the program) around the first frame of `held`, the frames in memory.
 fn rig_around(held: &FramesInMemory) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.median, bounds.extent())
 }
 
-/// Running statistics of the frames of a stream received so far.
+/// Running statistics of all Gaussians over the frames of a stream received so far.
 struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
@@ -289,7 +295,8 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// Returns a description of the assumption about the stream that proved wrong, if any.
+    /// Returns a description of the assumption about the times of the stream that proved wrong, if any. `complete` is
+    /// the plan of the scan made from the times of all frames.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.can_finish(self.plan) {
             return Some("the frames are not evenly spaced in time");
@@ -302,11 +309,12 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Assignment of views to the frames of a stream while later frames are unknown: a frame has the views with exactly its
-/// time, and all views without a time.
+/// Rule that assigns views to the frames of a stream while later frames are unknown: a frame gets the views of the rig
+/// that have exactly its time, and all views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
-    /// Time and index in the rig of each view of the split that has a time, sorted by time, then index.
+    /// Time and index in the rig of each view that belongs to the requested split and has a time; sorted by time, then
+    /// by index.
     timed: Vec<(f64, usize)>,
     timeless: Vec<usize>,
     tolerance: f64,
@@ -327,7 +335,7 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// Returns the view number and camera index of each view of a frame at `time`, in the order of the rig.
+    /// Returns the views of a frame at `time`, each as its view number and camera index, in the order of the rig.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

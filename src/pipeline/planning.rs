@@ -1,4 +1,4 @@
-//! Input of the planning of stages: the request, and facts about the input model that several stages depend on.
+//! Information from which the stages of a run are planned: the request of the user, and facts about the input model.
 
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
@@ -29,7 +29,8 @@ impl InputMeta {
     }
 }
 
-/// Input of the planning of stages: the request of the user, and decisions and facts that several stages depend on.
+/// Information from which the stages of a run are planned: the request of the user, facts about the input, and
+/// decisions that several stages depend on.
 pub struct Planning<'a> {
     /// Request of the user.
     pub request: &'a Request,
@@ -56,19 +57,19 @@ pub struct Planning<'a> {
 }
 
 impl Planning<'_> {
-    /// Returns the requested number of Gaussians as a fraction of the input's, if a target was requested.
+    /// Returns the requested number of Gaussians divided by that of the input; `None` if no number was requested.
     pub fn target_fraction(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 
-    /// Returns whether refinement chooses the SH degree for a requested size on disk. For each degree it refines as
-    /// many Gaussians as fit the size, and takes the degree with the best quality.
+    /// Returns whether refinement chooses the SH degree for a requested size on disk. If so, the run refines, for each
+    /// degree, as many Gaussians as fit the size, and takes the degree with the best quality.
     pub fn chooses_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
     }
 
-    /// Returns whether Gaussians are removed by a ranking that rendered views determine.
+    /// Returns whether Gaussians are pruned in the order of a ranking that is measured on rendered views.
     pub fn prunes_by_views(&self) -> bool {
         self.renders_views && self.prunes
     }
@@ -80,19 +81,19 @@ pub(crate) enum MemoryFallback {
     /// Nothing is omitted: full refinement.
     #[default]
     Nothing,
-    /// Parameter deltas (what refinement adds to stored values) are constant in time.
+    /// Time-varying deltas are omitted: the values that refinement adds to stored parameters are constant in time.
     ConstantInTime {
-        /// Smallest memory limit with which deltas would vary in time, bytes.
+        /// Smallest memory limit, bytes, with which the added values would vary in time.
         required_bytes: u64,
     },
-    /// Parameter deltas are constant in time, and SH coefficients above degree 0 are not refined.
+    /// In addition to time-varying deltas, the refinement of SH coefficients above degree 0 is omitted.
     WithoutHarmonics {
-        /// Smallest memory limit with which SH coefficients above degree 0 would be refined, bytes.
+        /// Smallest memory limit, bytes, with which SH coefficients above degree 0 would be refined.
         required_bytes: u64,
     },
-    /// Nothing is refined.
+    /// Refinement is omitted completely.
     WithoutRefinement {
-        /// Smallest memory limit with which anything would be refined, bytes.
+        /// Smallest memory limit, bytes, with which at least a part of refinement would run.
         required_bytes: u64,
     },
 }

@@ -33,12 +33,12 @@ pub enum Target {
     Ratio(f64),
 }
 
-/// Goal by which the number of Gaussians in the output is found.
+/// Goal from which the program finds the number of Gaussians in the output.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// The smallest output that has at least this quality.
+    /// Smallest output with at least this quality.
     Quality(Quality),
-    /// The best output whose files together have at most this number of bytes.
+    /// Best output whose files together have at most this number of bytes.
     Bytes(u64),
 }
 
@@ -47,7 +47,8 @@ pub enum Goal {
 pub enum Quality {
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     Psnr(f64),
-    /// Maximum loss of mean PSNR against photographs, compared with the original model.
+    /// Maximum amount by which the mean PSNR against photographs may be lower for the output than for the original
+    /// model.
     Loss {
         /// Maximum loss, dB.
         most: f64,
@@ -59,7 +60,7 @@ pub enum Quality {
 /// Returns `value` if it is a valid number of decibels for a quality: above 0 and at most 100.
 ///
 /// # Errors
-/// Fails with a message that names the parameter `name` if `value` is out of this range.
+/// Fails if `value` is out of this range. The error message names the parameter by `name`.
 pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, String> {
     match value > 0.0 && value <= 100.0 {
         true => Ok(value),
@@ -78,7 +79,8 @@ pub struct Request {
     pub kind: Option<OutputKind>,
     /// Parameters of the method.
     pub recipe: Recipe,
-    /// Digest of the input for which the recipe was written, if known. For another input the user gets a note.
+    /// Digest of the input for which the recipe was written, if known. If the actual input has another digest, the user
+    /// gets a note.
     pub made_for: Option<String>,
     /// Minimum PSNR, dB, of renders of an archive against renders of the result before its values are quantized.
     /// `None`: derived from the quality of the result.
@@ -100,8 +102,8 @@ pub struct Request {
 }
 
 impl Request {
-    /// Returns a request that compresses `input` by the parameters of `recipe` and writes to `output`. Keeps and drops
-    /// no particular Gaussians and replaces no existing output.
+    /// Returns a request that compresses `input` by the parameters of `recipe` and writes to `output`. The request
+    /// names no Gaussians to keep or drop, and existing output is not replaced.
     pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
         Request {
             input,

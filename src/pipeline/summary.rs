@@ -37,8 +37,8 @@ pub struct GoalSummary {
     /// PSNR or loss of the output on views that the search did not use, dB.
     #[serde(deserialize_with = "number")]
     pub held: f64,
-    /// Names of the views that the search did not use. A view between the cameras of the scene has only the frame in
-    /// its name.
+    /// Names of the views that the search did not use. A name consists of frame and view number; the name of a view
+    /// from a camera between those of the scene has only the frame.
     pub held_pictures: Vec<String>,
     /// Every number of Gaussians that was tried, with its PSNR or loss on the views that the search used, dB.
     #[serde(deserialize_with = "sizes")]
@@ -59,14 +59,17 @@ pub struct ArchiveSummary {
     /// Number of bytes of each part of the archive; `None` for an archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parts: Option<ArchiveSize>,
-    /// Error bound of every attribute by its name, in the unit of the attribute; only for an archive of frames.
+    /// Error bound of every attribute, by name of the attribute and in its unit; `None` unless the archive stores
+    /// frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bounds: Option<BTreeMap<String, f64>>,
-    /// Number of bits of every attribute and tensor, by name; empty for an archive of frames.
+    /// Number of bits that each attribute and each tensor takes in the archive, by name; empty for an archive of
+    /// frames.
     pub bits: BTreeMap<String, f64>,
     /// Measurements from which the quantization steps were derived. Each entry has the name of an attribute or tensor,
-    /// log2 of its step (of twice the error bound for frames), the squared error of renders caused by this step alone,
-    /// and the number of bits at this step (for frames: in some blocks of Gaussians).
+    /// log2 of its quantization step (in an archive of frames: of twice its error bound), the squared error of renders
+    /// if only this attribute or tensor is quantized with this step, and the number of bits that it takes then (in an
+    /// archive of frames: its bits in some blocks of Gaussians).
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
@@ -77,7 +80,7 @@ pub struct InputSummary {
     pub path: String,
     /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
-    /// Digest of the bytes that were read.
+    /// Digest of the bytes of the input.
     pub digest: String,
     /// Number of Gaussians, N.
     pub gaussians: usize,
@@ -87,7 +90,7 @@ pub struct InputSummary {
     pub sh_degree: usize,
     /// Names of the attributes that vary in time.
     pub varying: Vec<String>,
-    /// Number of bytes of all files that a renderer opens; for a stream, of the bytes that arrived.
+    /// Number of bytes of all files of the input that a renderer opens; for a stream, number of bytes that arrived.
     pub bytes: u64,
     /// Number of bytes of each part of the input.
     pub size: ModelSize,
@@ -151,7 +154,7 @@ impl CameraSummary {
     }
 }
 
-/// Counts of the merge stage, which replaces clusters of Gaussians by one proxy each.
+/// Summary of the merge stage, which replaces clusters of Gaussians by one Gaussian each, a proxy.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MergeSummary {
     /// Reference frame, at which Gaussians were compared and merged.
@@ -162,7 +165,7 @@ pub struct MergeSummary {
     pub members: usize,
     /// Rule for the opacity of a proxy.
     pub opacity: ProxyOpacity,
-    /// Counts of every merge pass.
+    /// Statistics of every merge pass, in order: numbers of candidate pairs, of joins, and others.
     pub passes: Vec<PassCounts>,
     /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units;
     /// `None` without a deformation field.
@@ -170,7 +173,7 @@ pub struct MergeSummary {
 }
 
 impl MergeSummary {
-    /// Sets the numbers of proxies and members from the merged clusters `clusters`.
+    /// Sets the numbers of proxies and of merged Gaussians from `clusters`, the merged clusters.
     pub(super) fn count(&mut self, clusters: &[Cluster]) {
         self.proxies = clusters.len();
         self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
@@ -220,9 +223,9 @@ pub struct Summary {
     pub stages: Vec<StageRecord>,
     /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
-    /// Numbers of Gaussians with unusual values.
+    /// Numbers of Gaussians with unusual values, by kind.
     pub flags: FlagSummary,
-    /// Counts of merging (stage 3 of the paper); `None` if nothing was merged.
+    /// Numbers of Gaussians that were merged (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
@@ -249,7 +252,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Returns the amount read from the input by all stages together, in full reads (every frame once).
+    /// Returns the amount that all stages together read from the input. Unit: full reads (reading every frame once).
     pub fn full_reads(&self) -> f64 {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }

@@ -21,7 +21,8 @@ pub(crate) struct Prune {
     pub merges: bool,
 }
 
-/// Adds the stage to `stages`.
+/// Adds the stage that prunes Gaussians to `stages`. If the user asks for merging only, also records that pruning is
+/// omitted.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if !planning.prunes {
         stages.leave_out("pruning", "--merge-only");
@@ -47,9 +48,11 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors (Gaussians that are not removed); with a `target`, this number. If merging later
-    /// reduces them to the target, returns all Gaussians that may stay, because only merging can tell how many it
-    /// needs.
+    /// Returns the number of survivors (Gaussians that are not removed). With a `target`, the number of Gaussians
+    /// requested, this is the target; without one, it is the number that the thresholds of the recipe select. If
+    /// Gaussians are not pruned by rank, it is the number of all Gaussians that may stay. The same holds if merging
+    /// later reduces the survivors to the target, because only merging can tell how many it needs. `ranked` holds all
+    /// Gaussians that may stay.
     ///
     /// # Errors
     /// Fails if the target is below the number of Gaussians that must stay or above the number that may stay.
