@@ -54,8 +54,8 @@ fn processor_seconds() -> Option<f64> {
 /// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Amounts that one full read takes: every frame of the input is read once. Reads of stages are reported as
-    /// multiples of it.
+    /// Amounts that are read when every frame of the input is read once (one full read). Reads of stages are reported
+    /// as multiples of it.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -95,9 +95,9 @@ impl Journal {
         Ok(value)
     }
 
-    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage like
-    /// [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be divided among
-    /// processes.
+    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage `name` with
+    /// `compute` like [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be
+    /// divided among processes.
     ///
     /// # Errors
     /// Fails if `compute` fails, or if the cache cannot be read or written. A run that computes only one shard (part of

@@ -86,8 +86,8 @@ impl LeftOut {
     }
 }
 
-/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. null becomes NaN in the place
-/// of the number.
+/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. The value null in place of the
+/// number becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
