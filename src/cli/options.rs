@@ -34,8 +34,8 @@ use splatsieve::progress::Events;
 use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
-/// Returns the request of `compress`. Options that the command line does not give are taken from the recipe file, if it
-/// records the options of an earlier run.
+/// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
+/// the recipe file, if it records the options of an earlier run.
 ///
 /// # Errors
 /// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal
@@ -216,7 +216,8 @@ pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
     }
 }
 
-/// Returns the options of the page that shows the result of `request` beside its input (`compress --view`).
+/// Returns the options of the page that shows the result of `request` beside its input (`compress --view`). `output` is
+/// the path of the page; `None` chooses a path beside the result.
 ///
 /// # Errors
 /// Fails if the input is a stream, or if the page cannot be written. Both are checked before the run.
@@ -319,7 +320,7 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
     })
 }
 
-/// Returns how precisely and with which compression `convert` stores the values of a container.
+/// Returns the compression and the error bounds with which `convert` stores the values of a container.
 pub(super) fn storing(args: &Convert) -> StoragePrecision {
     match (args.raw, args.max_error.clone()) {
         (true, _) => StoragePrecision::Exact(Compression::Raw),
@@ -381,8 +382,8 @@ pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }
 
-/// Returns the memory limit, and whether the memory plan is printed. If a limit is given, the process returns freed
-/// memory to the system from this call on.
+/// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is
+/// given, the process returns freed memory to the system from this call on.
 fn memory_budget(memory: Memory) -> Budget {
     if memory.memory.is_some() {
         return_freed_memory();
@@ -390,7 +391,7 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the facts about the training of the model that the command line states.
+/// Returns the facts about the training of the model that the options `trained` of the command line state.
 fn conventions(trained: &Trained) -> TrainingConventions {
     let zero_rotation = trained.zero_rotation.map(|handling| match handling {
         ZeroRotationArg::Drop => ZeroRotation::Drop,

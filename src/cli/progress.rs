@@ -161,8 +161,8 @@ struct RunPosition {
 }
 
 impl RunPosition {
-    /// Notes that the task `name` begins. If it is a stage of the run, marks it as running and returns its label `[k/n]
-    /// name`. Otherwise returns `name` unchanged.
+    /// Notes that the task `name` begins at the time `now`. If it is a stage of the run, marks it as running and
+    /// returns its label `[k/n] name`. Otherwise returns `name` unchanged.
     fn enter(&mut self, name: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
         if self.current.is_none_or(|(stage, _)| stage != place) {
@@ -202,7 +202,8 @@ struct BarSnapshot<'a> {
 }
 
 impl<'a> BarSnapshot<'a> {
-    /// Returns the data of a bar whose progress is `state`. `run` is given if the task is a stage of a run.
+    /// Returns the data of the bar of the task `name`, whose progress is `state`, counted in `unit`. `run` is given if
+    /// the task is a stage of a run.
     fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // The rate is unknown before the first unit is done.
@@ -333,7 +334,8 @@ impl Drop for Log {
     }
 }
 
-/// Formats a rate with two or three digits. Below 0.5 units per second, the text is the time per unit.
+/// Formats the rate `per_second` (units per second) with two or three digits. Below 0.5 units per second, the text is
+/// the time per unit.
 fn rate(per_second: f64, unit: &str) -> String {
     if per_second > 0.0 && per_second < 0.5 {
         return format!("{} each", format_duration(1.0 / per_second));

@@ -40,8 +40,8 @@ pub(super) struct RecipeFlags {
 }
 
 impl RecipeFlags {
-    /// Returns the record in the recipe file of the run that wrote the file: program, input and options. The record is
-    /// empty if no recipe file is given.
+    /// Returns the record that the given recipe file holds of the run that wrote it: program, input and options. The
+    /// record is empty if no recipe file is given.
     ///
     /// # Errors
     /// Fails if the file cannot be read or its record is invalid.
@@ -181,7 +181,8 @@ impl TypedValueParser for SettingParser {
     }
 }
 
-/// Parses a recipe setting, `key=value` or `section.key=value`.
+/// Parses the recipe setting `text`, of the form `key=value` or `section.key=value`. Fails with a message for other
+/// texts and unknown keys.
 fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     let (name, value) =
         text.split_once('=').ok_or_else(|| format!("expected KEY=VALUE such as mu=2, found {}", quoted(text)))?;
@@ -209,7 +210,8 @@ fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     }
 }
 
-/// Parses a merge pass, `EPSILON,D0,RHO,TAU_M`.
+/// Parses the merge pass `text`: the four thresholds `EPSILON,D0,RHO,TAU_M` of a pass. Fails with a message for other
+/// texts.
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
@@ -218,7 +220,7 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     }
 }
 
-/// Parses numbers that are separated by commas.
+/// Parses the numbers in `text`, which are separated by commas. Fails with a message for other texts.
 pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<Vec<T>, String> {
     text.split(',').map(|part| part.trim().parse().map_err(|_| format!("{} is not a number", quoted(part)))).collect()
 }
