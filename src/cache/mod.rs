@@ -71,7 +71,7 @@ impl Cache {
         Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
-    /// Makes all keys used from now on depend on `context` as well.
+    /// Makes all keys used from now on depend on `context`, too.
     pub fn depend_on(&mut self, context: CacheKey) {
         if let Some(dir) = &mut self.dir {
             dir.depend_on(context);
@@ -110,7 +110,7 @@ impl Cache {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
 
-    /// Returns the stored result of `stage` for `key`, if there is one.
+    /// Returns the stored result of `stage` for `key`; `None` if there is none.
     ///
     /// # Errors
     /// Fails if the folder cannot be read. A damaged entry counts as missing and causes a note.
@@ -159,9 +159,9 @@ impl Cache {
         }
     }
 
-    /// Returns the result of `stage`, which is computed in shards (ranges of its `units` units of work). Other runs may
-    /// have computed some of the shards. `compute` returns the result of a range; `join` combines the results of all
-    /// ranges in order. The combined result must not depend on how the units are divided.
+    /// Returns the result of `stage` for `key`, which is computed in shards (ranges of its `units` units of work).
+    /// Other runs may have computed some of the shards. `compute` returns the result of a range; `join` combines the
+    /// results of all ranges in order. The combined result must not depend on how the units are divided.
     ///
     /// # Errors
     /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
@@ -293,7 +293,8 @@ impl Cache {
         Err(Error::ShardDone(report))
     }
 
-    /// Adds a note for the user if shards of `stage` are stored that belong to another input or recipe.
+    /// Adds a note for the user if the folder `dir` holds shards of `stage` that have another key than `key`, because
+    /// they belong to another input or recipe.
     fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in dir.foreign_inputs(stage, key)? {
             self.add_note(format!(

@@ -15,7 +15,7 @@ use crate::files::atomic::{Replace, StagedFile};
 /// Number of bytes that this process has read back from all [`Spill`]s so far.
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
-/// Data on disk that is written once and then read in pieces, in any order.
+/// Data on disk that is written once. Any part of it can then be read, in any order.
 #[derive(Debug)]
 pub struct Spill {
     file: File,
