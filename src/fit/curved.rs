@@ -88,9 +88,9 @@ const CONVERGED: f64 = 1e-3;
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Frames at which the time window of a curve has at most this value are not used to fit the opacity of the curve.
-/// Frames at which window × opacity is at most this value times the smallest visible opacity are not used to fit its
-/// motion.
+/// Limit below which frames are left out of the fit of a curve. The fit of its opacity leaves out frames at which its
+/// time window has at most this value. The fit of its motion leaves out frames at which window × opacity is at most
+/// this value times the smallest visible opacity.
 const MIN_WEIGHT: f64 = 1e-3;
 
 /// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,
@@ -137,7 +137,7 @@ fn depth(opacity: f64) -> f64 {
     -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
-/// Returns one curve of constant opacity, whose window is infinitely wide.
+/// Returns one curve of the form `form` for `track`, with constant opacity: its window is infinitely wide.
 fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_visible(frame));
@@ -146,10 +146,10 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// Returns one curve whose logarithm of opacity is the parabola that fits the visible frames best, weighted by squared
-/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does
-/// not open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is
-/// long.
+/// Returns one curve for `track` whose logarithm of opacity is the parabola that fits the visible frames best, weighted
+/// by squared opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the
+/// parabola does not open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the
+/// sequence is long.
 fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     let (first, last) = (track.times[0], track.times[track.len() - 1]);
     let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
@@ -173,7 +173,7 @@ fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     Some(CubicTrack { opacity: peak, ..curve })
 }
 
-/// Returns one curve whose time window has the mean and the variance of the opacity over time.
+/// Returns one curve for `track` whose time window has the mean and the variance of the track's opacity over time.
 fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
@@ -194,8 +194,8 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves. Their centers are evenly spaced over the time from `start` to `end`, in
-/// which the Gaussian is visible.
+/// Returns `count` + 1 overlapping curves for `track`. Their centers are evenly spaced over the time from `start` to
+/// `end`, in which the Gaussian is visible.
 fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
@@ -239,9 +239,9 @@ fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// Returns a curve that follows the position and rotation of `track` by least squares. The weight of a frame is its
-/// opacity times `weight(frame)`. Scales and SH coefficients are weighted means. The opacity of the curve is left at 0,
-/// for the caller to set.
+/// Returns a curve of the form `form` that follows the position and rotation of `track` by least squares. Its time
+/// window has the center `center` and the width `width`. The weight of a frame is its opacity times `weight(frame)`.
+/// Scales and SH coefficients are weighted means. The opacity of the curve is left at 0, for the caller to set.
 fn fit_motion(
     track: &FittedTrack,
     form: CurveForm,
@@ -282,9 +282,9 @@ fn fit_motion(
     }
 }
 
-/// Returns the largest error of `curves` relative to `tolerance` (1 means just within it; infinite if an error is NaN),
-/// and the errors over all visible frames. Where several curves are visible, each must be close to the Gaussian, in
-/// proportion to its share of the optical depth.
+/// Compares `curves` with `track` at all visible frames. Returns the largest error relative to `tolerance` (1 means
+/// just within it; infinite if an error is NaN), and the errors over these frames. Where several curves are visible,
+/// each must be close to the Gaussian, in proportion to its share of the optical depth.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
     let (mut worst, mut misfit) = (0.0f64, FitError::default());
     for frame in 0..track.len() {

@@ -45,8 +45,8 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     pieces
 }
 
-/// Adds the pieces for the frames `span` to `pieces`, halving the span where one piece is not accurate enough. A span
-/// has 2ᵏ frames and may extend beyond the last frame.
+/// Adds the pieces of `track` for the frames `span` to `pieces`. Halves the span where one piece differs from the track
+/// by more than `tolerance`. A span has 2ᵏ frames and may extend beyond the last frame.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();
