@@ -98,7 +98,7 @@ pub struct FrameMeans {
 /// Mean scores of one set of images compared with another, such as renders with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Means over all views.
+    /// Mean scores over all views.
     #[serde(flatten)]
     pub overall: QualityMeans,
     /// Means over the frames of each view, by increasing view number.
@@ -128,7 +128,7 @@ pub struct RigSides {
     /// Means over the views inside: in the directions of the training cameras and between them. `None` if there are no
     /// such views.
     pub inside: Option<QualityMeans>,
-    /// Means over the views outside.
+    /// Means over the views outside the rig.
     pub outside: QualityMeans,
 }
 

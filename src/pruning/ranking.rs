@@ -127,7 +127,7 @@ fn ratio(x: f64, tau: f64) -> f64 {
     }
 }
 
-/// Returns for each id its position in `order`, from 0.
+/// Returns the position, from 0, of every id in `order`, which contains each id once.
 fn positions(order: &[u32]) -> Vec<u32> {
     let mut positions = vec![0; order.len()];
     for (place, &id) in order.iter().enumerate() {

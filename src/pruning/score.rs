@@ -71,7 +71,7 @@ pub struct Scored {
     /// [`frames_to_cover`].
     #[serde(rename = "frames_to_see")]
     pub frames_to_cover: usize,
-    /// Normalization of every term of the scores: percentiles and weight.
+    /// Terms of the scores: the quantities that are added, each with the percentiles by which it is normalized.
     pub terms: Vec<Term>,
     /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
     pub flags: FlagSummary,

@@ -56,8 +56,9 @@ pub struct Adam {
     change: ParamDelta,
     /// Running mean of the derivatives, and running mean of the squared derivatives.
     means: [Gaussians; 2],
-    /// Factors on the learning rates, one per Gaussian: first for positions (0.04 times the geometric mean of the
-    /// scales, scene units), then for all other attributes (1). Both are 0 for Gaussians that are not optimized.
+    /// Two lists of factors on the learning rates, with one factor per Gaussian: the first list for positions (0.04
+    /// times the geometric mean of the scales of the Gaussian, scene units), the second for all other attributes (1).
+    /// Both factors are 0 for Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,

@@ -442,7 +442,7 @@ impl<'a> OptimizerState<'a> {
         .unwrap_or_else(|| Ok(zero().1))
     }
 
-    /// Creates the renderer and the frame state buffer of one thread.
+    /// Creates a renderer and a frame state buffer, as each thread needs them.
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
     }

@@ -154,8 +154,8 @@ pub(crate) struct RefineRun<'a> {
     key: CacheKey,
 }
 
-/// Decides when the next checkpoint of a refinement is written. A phase is one prune step with the optimization steps
-/// before it, or the final steps.
+/// State that decides when the next checkpoint of a refinement is written. A phase is one prune step with the
+/// optimization steps before it, or the final steps.
 struct CheckpointTimer {
     /// Cache key of the refinement, under which its checkpoints are stored.
     key: CacheKey,
