@@ -400,7 +400,7 @@ fn figure(k: usize, n: usize) -> SurfacePoint {
         let end = n * share / 100;
         if k < end {
             let at = on_sphere(k - start);
-            // Of an ellipsoid, by the formula of Thomsen, to 1%.
+            // Surface area of the ellipsoid by Thomsen's formula, which is accurate to 1%.
             let [a, b, c] = limb.axes.to_array().map(|axis| axis.powf(1.6));
             let area = 2.0 * TAU * ((a * b + a * c + b * c) / 3.0).powf(1.0 / 1.6);
             return SurfacePoint {

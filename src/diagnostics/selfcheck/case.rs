@@ -11,7 +11,7 @@ use crate::error::Result;
 pub struct CaseResult {
     /// Short name of the self-check case.
     pub name: &'static str,
-    /// Description of the values that are compared, and of what they are compared with.
+    /// Description, for tables, of the compared values and of the reference with which they are compared.
     pub what: &'static str,
     /// Largest error that a correct program may have. Errors are relative, or in the unit that `what` names.
     pub bound: f64,
@@ -53,22 +53,22 @@ impl Default for LargestError {
 }
 
 impl LargestError {
-    /// Adds the error of one value; NaN counts as infinite.
+    /// Keeps the larger of `error`, the error of one value, and the largest error so far. A NaN counts as infinite.
     pub(super) fn add(&mut self, error: f64) {
         self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
     }
 
-    /// Adds the error |got − expected| / `unit`; `unit` must be positive.
+    /// Compares one value: its error is |got − expected| / `unit`, where `unit` must be positive.
     pub(super) fn near(&mut self, got: f64, expected: f64, unit: f64) {
         self.add((got - expected).abs() / unit);
     }
 
-    /// Adds the relative error |got − expected| / |expected|, or 0 if both are equal.
+    /// Compares one value: its error is |got − expected| / |expected|, or 0 if both are equal.
     pub(super) fn relative(&mut self, got: f64, expected: f64) {
         self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
     }
 
-    /// Adds the error 1 if `got` differs from `expected`, else 0.
+    /// Compares one value: its error is 1 if `got` differs from `expected`, else 0.
     pub(super) fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
         self.add(if got == expected { 0.0 } else { 1.0 });
     }
