@@ -43,7 +43,7 @@ pub struct DryRunReport {
     pub bytes: u64,
     /// Cameras whose views would be rendered.
     pub cameras: CameraSummary,
-    /// Number of Gaussians in the output, if it is known in advance; `None` if it depends on renders.
+    /// Number of Gaussians in the output; `None` if it is found only during the run.
     pub gaussians: Option<usize>,
     /// Text that states how the number of Gaussians in the output is determined.
     pub size_by: String,
@@ -67,8 +67,8 @@ pub struct DryRunReport {
 /// machine for the time estimates.
 ///
 /// # Errors
-/// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
-/// arrived completely.
+/// Fails for every reason for which a run would fail before its first stage. Also fails for a stream, whose size is
+/// unknown before it has arrived completely.
 pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     if request.input.is_stream() {
         return Err(Error::usage(

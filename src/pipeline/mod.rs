@@ -94,8 +94,9 @@ pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<
     scene.plan_memory(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
-/// Measures the statistics of a scene, scores its Gaussians and selects the survivors (Gaussians that are not removed)
-/// by the parameters of `recipe`. `user` states which Gaussians the user wants to keep or to drop in any case.
+/// Computes the statistics of the Gaussians of `scene`, scores the Gaussians and selects the survivors (Gaussians that
+/// are not removed) by the parameters of `recipe`. Returns statistics, scores and selection. `user` states which
+/// Gaussians the user wants to keep or to drop in any case.
 ///
 /// # Errors
 /// Fails if frames cannot be read, or if their times do not allow statistics of motion.

@@ -202,9 +202,10 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about the memory that a stream takes or the number of its frames that fit, if the user asked for the
-/// plan or the forecast. `peak`: maximum memory, bytes. `most`: maximum number of frames that fit the memory limit.
-/// `to_measure`: maximum number of frames that can be measured while they arrive.
+/// Sends a message about a stream before it is received: its maximum memory if the user asked for the forecast, or the
+/// numbers of frames that fit the memory limit if the user asked for the plan. `peak`: maximum memory, bytes. `most`:
+/// maximum number of frames that fit the memory limit. `to_measure`: maximum number of frames that can be measured
+/// while they arrive.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
@@ -255,7 +256,8 @@ struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Views of the frames received so far, under the assumption that views have exactly the times of frames.
+    /// Views that belong to the frames received so far, under the assumption that views have exactly the times of
+    /// frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(ViewSampler, RunningContribution)>,

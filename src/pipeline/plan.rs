@@ -59,10 +59,10 @@ impl RunPlan {
     }
 
     /// Returns the plan of a run within the memory limit of `request`. Refinement is reduced until the plan fits: first
-    /// its parameter deltas (what it adds to stored values) become constant in time, then SH coefficients above degree
-    /// 0 are not refined either, then nothing is refined. If even a run without refinement exceeds the limit, the plan
-    /// with full refinement is returned; it is refused later with an error that names the smallest sufficient limit.
-    /// The plan includes the measurement of the quality of the result if there is memory for it.
+    /// the values that it adds to stored parameters (parameter deltas) become constant in time, then SH coefficients
+    /// above degree 0 are not refined either, then nothing is refined. If even a run without refinement exceeds the
+    /// limit, the plan with full refinement is returned; it is refused later with an error that names the smallest
+    /// sufficient limit. The plan includes the measurement of the quality of the result if there is memory for it.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.
@@ -248,7 +248,8 @@ impl RunPlan {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
-    /// Returns the plan as text for display: numbers of Gaussians, parameters of the stages, and omitted stages.
+    /// Returns the plan as text for display: numbers of Gaussians that ranking and refinement leave, parameters of the
+    /// stages, and omitted stages.
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);

@@ -10,7 +10,7 @@ use crate::scene::Scene;
 /// Facts about a scene that are known before its frames are read.
 #[derive(Debug, Clone, Copy)]
 pub struct InputMeta {
-    /// Number of Gaussians, N.
+    /// Number of Gaussians in the scene, N.
     pub gaussians: usize,
     /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
@@ -34,7 +34,7 @@ impl InputMeta {
 pub struct Planning<'a> {
     /// Request of the user.
     pub request: &'a Request,
-    /// Facts about the input.
+    /// Facts about the input that are known before its frames are read.
     pub input: InputMeta,
     /// Kind of output that is written.
     pub output: OutputKind,

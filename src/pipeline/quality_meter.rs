@@ -21,7 +21,8 @@ pub(super) enum QualityReference<'a> {
     Photographs(Photographs),
 }
 
-/// Views on which the PSNR of compressed models is measured, with the images to which their renders are compared.
+/// Views on which the PSNR of compressed models is measured, with the images to which renders of the models are
+/// compared.
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
@@ -53,8 +54,9 @@ impl<'a> QualityMeter<'a> {
         Ok(QualityMeter { scene, cameras, pictures, comparison })
     }
 
-    /// Returns the mean PSNR of renders of `source`, dB. If `held`, measures on the views held back from the search,
-    /// otherwise on the views of the search.
+    /// Returns the mean PSNR, dB, of renders of the model `source` against the images of the meter (renders of the
+    /// original, or photographs). If `held`, measures on the views held back from the search, otherwise on the views of
+    /// the search.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read.

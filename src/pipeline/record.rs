@@ -87,7 +87,7 @@ pub struct RunOptions {
     pub link: Option<LinkMode>,
 }
 
-/// Tables `[provenance]` and `[run]` of a recipe file, which its parameters of the method follow.
+/// Tables `[provenance]` and `[run]` of a recipe file: everything in it except the parameters of the method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecipeRecord {
     /// Program and input with which the recipe file was written.
@@ -140,8 +140,8 @@ impl RunOptions {
 }
 
 impl RecipeRecord {
-    /// Returns the record of a run of `request`. `user` holds the ids of the Gaussians that the user keeps and drops,
-    /// `input_digest` is the digest of the input.
+    /// Returns the record that describes a run of `request`. `user` holds the ids of the Gaussians that the user keeps
+    /// and drops, `input_digest` is the digest of the input.
     pub(super) fn new(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),

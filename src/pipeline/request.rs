@@ -50,9 +50,9 @@ pub enum Quality {
     /// Maximum amount by which the mean PSNR against photographs may be lower for the output than for the original
     /// model.
     Loss {
-        /// Maximum loss, dB.
+        /// Maximum loss of mean PSNR, dB.
         most: f64,
-        /// Folder of the photographs.
+        /// Folder with the photographs, against which both models are compared.
         photographs: PathBuf,
     },
 }

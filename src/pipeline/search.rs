@@ -44,7 +44,8 @@ const NAME: &str = "search";
 const FIRST_FRACTION: f64 = 0.2;
 /// Usual number of sizes (numbers of Gaussians) that are tried; used for estimates of time.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Maximum number of sizes (numbers of Gaussians) that are tried, apart from the full size if all of them fail.
+/// Maximum number of sizes (numbers of Gaussians) that are tried. If all of them fail, the model of all Gaussians that
+/// may stay is tried as well.
 const MAX_SIZES: usize = 8;
 /// Ratio of the smallest size (number of Gaussians) that passed to the largest that failed, at or below which the
 /// search ends.
@@ -58,7 +59,8 @@ const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
-/// Number n: one of every n views with photographs is held back from the search, for the report.
+/// Number n: one of every n views with photographs is held back from the search, to measure the quality that is
+/// reported.
 const HELD_EVERY: usize = 4;
 
 /// Search of a run for the smallest model with a requested quality. Repeats the stages that reduce the model to a

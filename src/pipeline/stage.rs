@@ -27,7 +27,7 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// Fraction of the Gaussians down to which pruning rounds rank, if the run searches for a quality and does not refine.
+/// Fraction of the Gaussians that the last pruning round leaves if the run searches for a quality and does not refine.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
@@ -354,7 +354,8 @@ pub struct RunState<'a> {
 }
 
 impl<'a> RunState<'a> {
-    /// Returns the state of a run before its first stage.
+    /// Returns the state of a run before its first stage. `template` is a model without Gaussians that holds the
+    /// settings of all models of the run.
     pub fn new(
         scene: &'a Scene,
         request: &'a Request,

@@ -54,7 +54,7 @@ pub struct ArchiveSummary {
     pub psnr: f64,
     /// PSNR of renders of the result before quantization, compared with renders of the original on the same views, dB.
     pub level: f64,
-    /// By how much quantization lowers the PSNR against the original, dB.
+    /// Amount by which quantization lowers the PSNR against the original, dB.
     pub loss: f64,
     /// Number of bytes of each part of the archive; `None` for an archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -76,19 +76,20 @@ pub struct ArchiveSummary {
 /// Description of the input of a run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
-    /// Path of the input. In files only the last component; on standard output the path as given by the user.
+    /// Path of the input. Summary files hold only its last component; a summary on standard output holds the path as
+    /// given by the user.
     pub path: String,
     /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
     /// Digest of the bytes of the input.
     pub digest: String,
-    /// Number of Gaussians, N.
+    /// Number of Gaussians in the input, N.
     pub gaussians: usize,
-    /// Number of frames, T; `None` for a model whose frames have not been chosen yet.
+    /// Number of frames of the input, T; `None` for a model whose frames have not been chosen yet.
     pub frames: Option<usize>,
     /// SH degree of the input.
     pub sh_degree: usize,
-    /// Names of the attributes that vary in time.
+    /// Names of the attributes of the input that vary in time.
     pub varying: Vec<String>,
     /// Number of bytes of all files of the input that a renderer opens; for a stream, number of bytes that arrived.
     pub bytes: u64,
@@ -167,8 +168,8 @@ pub struct MergeSummary {
     pub opacity: ProxyOpacity,
     /// Statistics of every merge pass, in order: numbers of candidate pairs, of joins, and others.
     pub passes: Vec<PassCounts>,
-    /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units;
-    /// `None` without a deformation field.
+    /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
+    /// and sampled frames, in scene units. `None` if every proxy follows its members exactly.
     pub deviation: Option<f64>,
 }
 
@@ -203,7 +204,8 @@ pub struct Summary {
     pub input: InputSummary,
     /// Cameras whose views were used for scoring.
     pub cameras: CameraSummary,
-    /// Path of the output. In files only the last component; on standard output the path as given by the user.
+    /// Path of the output. Summary files hold only its last component; a summary on standard output holds the path as
+    /// given by the user.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Number of Gaussians in the output.

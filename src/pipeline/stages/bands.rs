@@ -26,7 +26,7 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name of this stage's work in the list of omitted work, if no SH degree is dropped.
+/// Name in the list of omitted work that says that no SH degree was dropped.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
 /// Returns the SH degree of a result of `scene` if the user asks for at most `degree`. This is `degree`, or the degree

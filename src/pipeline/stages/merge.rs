@@ -42,9 +42,10 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "merge";
 
-/// Name under which measured motions of pairs of Gaussians are cached. The measurement can be divided into shards.
+/// Name under which the measured motion similarities of pairs of Gaussians are cached. The measurement can be divided
+/// into shards.
 pub(crate) const PAIRS: &str = "pairs";
-/// Minimum number of pairs of Gaussians from which their measurement is divided into shards.
+/// Minimum number of pairs of Gaussians for which the measurement of their motion is divided into shards.
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
 /// Bytes of memory per Gaussian that may survive, for its id, its state with base colors only, a flag whether the state
@@ -55,8 +56,8 @@ const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() 
 /// used to estimate reads. The secant search ([`bracket`]) usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
-/// Number of Gaussians that are read at a time at the reference frame. Only for these, the attributes that merging does
-/// not use are in memory, until they are dropped.
+/// Number of Gaussians whose full states are read at a time at the reference frame. Merging then keeps only the
+/// attributes that it uses.
 const GATHER_CHUNK: usize = 16 * GAUSSIANS_PER_BLOCK;
 
 /// Processor time per Gaussian of finding neighbors, testing pairs and forming clusters, seconds (`benches/merge.rs`).
@@ -87,7 +88,7 @@ pub(crate) struct MergeOutcome {
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage that merges survivors to `stages` if the run merges; otherwise records the reason why they are not.
+/// Adds the stage that merges survivors to `stages` if the run merges; otherwise records the reason why it does not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -255,9 +256,10 @@ struct Trial<'a> {
     merge: recipe::MergeParams,
     /// Ids of the Gaussians whose states are in memory, the pool, in increasing order.
     pool: Vec<u32>,
-    /// States of the Gaussians of the pool at the reference frame, with base colors only.
+    /// States at the reference frame of the Gaussians in the pool (Gaussians in memory), with base colors only.
     states: Gaussians,
-    /// Merge class of each Gaussian of the pool. Only Gaussians of the same class may merge; `None`: never merges.
+    /// Merge class of each Gaussian in the pool (Gaussians in memory). Only Gaussians of the same class may merge.
+    /// `None`: the Gaussian never merges.
     classes: Vec<Option<u8>>,
     /// Importances of all Gaussians, by id: contribution C, and fraction Vis of the views that may show the Gaussian.
     importance: [Cow<'a, [f64]>; 2],
@@ -307,8 +309,8 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left. Fails if merging cannot reduce
-    /// them to so few.
+    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left, and returns the result. Fails
+    /// if merging cannot reduce them to so few.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
         let left = merged.compressed.len();
@@ -321,8 +323,8 @@ impl<'a> Trial<'a> {
         Ok(merged)
     }
 
-    /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory). If `limit` is given, stops after
-    /// this number of joins (a join reduces the number of Gaussians by one).
+    /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory), and returns the result. If `limit`
+    /// is given, stops after this number of joins (a join reduces the number of Gaussians by one).
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
         let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
             self;

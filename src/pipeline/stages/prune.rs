@@ -48,11 +48,11 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors (Gaussians that are not removed). With a `target`, the number of Gaussians
-    /// requested, this is the target; without one, it is the number that the thresholds of the recipe select. If
-    /// Gaussians are not pruned by rank, it is the number of all Gaussians that may stay. The same holds if merging
-    /// later reduces the survivors to the target, because only merging can tell how many it needs. `ranked` holds all
-    /// Gaussians that may stay.
+    /// Returns the number of survivors (Gaussians that are not removed). If Gaussians are not pruned by rank, this is
+    /// the number of all Gaussians that may stay, which are those in `ranked`. Otherwise it is the number that the
+    /// thresholds of the recipe select, or `target` (the requested number) if given. If merging later reduces the
+    /// survivors to the target, it is the number of all Gaussians that may stay, because only merging can tell how many
+    /// it needs.
     ///
     /// # Errors
     /// Fails if the target is below the number of Gaussians that must stay or above the number that may stay.

@@ -36,7 +36,7 @@ const NAME: &str = "rounds";
 /// removes the lowest.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Fraction of its Gaussians that a round leaves.
+    /// Fraction of the Gaussians present at the start of a round that the round leaves.
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
@@ -54,11 +54,11 @@ pub(crate) struct Rounds {
     pub usual: f64,
 }
 
-/// Smallest fraction of the Gaussians that the last round is assumed to leave ([`Rounds::fewest`]) if the user requests
-/// no number of Gaussians.
+/// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last round is assumed to leave) if the user
+/// requests no number of Gaussians.
 const MIN_LEFT: f64 = 0.05;
-/// Fraction of the Gaussians that the last round is assumed to leave usually ([`Rounds::usual`]) if the user requests
-/// no number of Gaussians.
+/// Value of [`Rounds::usual`] (fraction of the Gaussians that the last round usually leaves) if the user requests no
+/// number of Gaussians.
 const USUAL_LEFT: f64 = 0.5;
 
 /// Adds the stage that ranks Gaussians in pruning rounds to `stages` if Gaussians are pruned by a ranking on rendered

@@ -1,4 +1,5 @@
-//! Stage `scan`: reads every Gaussian at every frame once and gathers its statistics in a state of fixed size.
+//! Stage `scan`: reads every Gaussian at every frame once and gathers its statistics in a record whose size does not
+//! depend on the number of frames.
 
 use crate::error::Result;
 use crate::journal::Journal;

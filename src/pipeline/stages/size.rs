@@ -31,15 +31,15 @@ const MAX_TRIED: usize = 8;
 /// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
 const RANKING_VIEWS: usize = 48;
 
-/// If a size on disk is requested, adds to `stages` the stage that finds how many Gaussians fit it.
+/// Adds to `stages` the stage that finds how many Gaussians fit the requested size on disk, if a size is requested.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning) {
         stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_degree(), limit });
     }
 }
 
-/// If a size on disk is requested, adds to `stages` the stage that removes Gaussians from a result above this size. An
-/// archive needs no such stage, because its quantization steps are adapted to the size.
+/// Adds to `stages` the stage that removes Gaussians from a result above the requested size on disk, if a size is
+/// requested. An archive needs no such stage, because its quantization steps are adapted to the size.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
