@@ -20,8 +20,8 @@ const NOTES: usize = 2;
 const TITLE_WIDTH: usize = 52;
 
 impl Summary {
-    /// Returns the summary as text for people: the table of the result, and with [`SummaryDetail::All`] the stages before it
-    /// and all notes.
+    /// Returns the summary as text for people: the table that compares the result with the original, some notes, and
+    /// commands to run next. With [`SummaryDetail::All`], the stages come before the table, and all notes are included.
     pub fn text(&self, detail: SummaryDetail) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.

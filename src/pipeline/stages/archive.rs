@@ -253,9 +253,9 @@ fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Resul
 /// Quantization steps of all groups of values (attributes and tensors) in the content of an archive.
 struct Grids {
     groups: Vec<ValueGroup>,
-    /// Standard deviation of the values of each group.
+    /// Standard deviation of the values of each group in `groups`.
     deviations: Vec<f64>,
-    /// Log2 of the quantization step of each group.
+    /// Log2 of the quantization step of each group in `groups`.
     octaves: Vec<f64>,
     /// For each tensor, by name: offsets, in eighths of an octave, by which the steps of its channels (or of its rows
     /// and columns) differ from the step of the tensor. See [`TensorSteps::channels`].
