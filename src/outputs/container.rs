@@ -101,10 +101,10 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes the frame blocks with the numbers `blocks` and writes them to the scratch file `to`, from which
-/// [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the tile equals that
-/// of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
-/// last call.
+/// Encodes the frame blocks of `source` with the numbers `blocks` as `packing`, and writes them to the scratch file
+/// `to`, from which [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the
+/// tile equals that of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians × frames)
+/// encoded since the last call.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -124,9 +124,10 @@ pub fn spill_blocks(
     Ok(())
 }
 
-/// Writes the container `path` from frame blocks that [`spill_blocks`] encoded. The file is the same as that of
-/// [`write_container`]. `spills` lists the scratch files, each with the numbers of its frame blocks; together they must
-/// have all frame blocks, in order. Memory: a tile, and the index of the container.
+/// Writes the container `path` from the frame blocks of `source` that [`spill_blocks`] encoded with the same `packing`,
+/// and with the metadata `attributes` (names and texts). The file is the same as that of [`write_container`]. `spills`
+/// lists the scratch files, each with the numbers of its frame blocks; together they must have all frame blocks, in
+/// order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
 /// Fails if a scratch file cannot be read back or the container cannot be written.
@@ -165,8 +166,8 @@ pub struct ContainerWriter {
 }
 
 impl ContainerWriter {
-    /// Creates the container `path` for `count` Gaussians, with `frame_block` frames in a frame block, encoded as
-    /// `packing`, and with the metadata `attributes` (names and texts).
+    /// Creates the container `path` for `count` Gaussians of SH degree `sh_degree`, with `frame_block` frames in a
+    /// frame block, encoded as `packing`, and with the metadata `attributes` (names and texts).
     pub fn create(
         path: &Path,
         count: usize,
@@ -192,7 +193,7 @@ impl ContainerWriter {
     }
 
     /// Creates the container `path` with the number of Gaussians, the SH degree and the frames per block that `source`
-    /// and `packing` need.
+    /// and `packing` need, and with the metadata `attributes` (names and texts).
     fn from_source(
         source: &dyn FrameSource,
         path: &Path,
@@ -265,7 +266,8 @@ impl ContainerWriter {
         )
     }
 
-    /// Writes one tile of the present frame block. `None` means that the tile equals that of the frame block before.
+    /// Writes `tile`, the values of column `column` for block number `gaussian_block` of Gaussians in the present frame
+    /// block. `None` means that the tile equals that of the frame block before.
     fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
@@ -352,8 +354,8 @@ fn encode_frames(
     Ok(())
 }
 
-/// Encodes some blocks of Gaussians of `source` over the frames `frames` as one frame block. Returns the number of
-/// bytes that each column (attribute) takes. `blocks` has the numbers of the blocks.
+/// Encodes the blocks of Gaussians of `source` with the numbers `blocks`, over the frames `frames` as one frame block.
+/// Returns the number of bytes that each column (attribute) takes.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -373,8 +375,8 @@ pub fn column_bytes(
     Ok(bytes)
 }
 
-/// Encodes the tiles of the block of Gaussians `gaussians` over the frames `frames`. Returns one tile per attribute;
-/// `None` for attributes that are not in `columns`.
+/// Encodes the tiles of the block of Gaussians `gaussians` of `source` over the frames `frames`. Returns one tile per
+/// attribute; `None` for attributes that are not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,

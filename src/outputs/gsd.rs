@@ -32,7 +32,7 @@ use crate::source::{FrameSource, ReadPlan};
 
 /// Frame rate stored in the file, in frames per second. Sequences have no frame rate of their own.
 const FRAME_RATE: f64 = 30.0;
-/// Centimeters per unit of the scene, which counts as a meter: the unit of the bounds in the JSON text.
+/// Centimeters per scene unit, which counts as one meter. The bounds in the JSON text are in centimeters.
 const CENTIMETERS: f64 = 100.0;
 /// Number of bits per axis of the Morton code.
 const MORTON_BITS: u32 = 10;
@@ -167,7 +167,7 @@ impl PackedFrame {
     }
 }
 
-/// Returns whether all stored values of the Gaussian `row` are finite.
+/// Returns whether all values of the Gaussian `row` of `state` that the file stores are finite.
 fn is_finite(state: &Gaussians, row: usize) -> bool {
     let base = state.sh.row::<3>(row).iter().all(|x| x.is_finite());
     let [position, scale] = [state.position.row::<3>(row), state.log_scale.row::<3>(row)];
@@ -196,7 +196,8 @@ fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     })
 }
 
-/// Adds a texture of `pixels` pixels with shuffled bytes: the values of the Gaussians `rows`, then `padding`.
+/// Appends a texture of `pixels` pixels with shuffled bytes to `textures`. Its pixels hold the numbers that `value`
+/// returns for each of the Gaussians `rows`; all further pixels hold `padding`.
 fn add_texture<const N: usize>(
     textures: &mut Vec<u8>,
     pixels: usize,

@@ -32,8 +32,9 @@ mod tests {
         (visible >= 0.1).then(|| (visible, near.collect()))
     }
 
-    /// Returns the opacity of Gaussians with the opacities `near` at one place. Other Gaussians than those that are
-    /// compared may lie there too, so it can only show that a contribution is missing.
+    /// Returns the blended opacity 1 − Π(1 − α) of Gaussians at one place whose opacities α are `near`. Gaussians that
+    /// do not belong to the comparison may lie there too and raise the result. So tests can only conclude from a low
+    /// result that a contribution is missing.
     pub(super) fn blended(near: &[f64]) -> f64 {
         1.0 - near.iter().map(|alpha| (1.0 - alpha).ln()).sum::<f64>().exp()
     }

@@ -118,9 +118,9 @@ pub fn write_fitted_windows(
     Ok(notes)
 }
 
-/// Returns whether single frames are written instead of `lines`. This is so if more than the fraction [`MAX_FAR_SHARE`]
-/// of the visible states are far off, or if single frames, which have no error of a fit, take about as few bytes.
-/// Single frames with more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians are not written.
+/// Returns whether single frames are written instead of `lines`, whose fit has the error `misfit`. This is so if more
+/// than the fraction [`MAX_FAR_SHARE`] of the visible states are far off, or if single frames, which have no error of a
+/// fit, take about as few bytes. Single frames with more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians are not written.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
@@ -128,8 +128,8 @@ fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAME_GAUSSIANS as u64 && frames <= MAX_FRAMES
 }
 
-/// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. Gaussians with values
-/// that are not finite are left out.
+/// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. `clip` maps the times of
+/// the frames to 0 to 1. Gaussians with values that are not finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
     let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(1))?;
@@ -193,7 +193,7 @@ fn is_finite(line: &CubicTrack) -> bool {
     values.chain(sh).all(|value| (value as f32).is_finite())
 }
 
-/// Sets the parameters of the Gaussian `row` to those of the fitted line `line`.
+/// Sets the parameters of the Gaussian `row` of `params` to those of the fitted line `line`.
 fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     let narrow = |value: f64| value as f32;
     let gaussians = &mut params.gaussians;
