@@ -79,7 +79,8 @@ pub struct PageScene {
     pub extent: f64,
     /// Mean upward direction of the cameras.
     pub up: [f64; 3],
-    /// Directions in which the training cameras see the scene; `None` if nothing is outside them.
+    /// Directions in which the training cameras see the scene; `None` if there are no training cameras, or if they are
+    /// all around the scene.
     pub rig: Option<PageRig>,
     /// Names of the files of the chunks (encoded groups of frames) to load, in order; empty if the page itself contains
     /// the chunks.
@@ -97,7 +98,7 @@ pub struct PageRig {
     focus: [f64; 3],
     /// Inward unit normals of the faces of the cone of directions from this point to the cameras.
     faces: Vec<[f64; 3]>,
-    /// Sine of the angle from which a direction counts as outside.
+    /// Sine of the smallest angle between a direction and the cone at which the direction counts as outside.
     tolerance: f64,
 }
 
@@ -259,8 +260,9 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the HTML of the page before its chunks (scripts with encoded frames). `chunks` has the digests of the
-/// chunks, which the content security policy allows besides the scripts of the page itself.
+/// Returns the HTML of the page for the scene `stage`, up to the place where its chunks (scripts with encoded frames)
+/// begin. `chunks` has the digests of the chunks, which the content security policy allows besides the scripts of the
+/// page itself.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();

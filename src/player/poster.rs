@@ -19,8 +19,8 @@ const MAX_PIXELS: f64 = 160_000.0;
 /// JPEG quality of a poster, from 1 to 100.
 const QUALITY: u8 = 80;
 
-/// Renders `source` by the first camera of `rig`, at the camera's time if it has one, else at the first frame. Returns
-/// a JPEG as a data URI; `None` without cameras or frames.
+/// Renders `source` by the first camera of `rig`, at the camera's time if it has one, else at the first frame, over the
+/// color `background`. Returns a JPEG as a data URI; `None` without cameras or frames.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

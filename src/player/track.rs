@@ -159,9 +159,9 @@ pub fn encode(
     Ok(())
 }
 
-/// Encodes scalar components (such as x of the position) as a compressed chunk. Each component has the values of all
-/// Gaussians at the first frame of the sequence, and their values at every frame of the chunk; all values are
-/// quantized.
+/// Encodes scalar components (such as the x of the position) as a compressed chunk. An item of `components` is one
+/// component: the values of all Gaussians at the first frame of the sequence, and their values at every frame of the
+/// chunk; all values are quantized.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));

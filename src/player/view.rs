@@ -61,7 +61,7 @@ pub struct ViewReport {
     pub notes: Vec<String>,
 }
 
-/// Checks, before any work, that the output may be written.
+/// Checks, before any work, that the output of `options` may be written.
 ///
 /// # Errors
 /// Fails as [`check_target`] does, for example if the output exists and may not be replaced.
@@ -170,7 +170,7 @@ struct ModelView<'a> {
 }
 
 /// Encodes the frames of `model` as model number `place` of the page and adds its chunks to `chunks`. Returns the
-/// description of the model.
+/// description of the model. `asked` holds the settings for this model, and `steps` the quantization steps.
 fn show(
     model: &dyn InputModel,
     place: usize,
