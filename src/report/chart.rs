@@ -105,8 +105,8 @@ struct AxisScale {
 }
 
 impl AxisScale {
-    /// Returns a scale that covers `values` with a margin and runs from pixel `from` to pixel `to` of the chart; `None`
-    /// if there are no values to draw.
+    /// Returns a scale for the axis `axis` that covers `values` with a margin and runs from pixel `from` to pixel `to`
+    /// of the chart; `None` if there are no values to draw.
     fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
@@ -135,7 +135,8 @@ impl AxisScale {
         })
     }
 
-    /// Extends the range of values so that `room` pixels stay free behind the last value on the axis.
+    /// Extends the range of values at its upper end, so that `room` pixels stay free after the largest value on the
+    /// axis.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
@@ -447,8 +448,8 @@ impl Drawing {
         self.x_axis(x, x_label, [self.top, bottom]);
     }
 
-    /// Draws ticks, grid lines and label of a horizontal axis. The grid lines run from `top` to `bottom`, in SVG units
-    /// (about pixels).
+    /// Draws ticks, grid lines and label of the horizontal axis `x`. The grid lines run from `top` to `bottom`, in SVG
+    /// units (about pixels).
     fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };

@@ -48,7 +48,8 @@ pub(super) fn links(names: &[&str]) -> String {
     links.join(", ")
 }
 
-/// Returns the HTML heading of the compressed model with the index `number`; empty if there is only one model.
+/// Returns the HTML heading of the compressed model with the index `number` in `names`; empty if there is only one
+/// compressed model.
 pub(super) fn heading(names: &[String], number: usize) -> String {
     if names.len() < 2 { String::new() } else { format!("<h3>{}</h3>\n", escape(&names[number])) }
 }

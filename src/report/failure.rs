@@ -19,8 +19,8 @@ use crate::render::{Image, render};
 /// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
 /// colors.
 pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
-/// Minimum difference in dB for a failure mode to be flagged: by so much the PSNR where the kind of Gaussian is visible
-/// is below the PSNR elsewhere. 3 dB lower is twice the squared error.
+/// Minimum amount in dB by which the PSNR where a kind of Gaussian is visible is below the PSNR elsewhere, for the
+/// failure mode of this kind to be flagged. A PSNR lower by 3 dB means twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
 /// Minimum share of a render's pixels that a kind of Gaussian must have for its failure mode to be judged in this
 /// render.
@@ -198,8 +198,9 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `seen` has the error
-/// sums of all renders, `names` the frame and the view of each render.
+/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `members` has the
+/// counts and the contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the
+/// frame and the view of each render.
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
@@ -279,16 +280,17 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
     }
 }
 
-/// Returns the PSNR in dB. `error` is a weighted sum of squared errors, `weight` the sum of the weights; `None` if the
-/// weights sum to 0.
+/// Returns the PSNR in dB, at most [`PSNR_CAP_DB`]. `error` is a weighted sum of squared errors, and `weight` the sum
+/// of the weights; `None` if the weights sum to 0.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. The error is the
-/// sum of w e² over the pixels of the square, where w is the share of the kind in a pixel and e² the squared difference
-/// of the renders. The square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the
-/// first is taken, row by row.
+/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. `taken` has the
+/// renders of both models, and `shares` the shares of the kinds in every pixel. The error is the sum of w e² over the
+/// pixels of the square, where w is the share of the kind in a pixel and e² the squared difference of the renders. The
+/// square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the first is taken, row
+/// by row.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));

@@ -239,8 +239,9 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are the split with as many
-/// views as the summary of the run states; if there is none, the training views, else all views.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians. The summary of the run states
+/// their number; the split that has this many views is returned. Without a summary or such a split, returns the
+/// training views, or all views if there are no training views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -276,8 +277,9 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians. `traits` has the kinds of every
-/// Gaussian. `fates` is `None` without an index map (file that maps input to output Gaussians).
+/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians, from their statistics `rows`.
+/// `traits` has the kinds of every Gaussian. `fates` is `None` without an index map (file that maps input to output
+/// Gaussians).
 fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -291,8 +293,8 @@ fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMe
     })
 }
 
-/// Renders the chosen views once more for their images. Returns these images, and for each failure mode the images of
-/// the place where it is worst.
+/// Renders the views of `choices` once more for their images. Returns these images, and for each of the failure modes
+/// `modes` the images of the place where it is worst. `traits` has the kinds of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],
@@ -321,7 +323,7 @@ fn show_again(
     Ok((shown, close))
 }
 
-/// Writes the report page and its data files to the output folder.
+/// Writes the report page `page` and its data files, which hold `report`, to the output folder of `options`.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
