@@ -163,7 +163,7 @@ pub trait FrameSource: Send + Sync {
     fn info(&self) -> &SequenceInfo;
 
     /// Opens a reader for the Gaussians `ids`, which returns them in this order. Work that does not depend on time is
-    /// done here once.
+    /// done once, in this call.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
     /// Opens a reader for all Gaussians at the frames `_wanted`, or returns `None` if readers of blocks take less time.
@@ -246,8 +246,8 @@ pub trait BlockReader: Send {
     /// Fails if the frame cannot be read.
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Announces by a plan the frames that will be read from now on, and how many of them the reader may keep in
-    /// memory. Readers that keep no frames ignore the plan.
+    /// Announces by the plan `_wanted` the frames that will be read from now on, and how many of them the reader may
+    /// keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later
