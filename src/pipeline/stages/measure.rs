@@ -49,7 +49,8 @@ impl MeasureStages {
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> MeasureStages {
         let recipe = &planning.request.recipe;
         let mut measure = MeasureStages::new(recipe, planning.input.has_cameras, planning.user.clone());
-        // If rounds rank the Gaussians and their number is given, no threshold of the scores decides which of them stay.
+        // If pruning rounds rank the Gaussians and their number is given, no threshold of the scores decides which of
+        // them stay.
         measure.scan.can_be_partial = recipe.scan.scan_frames == ScanFrames::Needed
             && planning.target.is_some()
             && planning.prunes_by_views()
