@@ -46,8 +46,8 @@ const PACK_STAGE: &str = "pack";
 pub enum StoragePrecision {
     /// All values exact to the bit, with the given compression.
     Exact(Compression),
-    /// Errors of the listed attributes within their bounds, all other values exact to the bit. The number is the level
-    /// of zstd compression.
+    /// Errors of the listed attributes within their bounds, all other values exact to the bit. The second field is the
+    /// level of zstd compression.
     Within(Vec<MaxError>, i32),
 }
 
@@ -79,8 +79,8 @@ pub fn pack(
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
-/// Does the work of [`pack`] and returns its report. If the run computes only one shard (part of a divided stage), it
-/// ends with the error [`Error::ShardDone`].
+/// Packs any input into a container, as [`pack`] does, and returns the report. If the run computes only one shard (part
+/// of a divided stage), it ends with the error [`Error::ShardDone`].
 fn pack_whole(
     input: &InputOptions,
     output: &Path,
@@ -134,8 +134,8 @@ fn pack_whole(
     Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
-/// Packs a frame stream into the container `output` while its frames arrive. For streams in which each Gaussian keeps
-/// its id from frame to frame.
+/// Packs a frame stream into the container `output` while its frames arrive. In the stream, each Gaussian must keep its
+/// id from frame to frame.
 fn pack_arriving(
     stream: FrameStream<Stdin>,
     input: &InputOptions,

@@ -80,8 +80,8 @@ pub fn render(options: &RenderOptions) -> Result<Completion<RenderReport>> {
     Completion::from_result(render_whole(options))
 }
 
-/// Does the work of [`render`] and returns its report. If the run computes only one shard (part of a divided stage), it
-/// ends with the error [`Error::ShardDone`].
+/// Renders views to image files, as [`render`] does, and returns the report. If the run computes only one shard (part
+/// of a divided stage), it ends with the error [`Error::ShardDone`].
 fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
     let output = options.output.as_path();
     let (kind, format) = match options.selection {

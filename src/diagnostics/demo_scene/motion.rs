@@ -60,8 +60,8 @@ const SWING: f64 = 0.18;
 const WAVES: f64 = 1.5;
 /// Number of periods that the wave of the cloth makes during the sequence.
 const PASSES: f64 = 2.0;
-/// Opacity logit at which a spark or a fading Gaussian counts as invisible. The logit of 0.01, the usual alpha_min
-/// (opacity from which a Gaussian is alive), is −4.6.
+/// Opacity logit at which a spark or a fading Gaussian counts as invisible. It lies below −4.6, the logit of 0.01,
+/// which is the usual alpha_min (minimum opacity at which a Gaussian is alive).
 pub(super) const GONE: f64 = -6.0;
 /// Opacity logit of a spark at its peak, and of a fading Gaussian when it is most opaque.
 pub(super) const BRIGHT: f64 = 3.0;
@@ -129,8 +129,9 @@ impl DemoGaussian {
     }
 }
 
-/// Pseudo-random numbers of one Gaussian, whose id is the field. Each number is a hash of the id and of its index,
-/// which is called channel, so that it does not depend on the order in which Gaussians are read.
+/// Pseudo-random numbers of the Gaussian whose id is the value of the field. Each number is a hash of this id and of
+/// the index of the number, which is called channel. So the numbers do not depend on the order in which Gaussians are
+/// read.
 #[derive(Clone, Copy)]
 pub(super) struct GaussianRandom(pub(super) u64);
 

@@ -14,9 +14,9 @@ use crate::statistics::{BlockScan, ScanPlan};
 
 const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
-/// Compares the statistics of motion and opacity (D, κ, V and the number of life frames) with their definitions in f64,
-/// for Gaussians whose life spans have many gaps. In f64, the rounding error of a sum of 40 terms is about 1e-15, that
-/// of a variance larger by a few digits.
+/// Compares the statistics of motion and opacity (D, κ, V and the number of frames in which a Gaussian is alive) with
+/// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, the rounding error of a sum of 40
+/// terms is about 1e-15, that of a variance larger by a few digits.
 pub(super) fn motion() -> CaseResult {
     CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -51,9 +51,9 @@ pub(super) fn motion_of_any_size() -> CaseResult {
     })
 }
 
-/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. The Gaussian is at the position t² at the
-/// time t, a whole number. With m as the mean time step, its velocity between the times t and t' is m·(t + t'), and its
-/// turns (second differences) are 2m². Sums have 40 terms in f64.
+/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. The coordinate of the Gaussian at the time
+/// t, a whole number, is t². With m as the mean time step, its velocity between the times t and t' is m·(t + t'), and
+/// its turns (second differences) are 2m². Sums have 40 terms in f64.
 pub(super) fn uneven_frames() -> CaseResult {
     CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();

@@ -5,7 +5,8 @@ use crate::model::{Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
 /// Statistics of one Gaussian by the oracle (slow f64 reference): trajectory magnitude D, curvature κ, opacity variance
-/// V, number of life frames, contribution C in pixels, and visibility (fraction of all views).
+/// V, number of frames in which the Gaussian is alive, contribution C in pixels, and visibility (fraction of all views
+/// in which the Gaussian is alive and touches the image).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct OracleRow {
     pub(crate) d: f64,
