@@ -267,8 +267,8 @@ impl Workload {
         self.gaussians as f64
     }
 
-    /// Returns the bytes of memory of the data about an open input, in addition to the memory per Gaussian: index, time
-    /// stamps, cameras, and [`MemoryProfile::fixed`].
+    /// Returns the bytes of memory that an open input takes besides its memory per Gaussian: index, time stamps,
+    /// cameras, and [`MemoryProfile::fixed`].
     pub(super) fn known_bytes(&self) -> u64 {
         let index = match self.input.frame_block {
             0 => 0,
@@ -324,15 +324,15 @@ pub struct RenderCost {
     pace: fn(&Throughput) -> f64,
 }
 
-/// Time per view for finding the contribution (Σ alpha · transmittance) of every Gaussian to the view.
-/// [`CONTRIBUTION_COST`], [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models;
-/// `scripts/estimate.py` compares estimated with measured times.
+/// Time for finding the contribution (Σ alpha · transmittance) of every Gaussian to one view. [`CONTRIBUTION_COST`],
+/// [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models; `scripts/estimate.py` compares
+/// estimated with measured times.
 pub const CONTRIBUTION_COST: RenderCost =
     RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.contribution_time };
-/// Time per view for finding the removal error of every Gaussian: the squared error that removing this Gaussian alone
-/// would cause in the view.
+/// Time for finding the removal error of every Gaussian in one view: the squared error that removing this Gaussian
+/// alone would cause.
 pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.removal_time };
-/// Time per view for rendering it and comparing the render with another one.
+/// Time for rendering one view and comparing the render with another one.
 pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
 
 /// Returns the bytes of memory that zstd takes for its tables for finding matches, at the compression level `level`,

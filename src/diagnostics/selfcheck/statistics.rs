@@ -237,7 +237,7 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
 }
 
 /// Returns the state at frame `t` of one Gaussian that alternately moves by +3 and −3 scene units along x. `alive`:
-/// whether the Gaussian is visible at this frame.
+/// whether the Gaussian is opaque enough at this frame to count as alive.
 fn zigzag(t: usize, alive: bool) -> Gaussians {
     let mut frame = resting(1);
     frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);
