@@ -88,8 +88,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
-    /// Returns the words that precede the path in error messages. The path is that of the cache entry being written or,
-    /// for a scratch file, which has no name, that of its folder.
+    /// Returns the words that precede the path in error messages. For a cache entry, this path is the path of the
+    /// entry; for a scratch file, which has no name, it is the path of its folder.
     fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }

@@ -36,9 +36,9 @@ use workspace::{SCRATCH, Workspace, user_path};
 /// `target`. Completes or removes an output with this name that a killed run left unfinished.
 ///
 /// Refuses a target without a name or in a folder that does not exist. Refuses a target that is an input, contains an
-/// input or lies inside one, also through links and whatever `replace` is. Refuses an existing target that `replace`
-/// does not allow to replace (a folder may always replace an empty folder), a file in place of a folder or the reverse,
-/// sockets, block devices and dangling links.
+/// input or lies inside an input, even if the path leads there only through links, and for every value of `replace`.
+/// Refuses an existing target that `replace` does not allow to replace (a folder may always replace an empty folder), a
+/// file in place of a folder or the reverse, sockets, block devices and dangling links.
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
@@ -249,8 +249,8 @@ impl StagedFolder {
         &self.content
     }
 
-    /// Adds the list of its files to the summary of the folder (`summary.json`), if it has a summary, syncs everything
-    /// to disk and gives the folder its final name.
+    /// If the folder has a summary (`summary.json`), adds the list of all files in the folder to it. Then syncs
+    /// everything to disk and gives the folder its final name.
     ///
     /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
     /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the

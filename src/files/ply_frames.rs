@@ -242,8 +242,8 @@ fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }
 
-/// Checks that the frame `ply` has the same properties as the first frame. `properties` are those of the first frame,
-/// and `first` is its file. The error names the first difference.
+/// Checks that the frame `ply` has the same properties as the first frame. `properties` are the properties of the first
+/// frame, and `first` is the path of its file. The error names the first difference.
 fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<()> {
     if ply.properties() == properties {
         return Ok(());

@@ -33,7 +33,7 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 pub const MAGIC: u32 = 0x5053_474e;
 /// Number of bytes of the header of version 4.
 const HEADER_BYTES_4: usize = 32;
-/// zstd compression level of version 4, the one of the format's own library.
+/// zstd compression level of files of version 4, the same as in the format's own library.
 const ZSTD_LEVEL: i32 = 12;
 /// Largest magnitude of a stored position, in units of the last bit (24 bits, signed).
 const MAX_FIXED: f64 = 8_388_607.0;

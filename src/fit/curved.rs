@@ -93,8 +93,9 @@ const RIDGE: f64 = 1e-6;
 /// this value times the smallest visible opacity.
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,
-/// if none do, the closest ones that were tried. Adds their errors to `misfit`.
+/// Returns curves of the form `form` that represent `track`: the smallest tried number of curves that meets `tolerance`
+/// at every visible frame. If no tried number meets it, returns the curves with the smallest error. Adds their errors
+/// to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,

@@ -30,7 +30,7 @@ pub struct Tolerance {
     /// Maximum difference between the SH coefficients of the fit and of the Gaussian.
     pub sh: f64,
     /// Opacity from which on all tolerances hold as given; 0 if they hold for every Gaussian. For a Gaussian of a lower
-    /// opacity α, all of them but the tolerance of opacity are larger by the factor `full_opacity`/α. Used by
+    /// opacity α, every tolerance except the tolerance of opacity is larger by the factor `full_opacity`/α. Used by
     /// [`curved`] only.
     pub full_opacity: f64,
 }

@@ -67,8 +67,8 @@ pub struct Survivors<'a> {
     pub states: &'a Gaussians,
     /// Rows of the survivors in `states`, increasing.
     pub rows: &'a [u32],
-    /// Ids of all rows of `states`, whose hashes break ties; and for each id the contribution C, by which leaders are
-    /// ranked, and the visibility.
+    /// Ids of all rows of `states` (ties are broken by the hashes of ids); and for each id two values: the contribution
+    /// C, by which leaders are ranked, and the visibility.
     pub importance: Importance<'a>,
     /// Merge class of every row of `states`. A Gaussian merges only with others of its class; with `None` it never
     /// merges. A Gaussian with a value that is not finite never merges either.

@@ -22,8 +22,8 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 /// frames, whatever the time between them, because the noise level they are compared with is also one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; 0
-    /// counts for a step in which one of them is zero. The mean is over all frames in which both are alive
+    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; a step
+    /// in which a or b is zero counts as 0. The mean is over all frames in which both are alive
     /// (`MotionParams::Literal`), or only over the steps that also begin in such a frame (`MotionParams::Runs`).
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
@@ -54,7 +54,7 @@ impl PairMeasure {
     }
 
     /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
-    /// least one is. Returns 1 if neither is ever alive.
+    /// least one is alive. Returns 1 if neither is ever alive.
     pub fn one_alive_fraction(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
@@ -84,8 +84,8 @@ impl MotionThresholds {
     }
 
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
-    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two are never alive together, if the
-    /// fraction of frames with only one alive is too large, or if the two drift too far apart.
+    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two Gaussians are never alive together, if
+    /// the fraction of frames with only one alive is too large, or if the two Gaussians drift too far apart.
     pub fn similarity(&self, pair: &PairMeasure) -> f64 {
         let together =
             pair.common > 0 && pair.drift <= self.max_drift && pair.one_alive_fraction() <= self.max_dead_time;

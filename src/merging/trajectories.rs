@@ -10,8 +10,8 @@
 //! of F frames (the last may be shorter) the values that vary with time, `[N, F, W]` with W = 4, 3 or 1, or nothing.
 //! All values are f32 in the byte order of this machine.
 //!
-//! Memory while gathering: per Gaussian 8 bytes, and for each of F frames those of its 16 bytes that vary; per thread
-//! two blocks of as many frames.
+//! Memory while gathering: 8 bytes per Gaussian, and for each of F frames the part of its 16 bytes that varies with
+//! time; per thread, two blocks of Gaussians at F frames.
 
 use std::ops::Range;
 use std::path::Path;

@@ -1,9 +1,9 @@
 //! Writes any sequence to a `.gseq` container, one frame block (consecutive frames) after the other. A tile has the
 //! values of one attribute of one block of Gaussians in one frame block. Attributes are the columns of the container.
 //!
-//! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and as much again
-//! while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column and block of
-//! Gaussians, and 16 per frame.
+//! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and the same
+//! amount again while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column
+//! and block of Gaussians, and 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -204,10 +204,10 @@ impl ContainerWriter {
         ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
     }
 
-    /// Adds the frames `frames` of `source` as the next frame block. There must be as many frames as in a block; a
-    /// block with fewer must be the last one. Attributes that do not vary with time must have the same values as in the
-    /// blocks before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last
-    /// call.
+    /// Adds the frames `frames` of `source` as the next frame block. Their number must be the number of frames per
+    /// block; only the last block may have fewer. Attributes that do not vary with time must have the same values as in
+    /// the blocks before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
+    /// last call.
     pub fn append_block(
         &mut self,
         source: &dyn FrameSource,

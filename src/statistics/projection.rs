@@ -53,7 +53,8 @@ pub struct CoverageSums<'a> {
     pub touched: &'a mut [u32],
 }
 
-/// Fixed-point scale of contributions to the sums, and the opacity threshold.
+/// Settings of the sums: the fixed-point scale in which contributions are added, and the minimum opacity at which a
+/// Gaussian is alive.
 #[derive(Debug, Clone, Copy)]
 pub struct CoverageScale {
     /// Exponent of the fixed-point scale: contributions are rounded to multiples of 2^−exponent px. The number of

@@ -31,7 +31,8 @@ impl LinkConfidence {
     }
 
     /// Adds to the estimates the links that one round of linking made. `candidates_by_track` holds, for each track that
-    /// took part in the round, the Gaussians that might have continued it. Costs of links are those of `round`.
+    /// took part in the round, the Gaussians that might have continued it. Costs of links follow from the parameters of
+    /// `round`.
     pub(super) fn add_round(
         &mut self,
         links: &Links,

@@ -1,4 +1,4 @@
-//! Publication: moves finished outputs to their final names. For each name, one run at a time does so.
+//! Publication: moves finished outputs to their final names. Only one run at a time moves outputs to the same name.
 
 use std::ffi::OsString;
 use std::fs;

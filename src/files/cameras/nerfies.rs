@@ -28,7 +28,8 @@ use crate::model::{Rig, Split};
 
 /// Keys of the camera file of an image.
 const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
-/// In a data set that names no test images, every image whose index is a multiple of this number is a training image.
+/// Interval of training images in a data set that names no test images: every image whose index is a multiple of this
+/// number is a training image.
 const TRAIN_EVERY: usize = 4;
 
 /// Reads the data set whose `dataset.json` is `file`.

@@ -24,7 +24,7 @@ pub struct Norm {
 /// Number of passes over the values in which a percentile is found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PercentilePasses {
-    /// Two passes, which find the exact value.
+    /// Two passes over the values, which find the exact percentile.
     Two,
     /// One pass, with a histogram whose keys have this number of mantissa bits. The result is the middle of the
     /// histogram bucket that contains the percentile.
