@@ -4,8 +4,8 @@
 //! The state of a proxy at a frame has the weighted mean and covariance of its members (the Gaussians of its cluster)
 //! at that frame. The weights are those of the reference frame for all frames, so the trajectory is Σ w_i x_i(t). No
 //! proxy is stored; only the members being read are in memory. The members of a proxy may be anywhere in the source.
-//! Many Gaussians are best read by [`MergedSequence::open_together`], because a block of the source that is decoded for one
-//! of them then serves all.
+//! Many Gaussians are best read by [`MergedSequence::open_together`], because a block of the source that is decoded for
+//! one of them then serves all.
 
 use std::ops::Range;
 

@@ -67,8 +67,8 @@ pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64)
     VoxelGrid::around(rows.iter().map(|&row| at(row)), side).sort_rows(rows, at)
 }
 
-/// Returns the number along each axis of the voxel at `place`, a result of [`VoxelGrid::grid_coordinates`]. Outside of the grid it is
-/// the nearest voxel; NaN gives the first voxel.
+/// Returns the number along each axis of the voxel at `place`, a result of [`VoxelGrid::grid_coordinates`]. Outside of
+/// the grid it is the nearest voxel; NaN gives the first voxel.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
     // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
     place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))

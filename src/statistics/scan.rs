@@ -59,11 +59,11 @@ pub struct BlockStatistics {
     /// Id of the block's first Gaussian.
     pub first_id: usize,
     /// Statistics, one row per Gaussian. The anisotropy `e` is 0 until [`super::fill_anisotropy`]; the trajectory
-    /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a Gaussian with
-    /// [`Flags::NON_FINITE`] are 0.
+    /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a
+    /// Gaussian with [`Flags::NON_FINITE`] are 0.
     pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has not
-    /// returned. Gaussians with NaN values are included.
+    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has
+    /// not returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,

@@ -29,8 +29,8 @@ impl FloatSketch {
         Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
-    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MAX_MANTISSA_BITS`]. The histogram has
-    /// 2^(9 + bits) counts of 4 bytes.
+    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MAX_MANTISSA_BITS`]. The
+    /// histogram has 2^(9 + bits) counts of 4 bytes.
     pub fn with_mantissa_bits(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
         let dropped = ALL_BITS - bits.min(MAX_MANTISSA_BITS);
         let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
