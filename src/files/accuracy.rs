@@ -208,8 +208,7 @@ mod tests {
         RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Returns a record for six Gaussians on a line: five at distances of 2 from the next, and one far away. The scene
-    /// size is 2.
+    /// Returns a record for six Gaussians on a line: five with a spacing of 2, and one far away. The scene size is 2.
     fn accuracy() -> CodingErrors {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);

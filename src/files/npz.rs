@@ -285,7 +285,8 @@ fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File
 }
 
 impl NpzArray {
-    /// Returns whether the values, which have the type `float`, can be read directly from the mapped archive.
+    /// Returns whether the values of this array, which have the type `float`, can be read directly from the mapped
+    /// archive.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }

@@ -41,13 +41,13 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads from the summary at `path`, which may be a link, which files belong to the result.
+    /// Reads the list of the files that belong to the result from the summary at `path`, which may be a link.
     pub(super) fn read(path: &Path) -> Owner {
         // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
-    /// Reads from the open summary `file` which files belong to the result.
+    /// Reads the list of the files that belong to the result from the open summary `file`.
     pub(super) fn read_file(mut file: File) -> Owner {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;

@@ -79,8 +79,8 @@ impl<R: Read> CheckedReader<R> {
         self.is_blank
     }
 
-    /// Returns bytes of the file around the position of the parser, for error messages: the last two that the parser
-    /// has taken, and at least 14 that follow unless the file ends before.
+    /// Returns bytes of the file around the position of the parser, for error messages: the last two bytes that the
+    /// parser has taken, and at least 14 bytes after them unless the file ends earlier.
     pub(super) fn around(&mut self) -> Vec<u8> {
         let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
         if around.len() < 16 && self.fill().is_ok() {

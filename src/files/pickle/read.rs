@@ -460,8 +460,8 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// Executes STACK_GLOBAL: replaces two texts on the stack, a module and a name, by a node. A long text may be used
-    /// many times, so each copy of it is counted as memory.
+    /// Executes STACK_GLOBAL: replaces two texts on the stack, a module and a name, by a node for the function or class
+    /// with this name. A long text may be used many times, so each copy of it is counted as memory.
     fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {

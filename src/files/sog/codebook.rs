@@ -97,7 +97,7 @@ fn few_different(values: impl Iterator<Item = f32>) -> Option<Vec<f32>> {
     Some(padded(different))
 }
 
-/// Repeats the last entry up to 256 entries; without entries, returns zeros.
+/// Returns `entries` extended to 256 numbers: the last entry is repeated, and without entries all numbers are 0.
 fn padded(mut entries: Vec<f32>) -> Vec<f32> {
     let last = entries.last().copied().unwrap_or(0.0);
     entries.resize(ENTRIES, last);
