@@ -63,7 +63,7 @@ const CHUNK: usize = 1024;
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
     /// Attributes of all Gaussians at the reference frame. Comparisons read only the SH coefficients of degree 0;
-    /// proxies get all degrees that this table has.
+    /// proxies get the SH coefficients of all degrees in this table.
     pub states: &'a Gaussians,
     /// Rows of the survivors in `states`, increasing.
     pub rows: &'a [u32],

@@ -21,7 +21,8 @@ use crate::source::{FrameSource, Ids};
 /// Number of Gaussians per tile. One task of a scan reads such a block of Gaussians. The number is constant, so that
 /// the bytes of a container depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer.
+/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer
+/// frames per tile.
 pub const FRAME_BLOCK: usize = 32;
 /// Number of frames per tile in a container with error bounds. More frames pay with bounds, because the first frame of
 /// a tile takes as much space as all others together.

@@ -25,7 +25,8 @@ use crate::scene::outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
-/// Maximum number of cameras on the player page. If there are more cameras, an even selection is taken.
+/// Maximum number of cameras on the player page. If there are more cameras, an evenly spaced selection of them is
+/// taken.
 const CAMERAS: usize = 400;
 
 const PAGE: &str = include_str!("page/page.html");
@@ -102,7 +103,8 @@ pub struct PageRig {
     tolerance: f64,
 }
 
-/// Maximum number of training cameras whose cone is computed; of more cameras an even selection is taken.
+/// Maximum number of training cameras whose cone is computed. If there are more cameras, an evenly spaced selection of
+/// them is used.
 const RIG_CAMERAS: usize = 64;
 
 /// Returns the directions in which the training cameras of `rig` see the scene. Returns `None` if there are no such

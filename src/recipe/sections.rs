@@ -135,7 +135,8 @@ pub struct SelectParams {
 pub enum LowScorePolicy {
     /// Gaussians that stage 1 does not choose as candidates are removed.
     Drop,
-    /// Stage 2 decides on Gaussians that stage 1 does not choose in the same way as on the candidates that it chooses.
+    /// Stage 2 also decides on the Gaussians that stage 1 does not choose as candidates, by the same rule as on the
+    /// candidates.
     Rescue,
 }
 

@@ -77,8 +77,8 @@ pub struct BarChart {
     pub label: String,
     /// Name and value of each bar, from top to bottom.
     pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers only the range of the values instead of starting at 0. Marks are drawn instead of bars
-    /// if so.
+    /// Whether the axis covers only the range of the values instead of starting at 0. If so, marks are drawn instead of
+    /// bars.
     pub is_fitted: bool,
 }
 

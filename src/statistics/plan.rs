@@ -10,8 +10,8 @@ use crate::recipe::{MotionParams, ScanParams};
 /// step. Time stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5 frames; real gaps are far larger.
 const EVEN_TOLERANCE: f64 = 1e-2;
 
-/// Shortest accepted time step, as a fraction of the mean step. The curvature κ divides differences of positions by two
-/// steps, and is then squared, which must not overflow.
+/// Shortest accepted time step, as a fraction of the mean step. The curvature κ is a difference of positions divided by
+/// two steps; its square must not overflow.
 const LEAST_STEP: f64 = 1e-50;
 
 /// Number of bits of the largest contribution that a Gaussian can have in one (frame, view) pair, as a fixed-point

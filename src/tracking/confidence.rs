@@ -6,8 +6,8 @@ use super::track::{Candidates, NONE, OpenTrack, Round};
 
 /// Largest accepted fraction of a frame's links that is expected to be wrong.
 pub(super) const MAX_WRONG: f64 = 0.005;
-/// Cost that is added to the numerator and to the denominator of each ratio of link costs. Two costs whose difference
-/// is smaller then count as equal.
+/// Cost that is added to the numerator and to the denominator of each ratio of link costs. As a result, two costs that
+/// differ by less than this count as equal.
 const COST_TOLERANCE: f32 = 1e-6;
 /// Assumed probability that a track's own Gaussian is absent from a frame, although an unrelated one lies within reach.
 const ABSENCE_PROBABILITY: f32 = 0.25;

@@ -34,7 +34,7 @@ const IMAGES: u64 = 6;
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
 /// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
-/// Largest magnitude of a stored SH coefficient and of the logarithm of a scale.
+/// Largest accepted magnitude of a stored SH coefficient and of the logarithm of a scale.
 const MAX_CODEBOOK_VALUE: f32 = 1e30;
 
 /// Reads the Gaussians of the `.sog` file at `path`, or of a folder with the files of such an archive, in the order of
