@@ -20,7 +20,7 @@ const NETWORK_FILE: &str = "deform.pth";
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Paths {
     pub(super) root: PathBuf,
-    /// Training iteration K of both folders `iteration_K`.
+    /// Number K of the training iteration whose files are in `point_cloud/iteration_K` and `deform/iteration_K`.
     pub(super) iteration: u32,
     pub(super) cfg_args: PathBuf,
     pub(super) point_cloud: PathBuf,
@@ -48,8 +48,8 @@ fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
 }
 
 impl Paths {
-    /// Finds the files of the model folder `root`, of the requested `iteration`, or of the largest one that has both a
-    /// point cloud file and a network.
+    /// Finds the files of the model folder `root` that belong to the training iteration `iteration`. `None` selects the
+    /// largest iteration that has both a point cloud file and a network.
     ///
     /// # Errors
     /// Fails if a folder or file is missing.

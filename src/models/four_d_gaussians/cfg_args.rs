@@ -54,9 +54,9 @@ pub struct ModelConfig {
     pub no_dshs: bool,
     /// Whether the network reads positions instead of features from planes.
     pub no_grid: bool,
-    /// Whether a network computes a mask for the stored parameters of each Gaussian.
+    /// Whether a network computes for each Gaussian a mask: a factor on its stored parameters.
     pub static_mlp: bool,
-    /// Whether a voxel grid provides a mask for the stored parameters of each Gaussian.
+    /// Whether a voxel grid provides for each Gaussian a mask: a factor on its stored parameters.
     pub empty_voxel: bool,
     /// Number of frequencies whose sines and cosines are added to the features; default 0, none.
     pub grid_pe: i64,

@@ -194,8 +194,8 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
-    /// Returns a reader that computes the Gaussians block by block. A model computes each frame on its own, so a reader
-    /// of all Gaussians has no decoded frames to keep in memory.
+    /// Returns a reader that computes the Gaussians block by block. Frames do not depend on one another, so the reader
+    /// keeps nothing between frames.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
