@@ -92,11 +92,12 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step with which values have an error of at most `max_error`: twice `max_error`, minus the
-/// error that rounding the decoded value of the largest magnitude to f32 may add.
+/// Returns the quantization step with which values have an error of at most `max_error`. The step is twice `max_error`,
+/// minus the error that rounding the largest decoded value to f32 may add.
 ///
-/// Values whose neighboring f32 values are more than half of `max_error` apart are left out of this maximum. If their
-/// error exceeds `max_error`, they are stored with their original bits, as exceptions.
+/// Values whose neighboring f32 values are more than half of `max_error` apart are ignored when the largest value is
+/// determined. If the error of such a value exceeds `max_error`, the value is stored with its original bits, as an
+/// exception.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -164,7 +165,7 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Drops the multiples and exceptions (values stored with their original bits) of all frames but the first.
+    /// Returns only the multiples and exceptions (values stored with their original bits) of the first frame.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -183,7 +184,7 @@ impl Multiples {
     }
 
     /// Returns the prediction error of track `track` (one component of one Gaussian) at frame `frame`, zigzag-coded.
-    /// `frame` must not be the first.
+    /// `order` is the number of earlier frames that predict a value. `frame` must not be the first.
     fn residual(&self, order: u8, track: usize, frame: usize) -> u32 {
         let order = order_at(order, frame);
         let at = |back: usize| self.values[(frame - back) * self.plane + track];
@@ -191,7 +192,7 @@ impl Multiples {
     }
 
     /// Returns the prediction errors of all moving tracks (components of Gaussians that change in the tile) at all
-    /// frames but the first, track by track.
+    /// frames but the first, track by track. `order` is the number of earlier frames that predict a value.
     fn residuals(&self, order: u8) -> impl Iterator<Item = u32> + '_ {
         let moving = (0..self.plane).filter(|&track| self.moves[track]);
         let frames = self.values.len() / self.plane;
@@ -206,7 +207,8 @@ impl Multiples {
     }
 
     /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving, the
-    /// multiples of the first frame, and the prediction errors.
+    /// multiples of the first frame, and the prediction errors. `order` is the number of earlier frames that predict a
+    /// value.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {
@@ -232,13 +234,15 @@ pub(crate) struct BoundedTracks {
     exceptions: Vec<(u32, u32)>,
     plane: usize,
     frames: usize,
-    /// Number of moving tracks, that is, tracks that are not stored as a single multiple.
+    /// Number of moving tracks: tracks whose values are not all stored as a single multiple.
     moving: usize,
 }
 
 impl BoundedTracks {
-    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame. The error of a
-    /// malformed tile says what was found instead.
+    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame.
+    ///
+    /// # Errors
+    /// Fails if the tile is malformed; the error says what was found instead of a valid tile.
     pub(crate) fn read_head<'a>(
         &mut self,
         stored: &'a [u8],
@@ -276,8 +280,8 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks in the mask (one bit per track) at the start of the decompressed `bytes`, and checks
-    /// the length of `bytes`. An error says what was found.
+    /// Counts the moving tracks in the mask (one bit per track) at the start of `bytes`, the decompressed bytes of the
+    /// tile, and checks the length of `bytes`. An error says what was found.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -290,14 +294,15 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns the multiples of the quantization step of all tracks in the first frame, zigzag-coded.
+    /// Returns for each track its multiple of the quantization step in the first frame, zigzag-coded. `bytes` are the
+    /// decompressed bytes of the tile.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
     }
 
-    /// Returns the moving tracks at frame `frame`, which must not be the first: the index of each track, with its
-    /// prediction error.
+    /// Returns for each moving track its index and its prediction error at frame `frame`, which must not be the first.
+    /// `bytes` are the decompressed bytes of the tile.
     pub(crate) fn residuals<'a>(&self, bytes: &'a [u8], frame: usize) -> impl Iterator<Item = (usize, u32)> + 'a {
         let from = self.mask_bytes() + 4 * self.plane;
         let (after_first, values) = (self.frames - 1, self.moving * (self.frames - 1));
@@ -331,7 +336,7 @@ impl BoundedTracks {
     }
 }
 
-/// Returns whether the track `track` is moving, according to the mask at the start of `bytes`.
+/// Returns whether the track `track` is moving, according to the mask (one bit per track) at the start of `bytes`.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }

@@ -76,7 +76,7 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Statistics of the stored values of a tile; of a constant tile (all frames equal), those of its one stored frame.
+/// Statistics of the stored values of a tile. A constant tile (all frames equal) stores one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileStats {
     /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
@@ -191,17 +191,17 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
 
 /// Decoder of one tile that is not raw (lossless or lossy encoding), frame by frame.
 ///
-/// Memory: a lossless tile takes its decompressed bytes, as many as its values, and two frames. A lossy tile takes in
-/// addition 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th
-/// value is one). A raw tile takes nothing.
+/// Memory: a lossless tile takes as many bytes as its values, and two decoded frames. A lossy tile takes in addition
+/// 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th value is
+/// one). A raw tile takes nothing.
 #[derive(Debug, Default)]
 pub(crate) struct TileDecoder {
     order: u8,
     /// Decompressed bytes of the tile: in the lossless encoding the lowest bytes of all values, then the next bytes,
     /// and so on; in the lossy encoding as SPEC.md describes under "Bounded".
     shuffled: Vec<u8>,
-    /// The frame before `next`, and the frame before that: as [`ordered`] integers in the lossless encoding, as
-    /// multiples of the step in the lossy one.
+    /// Values of the last decoded frame (the frame before `next`), and of the frame before that: as [`ordered`]
+    /// integers in the lossless encoding, as multiples of the step in the lossy one.
     recent: [Vec<u32>; 2],
     next: usize,
     bounded: bool,
@@ -379,7 +379,7 @@ pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     }
 }
 
-/// Returns how many earlier frames predict frame `frame`: `order`, or fewer for the first frames.
+/// Returns the number of earlier frames that predict frame `frame`: `order`, or fewer for the first frames.
 pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
@@ -409,8 +409,9 @@ fn best_order(bits: &[u32], plane: usize) -> u8 {
     if cost(1) < cost(2) { 1 } else { 2 }
 }
 
-/// Applies the lossless filter to values given as bits, in frames of `plane` values. Returns the differences from the
-/// prediction as bytes in shuffled order: the lowest bytes of all first, their highest bytes last.
+/// Applies the lossless filter to values given as bits, in frames of `plane` values. `order` is the number of earlier
+/// frames that predict a value. Returns the differences from the prediction as bytes in shuffled order: the lowest
+/// bytes of all differences first, their highest bytes last.
 fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     let mut out = vec![0; 4 * bits.len()];
     let (low, high) = out.split_at_mut(2 * bits.len());

@@ -363,8 +363,8 @@ impl Reader {
         self.read_bytes.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Checks the checksum of a raw tile in the memory map, unless this was done before. Returns whether it was checked
-    /// now.
+    /// Checks the checksum of a raw tile (plain f32) in the memory map, unless an earlier call has checked it. Returns
+    /// whether this call checked it.
     fn verify_in_place(&self, index: usize, tile: &TileRecord, bytes: &[u8]) -> Result<bool> {
         // Relaxed ordering suffices: the flag only saves repeated work.
         if self.verified[index].load(Ordering::Relaxed) {

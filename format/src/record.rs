@@ -1,5 +1,6 @@
-//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes with a checksum of its
-//! own. A payload (the stored bytes of the record) with another checksum may follow.
+//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes, which contains a
+//! checksum of itself. The header may be followed by a payload (the stored bytes of the record), which has another
+//! checksum.
 
 use std::fmt;
 
@@ -29,8 +30,8 @@ pub(crate) struct TileRecord {
     pub(crate) frames: u32,
     pub(crate) encoding: Encoding,
     pub(crate) constant: bool,
-    /// Offset in the file of the tile's stored bytes. A constant tile (all frames equal) may share those of an earlier
-    /// one.
+    /// Offset in the file of the tile's stored bytes. A constant tile (all frames equal) may use the stored bytes of an
+    /// earlier tile.
     pub(crate) offset: u64,
     pub(crate) stored_bytes: u32,
     pub(crate) checksum: u64,

@@ -31,9 +31,9 @@ pub struct TileFrames {
 enum Counted {
     #[default]
     Nothing,
-    /// The frame that was read last has been counted. Contains the number of the frame.
+    /// Only the frame that was read last has been counted. Contains the number of this frame.
     Frame(usize),
-    /// The whole tile has been counted, when its checksum was checked.
+    /// The whole tile has been counted, because all of it was read to check its checksum.
     Tile,
 }
 
@@ -196,8 +196,8 @@ impl Reader {
         }
     }
 
-    /// Checks the checksum of a raw tile, which is read in chunks into the buffer `chunk`, unless this was done before.
-    /// Returns whether it was checked now.
+    /// Checks the checksum of a raw tile (plain f32), which is read in chunks into the buffer `chunk`, unless an
+    /// earlier call has checked it. Returns whether this call checked it.
     fn verify_raw(&self, index: usize, tile: &TileRecord, chunk: &mut Vec<u8>) -> Result<bool> {
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(false);
