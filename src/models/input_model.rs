@@ -358,7 +358,7 @@ pub(super) struct FoundInput<'a> {
 }
 
 impl<'a> FoundInput<'a> {
-    /// Reads the first bytes of `path` if it is a file.
+    /// Reads the first bytes of `path` if it is a file. Fails if `path` does not exist or cannot be read.
     pub(super) fn new(path: &'a Path, memory: ReadLimit) -> Result<FoundInput<'a>> {
         let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
         let mut head = Vec::new();

@@ -40,7 +40,8 @@ pub(in crate::models) fn network_tensor_names(root: &Path, memory: ReadLimit) ->
     last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
-/// Returns the number K of each subfolder `iteration_K` of `within` that contains `file`, in increasing order.
+/// Returns the number K of each subfolder `iteration_K` of `within` that contains `file`, in increasing order. Fails if
+/// `within` cannot be listed.
 fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
     let mut found = iteration_numbers(within)?;
     found.retain(|k| within.join(format!("iteration_{k}")).join(file).is_file());

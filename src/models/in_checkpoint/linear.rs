@@ -144,7 +144,8 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds the moment match in row `row` of `state`, at a frame where the window is `m` and the opacity is `alpha`.
+    /// Adds one frame to the sums. Row `row` of `state` is the moment match at this frame, `m` the window, and `alpha`
+    /// the opacity.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;

@@ -38,7 +38,7 @@ struct ReceivedFrames {
 
 impl ReceivedFrames {
     /// Creates an empty temporary folder in `scratch`. `reader_bytes` is the memory of the reader from which the frames
-    /// come.
+    /// come. Fails if the folder cannot be created.
     fn new(scratch: &Path, reader_bytes: u64) -> Result<ReceivedFrames> {
         Ok(ReceivedFrames {
             folder: ScratchFolder::new(scratch)?,
