@@ -137,7 +137,7 @@ impl<'a> Tile<'a> {
 impl Reader {
     /// Opens a container and checks its header, footer and index (table of tiles): every length and offset is within
     /// its limits, and no two tiles overlap. The tiles themselves are checked when they are read, or by
-    /// [`Reader::verify`].
+    /// [`Reader::verify`]. Fails if a check fails or the file cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
         Self::open_within(path, u64::MAX)
     }

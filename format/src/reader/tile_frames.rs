@@ -48,7 +48,8 @@ pub struct TouchedPages {
 impl Reader {
     /// Loads the tile `at` into `frames`, which then returns its frames. Decompresses a compressed tile; checks the
     /// checksum of a raw tile (plain f32) if this was not done before. `buffer` is used while loading and holds no
-    /// values of the tile afterwards.
+    /// values of the tile afterwards. Fails if there is no such tile, if its bytes are damaged, or if they cannot be
+    /// read.
     ///
     /// With `touched`, stored bytes are read in place from the memory map, under the conditions of [`Reader::tile`],
     /// and their range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released
@@ -106,7 +107,8 @@ impl Reader {
     }
 
     /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`. Of a raw tile only
-    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place.
+    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place. Fails if the
+    /// file has become too short.
     ///
     /// # Panics
     /// Panics if `out` has another size, if no tile was loaded into `frames` by this reader, or if the tile has no such
@@ -133,7 +135,7 @@ impl Reader {
     }
 
     /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the memory map
-    /// if the tile is raw and was loaded in place, otherwise in `buffer`.
+    /// if the tile is raw and was loaded in place, otherwise in `buffer`. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if no tile was loaded into `frames` by this reader, or if the tile has no such frame.
@@ -153,7 +155,7 @@ impl Reader {
     }
 
     /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; only one frame if all
-    /// frames of the tile are equal.
+    /// frames of the tile are equal. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if `out` has another size, or no tile was loaded.
