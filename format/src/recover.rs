@@ -112,7 +112,7 @@ struct FoundRecords {
 
 /// Finds the intact records of `file` from offset `start` on, one after the other. After a damaged record, it tries
 /// every multiple of 64 bytes. A record contains its own offset, so bytes inside a payload are not mistaken for a
-/// record.
+/// record. Fails if a read fails, or if the records found need more than `memory` bytes of memory.
 fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<FoundRecords> {
     let mut found = FoundRecords {
         times: HashMap::new(),

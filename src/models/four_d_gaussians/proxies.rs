@@ -143,9 +143,9 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 }
 
 /// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in
-/// scene units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at
-/// the leader of the cluster (its most important member), the offset that the leader has from the mean at the reference
-/// frame is added.
+/// scene units. The expected position is the weighted mean of the members of its cluster. If the proxy was placed at
+/// the leader of the cluster (its most important member), the offset of the leader from this mean at the reference
+/// frame is added to the expected position.
 fn deviations(
     model: &ModelFolder,
     reference: ReferenceFrame,
