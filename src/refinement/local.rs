@@ -25,7 +25,7 @@ pub(super) struct LinearizedState {
 }
 
 impl LinearizedState {
-    /// Creates a state without Gaussians, whose SH coefficients have degrees up to `sh_degree`.
+    /// Creates an empty state (no Gaussians) for SH coefficients of degrees up to `sh_degree`.
     pub(super) fn none(sh_degree: usize) -> LinearizedState {
         LinearizedState { present: None, state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
     }
@@ -60,7 +60,7 @@ impl LinearizedState {
     }
 }
 
-/// Reader of the scratch file with the frame states. Memory: one frame state in all, and 24 bytes per frame.
+/// Reader of the scratch file with the frame states. Memory: one frame state, and 24 bytes per frame.
 #[derive(Debug)]
 pub(super) struct LinearizedFrames {
     file: Spill,

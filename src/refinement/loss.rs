@@ -12,8 +12,8 @@ use crate::render::Image;
 /// Factor of the mean square error in the loss. With it, the squared error and 1 − SSIM contribute about equally at 35
 /// dB if both have the weight 0.5.
 const SQUARED_WEIGHT: f64 = 20.0;
-/// Number of rendered pixels of a training view per survivor (Gaussian left by pruning) that is enough: as long as the
-/// stride leaves 2 pixels per survivor, refinement loses at most 0.1 dB.
+/// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning), from which the stride
+/// follows. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
 const PIXELS_PER_GAUSSIAN: f64 = 2.5;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
@@ -70,8 +70,8 @@ impl Loss {
         [mean_square(picture, target), dissimilarity]
     }
 
-    /// Returns the bytes of memory per pixel of a view for comparing `threads` renders at once with their target views.
-    /// The renders and target views are not included. Returns 0 if SSIM is not part of the loss.
+    /// Returns the bytes of memory, per pixel of a view, for comparing `threads` renders in parallel with their target
+    /// views. The renders and target views themselves are not included. Returns 0 if SSIM is not part of the loss.
     pub(super) fn bytes_per_pixel(&self, threads: u64) -> u64 {
         let compared = threads * (12 + BYTES_PER_PIXEL) as u64;
         if self.ssim > 0.0 { compared.max((12 + SSIM_SLOPE_BYTES_PER_PIXEL) as u64) } else { 0 }

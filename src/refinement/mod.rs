@@ -49,8 +49,8 @@ const STEP_RENDERS: f64 = 3.0;
 /// Validation PSNR in dB at or above which refinement is skipped as useless: the root mean square error is then at most
 /// about a quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
-/// Minimum fraction of all Gaussians with which refinement begins. The ranking alone chooses these; smaller numbers are
-/// reached by prune steps between optimization steps.
+/// Minimum fraction of all Gaussians with which refinement begins. Ranking alone chooses the Gaussians at the
+/// beginning; prune steps between optimization steps then remove more of them.
 const MIN_START_FRACTION: f64 = 0.4;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
@@ -82,9 +82,8 @@ pub struct RefineStage {
     pub pictures: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub cuts: bool,
-    /// Color difference (norm over red, green, blue, each from 0 to 1) by which a Gaussian is assumed to differ at
-    /// least from the colors that it hides, when Gaussians are ranked for a prune step; see
-    /// [`crate::render::RemovalError`].
+    /// Minimum color difference (norm over red, green, blue, each from 0 to 1) that is assumed between a Gaussian and
+    /// the colors that it hides, when Gaussians are ranked for a prune step; see [`crate::render::RemovalError`].
     pub contrast_floor: f64,
     /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. With
     /// 0, parameter deltas are constant in time.
@@ -95,8 +94,8 @@ pub struct RefineStage {
 
 impl RefineStage {
     /// Returns the stage, or `None` if `recipe` optimizes no attribute or has no steps. `target`: fraction of the
-    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, because the run ranks Gaussians
-    /// by renders.
+    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, that is, whether the run ranks
+    /// Gaussians by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
@@ -158,8 +157,8 @@ impl RefineStage {
         self.loss.stride(pixels, survivors)
     }
 
-    /// Returns the number of final optimization steps, after the last prune step, if a fraction `kept` of all Gaussians
-    /// stays. The number grows in proportion to the fraction removed, up to [`RefineStage::steps`].
+    /// Returns the number of final optimization steps (after the last prune step) for a model that keeps the fraction
+    /// `kept` of all Gaussians. The number grows in proportion to the fraction removed, up to [`RefineStage::steps`].
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - MIN_START_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
@@ -183,7 +182,7 @@ impl RefineStage {
         (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
 
-    /// Returns the minimum fraction of all Gaussians with which refinement begins if its prune steps remove the
+    /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
     /// surplus; `None` if there are no prune steps.
     pub fn start_fraction(&self) -> Option<f64> {
         self.cuts.then_some(MIN_START_FRACTION)
@@ -284,8 +283,8 @@ pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> 
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
-/// Returns the number of optimization steps of the time-varying delta: two thirds of the `steps` steps of the constant
-/// delta, which they follow.
+/// Returns the number of optimization steps of the time-varying delta, which are run after `steps` optimization steps
+/// of the constant delta: two thirds of `steps`.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }

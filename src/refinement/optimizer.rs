@@ -18,9 +18,9 @@ const EPSILON: f32 = 1e-15;
 /// Number of first steps during which learning rates grow to full size, because Adam's running means are still
 /// unreliable.
 const WARM_UP: usize = 10;
-/// Error of the renders at the start from which learning rates have full size: the geometric mean of the root mean
-/// square errors of the views, with color values from 0 to 1. With a smaller error the rates are reduced in proportion,
-/// so that nearly correct parameters are not disturbed.
+/// Initial error of the renders at or above which learning rates have full size. The error is the geometric mean of the
+/// root mean square errors of the views, with color values from 0 to 1. For a smaller initial error the rates are
+/// reduced in proportion, so that nearly correct parameters are not disturbed.
 const FULL_ERROR: f64 = 0.036;
 
 /// Factor on all learning rates as a function of the optimization step.

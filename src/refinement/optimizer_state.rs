@@ -39,19 +39,19 @@ pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     if keyframe_count > 1 { keyframe_count } else { 0 }
 }
 
-/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only
-/// with a deformation field; without one, a frame state is always the state at the start plus the delta.
+/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only if
+/// the model has a deformation field; otherwise a frame state is always the state at the start plus the delta.
 pub(super) const REEVALUATE_EVERY: usize = 200;
 
 /// Optimizer together with its data: the frame states of the Gaussians left by pruning, at the frames of the target
 /// views, and the delta so far.
 ///
-/// With a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is then
-/// evaluated anew every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the field
-/// and its derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
+/// If the model has a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is
+/// then evaluated anew every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the
+/// field and its derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
-/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame; for a
-/// frame with few visible Gaussians it holds only these.
+/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame. If few
+/// Gaussians are visible in a frame, its state in the file has only these.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
@@ -61,9 +61,11 @@ pub(super) struct OptimizerState<'a> {
     varying: Attributes,
     /// State of each frame in `frames`, without the delta that the optimizer `descent` holds.
     linearized: LinearizedFrames,
-    /// Stored parameters without the delta that the optimizer `descent` holds. Used only with a deformation field.
+    /// Stored parameters without the delta that the optimizer `descent` holds. Used only if the model has a deformation
+    /// field.
     stored: StoredParams,
-    /// Delta of earlier optimization steps, which `stored` and `linearized` already include.
+    /// Part of the constant delta that `stored` and `linearized` already include. The optimizer `descent` holds
+    /// the rest.
     before: ParamDelta,
     fixed: Vec<bool>,
     /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
@@ -72,7 +74,7 @@ pub(super) struct OptimizerState<'a> {
     descent: Adam,
     /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.
     course: Vec<Adam>,
-    /// For each Gaussian, the attributes that vary between frames. With a deformation field, no attribute is listed.
+    /// For each Gaussian, the attributes that vary between frames; no attributes if the model has a deformation field.
     changing: Vec<Attributes>,
     gradients: Gradients,
     /// Buffer for the state of the frame that is being rendered.
@@ -89,8 +91,9 @@ pub(super) struct OptimizerState<'a> {
 }
 
 /// Contents of a checkpoint, in this order:
-/// - the stored parameters at the last evaluation of the frame states, and the delta that is included in them; `None`
-///   if states were not evaluated again since the last prune step or, before the first one, since the beginning,
+/// - the stored parameters at the last evaluation of the frame states, and the delta that they include; `None` if the
+///   frame states were not evaluated again since the optimizer was created (at the beginning or in the last prune
+///   step),
 /// - delta, running means and step number of the optimizer,
 /// - number of steps since the frame states were evaluated,
 /// - delta, running means and step number of the optimizer of each keyframe.
@@ -168,8 +171,8 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Creates a new optimizer `descent` with a delta of 0, which starts from the frame states in `linearized`, and
-    /// sets the stride for the number of Gaussians.
+    /// Replaces the optimizer `descent` by a new one, with a delta of 0, for the Gaussians in `linearized`. Also sets
+    /// the stride that suits the number of these Gaussians.
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -210,14 +213,15 @@ impl<'a> OptimizerState<'a> {
         &self.fixed
     }
 
-    /// Returns the delta of the stored parameters since the beginning, without its time-varying part.
+    /// Returns the total constant delta: the current stored parameters minus the stored parameters at the start. The
+    /// time-varying delta is not part of it.
     pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
         if self.descent.has_moved() { before.plus(self.descent.delta().clone()) } else { before }
     }
 
-    /// Evaluates the frame states anew from the stored parameters. Does nothing without a deformation field, because
-    /// states are then exact.
+    /// Evaluates the frame states anew from the stored parameters. Does nothing if the model has no deformation field,
+    /// because the states are then exact.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -273,8 +277,8 @@ impl<'a> OptimizerState<'a> {
         moved.position
     }
 
-    /// Restarts the optimizer from the total delta `change`, an earlier result of [`OptimizerState::change`] with the
-    /// same Gaussians.
+    /// Restarts the optimizer from the total constant delta `change`, an earlier result of [`OptimizerState::change`]
+    /// with the same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -283,8 +287,8 @@ impl<'a> OptimizerState<'a> {
         self.reevaluate_states()
     }
 
-    /// Adds the delta of the optimizer `descent` to the delta `before` and, with a deformation field, to the stored
-    /// parameters. Then resets the optimizer's delta to 0.
+    /// Adds the delta of the optimizer `descent` to the delta `self.before` and, if the model has a deformation field,
+    /// to the parameters `self.stored`. Then resets the delta of `descent` to 0.
     fn bake_delta(&mut self) {
         if !self.descent.has_moved() {
             return;

@@ -1,30 +1,30 @@
-//! Pruned models of a search for the smallest sufficient number of Gaussians. The model after each prune step is kept,
-//! so that smaller models can be made from it instead of from the beginning.
+//! Pruned models of a search for the smallest sufficient number of Gaussians. Models between two prune steps are kept,
+//! so that the search can make smaller models from them instead of from the beginning.
 
 use super::{MIN_PRUNE_FRACTION, RefineRun};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 
-/// Models that a search for the smallest sufficient number of Gaussians has made by prune steps so far. A model of
-/// another size is made from the smallest of these models that has at least as many Gaussians.
+/// Models that a search for the smallest sufficient number of Gaussians has kept so far, each between two prune steps.
+/// To try another number of Gaussians, the search starts from the smallest of these models that is large enough.
 pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
-    /// Models after a prune step, from the largest to the smallest. Models of a size that was asked for are not
-    /// included.
+    /// Models between two prune steps, from the largest to the smallest. The model after the last prune step of a
+    /// request is not kept.
     models: Vec<CompressedModel>,
 }
 
 impl<'a> PrunedModels<'a> {
-    /// Creates the models of a search without any model yet. [`PrunedModels::refined`] makes models by the optimization
-    /// and prune steps of `refinement`.
+    /// Creates an empty collection of models. [`PrunedModels::refined`] adds models to it, which it makes by the
+    /// optimization and prune steps of `refinement`.
     pub(crate) fn new(refinement: RefineRun<'a>) -> PrunedModels<'a> {
         PrunedModels { refinement, models: Vec::new() }
     }
 
-    /// Returns a refined model of `size` Gaussians: prunes the smallest earlier model that has at least `size`
-    /// Gaussians, then runs the final optimization steps. If there is no such model, pruning begins with `start`, the
-    /// model of the Gaussians that ranking alone keeps. Notes for the user are added to `journal`.
+    /// Returns a refined model of `size` Gaussians: prunes the smallest kept model that has at least `size` Gaussians,
+    /// then runs the final optimization steps. If no kept model is large enough, pruning begins with `start`, the model
+    /// of the Gaussians that ranking alone keeps. Notes for the user are added to `journal`.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.

@@ -35,13 +35,13 @@ const MIN_KEYFRAME_GAIN: f64 = 0.01;
 /// Factor applied to the learning rates when the optimization steps since the last validation have lowered the quality
 /// of the validation views.
 const RATE_REDUCTION: f32 = 0.3;
-/// Learning rates of the last step as a fraction of those of the first step: first value for the steps before a prune
-/// step, second value for the final steps.
+/// Learning rate at the last optimization step of a phase, divided by the learning rate at its first step. First value:
+/// steps before a prune step; second value: final steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
-/// Fraction of the final steps over whose parameters the mean is taken; these are the last ones. The mean is closer to
-/// the optimum than the parameters after a single step, which scatter around it.
+/// Fraction of the final steps, taken from their end, over which the parameters are averaged. The mean is closer to the
+/// optimum than the parameters after a single step, which scatter around it.
 const AVERAGED_FRACTION: f64 = 0.4;
-/// Number of optimization steps between two parameter deltas that enter the mean.
+/// Number of optimization steps between two parameter deltas that are averaged.
 const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
@@ -204,7 +204,7 @@ struct MeanDelta<Delta> {
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Adds the delta `next` to the deltas of which this is the mean.
+    /// Updates the mean with one more delta, `next`.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -254,8 +254,9 @@ impl<'a> RefineRun<'a> {
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of the model that is made of `reduction` by prune steps to `size` Gaussians and
-    /// refinement, if `wanted` Gaussians are to remain after the last prune step.
+    /// Returns the cache key of a refined model that is made from `reduction` by removing Gaussians until `size` are
+    /// left. The number of optimization steps also depends on `wanted`, the number of Gaussians after the last prune
+    /// step, so `wanted` is part of the key.
     fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
         self.key.extended_by(&(reduction, size, wanted, self.sampler.taken))
     }
@@ -375,7 +376,7 @@ impl<'a> RefineRun<'a> {
 
     /// Writes a checkpoint of the current phase (one prune step with its optimization steps, or the final steps), after
     /// `steps` optimization steps of this phase. Does nothing if too little time has passed since the last checkpoint,
-    /// or if nothing is cached.
+    /// or if the cache is disabled.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,
@@ -440,7 +441,8 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Runs `steps` optimization steps of the delta that is constant in time, then the steps of the time-varying delta.
-    /// Returns the deltas with the best validation quality, and tells `journal` how much was gained.
+    /// Returns the deltas with the best validation quality. Records in `journal` the gain in validation PSNR, or the
+    /// reason why nothing was gained.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -516,9 +518,11 @@ impl<'a> RefineRun<'a> {
         Ok(best_state)
     }
 
-    /// Runs the optimization steps of the time-varying delta, which follow `steps` steps of the constant delta. Starts
-    /// from the best constant delta or, if a checkpoint was loaded, after `done` steps in all (of both deltas) with its
-    /// learning rates `schedule`. Stores the best deltas in `best_state`. Returns whether any step was run.
+    /// Runs the optimization steps of the time-varying delta, which follow the `steps` steps of the constant delta.
+    /// Stores the best deltas in `best_state`. `done` is the number of steps of both deltas in the checkpoint that was
+    /// loaded; 0 without a checkpoint. If it is above `steps`, this function continues after these steps with the
+    /// learning rates `schedule`; otherwise it starts from the best constant delta. Returns false if there is nothing
+    /// to do, because no attribute may vary with time or the constant delta is good enough.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,

@@ -68,8 +68,9 @@ pub(crate) struct Targets {
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Fraction of the views from new cameras whose cameras are outside the rig (in directions that no camera of the scene,
-/// and no path between two of them, has) if [`Scene::outside`] is 1. It is proportionally smaller for smaller values.
+/// Fraction of the views from new cameras that are rendered from cameras outside the rig if [`Scene::outside`] is 1.
+/// For smaller values of it the fraction is smaller in proportion. A camera is outside the rig if it sees the scene
+/// from a direction that no camera of the scene, and no path between two of them, has.
 const OUTSIDE_SHARE: f64 = 0.5;
 
 /// Purpose of a target view.
@@ -151,8 +152,8 @@ impl Targets {
         }
     }
 
-    /// Returns target view `k` to be rendered: its camera, and the pixels whose values [`Targets::values`] returns for
-    /// the same `stride`.
+    /// Returns the camera of target view `k` with the grid of the pixels to render. [`Targets::values`] returns the
+    /// target colors of the same pixels if it gets the same `stride`.
     pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
         self.grid(k, stride).viewed_from(self.camera(k))
     }
