@@ -142,7 +142,8 @@ impl AxisScale {
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
 
-    /// Returns the pixel at which `value` is drawn; `None` if it is not finite, or not positive on a logarithmic axis.
+    /// Returns the position at which `value` is drawn, in SVG units (about pixels); `None` if the value is not finite,
+    /// or not positive on a logarithmic axis.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
         let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
@@ -317,7 +318,7 @@ impl StackedHistogram {
 /// Style of a series, which selects CSS classes of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Index of the style (color, shape, dash) in [`STYLE`], below [`LOOKS`].
+    /// Index of the style (color, shape, dash) in [`STYLE`]; less than [`LOOKS`].
     number: usize,
     hollow: bool,
 }

@@ -292,8 +292,8 @@ fn skipped(result: &ResultData, run: &RunFiles) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-/// Returns the chart of a search for a quality goal: the numbers of Gaussians that it tried. Empty if the run did not
-/// search.
+/// Returns the chart of a search for a quality goal, with the numbers of Gaussians that the search tried. Returns an
+/// empty text if the run made no search.
 fn searched(summary: &Summary) -> String {
     summary.goal.as_ref().map_or(String::new(), trade_off::search)
 }

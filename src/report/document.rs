@@ -1,4 +1,4 @@
-//! Frame of an HTML file that needs no network, and its building blocks.
+//! Skeleton of an HTML page that needs no network, and small parts for its content.
 //!
 //! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
 //! load only images that the file contains and to run only the scripts whose digests it lists.

@@ -239,9 +239,10 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views by which the run that wrote the compressed model scored Gaussians. The summary of the run states
-/// their number; the split that has this many views is returned. Without a summary or such a split, returns the
-/// training views, or all views if there are no training views.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are recognized by their
+/// number, which the summary of the run states. Tried in this order: the training views, all views, the held-out views.
+/// Without a summary, or if none of these has the stated number of views, returns the training views, or all views if
+/// there are no training views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -293,8 +294,9 @@ fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMe
     })
 }
 
-/// Renders the views of `choices` once more for their images. Returns these images, and for each of the failure modes
-/// `modes` the images of the place where it is worst. `traits` has the kinds of every Gaussian.
+/// Renders again the views of `choices` and the views in which failure modes are worst. Returns the images of
+/// `choices`, and for each failure mode in `modes` with a worst place the images of this place. `traits` has the kinds
+/// of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

@@ -95,8 +95,8 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     chosen
 }
 
-/// Returns the renders `choices` with their scores in `found`, the evaluation of another compressed model. The renders
-/// were chosen for the first compressed model of the same original.
+/// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `found` is
+/// the evaluation of this other model; the scores in `choices` are those of the first compressed model.
 pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
         let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;
