@@ -162,18 +162,18 @@ pub trait FrameSource: Send + Sync {
     /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
 
-    /// Opens a reader for the Gaussians `ids`, which returns them in this order. Work that does not depend on time is
-    /// done once, in this call.
+    /// Opens a reader that returns the Gaussians `ids` in this order. Work that does not depend on time is done once,
+    /// in this call.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
-    /// Opens a reader for all Gaussians at the frames `_wanted`, or returns `None` if readers of blocks take less time.
-    /// The reader may take more memory per Gaussian than readers of blocks.
+    /// Opens a reader for all Gaussians at the frames `_wanted`. The reader may take more memory per Gaussian than
+    /// readers of blocks. Returns `None` if reading block by block takes less time.
     fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
-    /// Returns the function that computes states from stored parameters. `None` for explicit trajectories, where a
-    /// change of a stored parameter changes the state at every frame by the same amount.
+    /// Returns the function that computes states from stored parameters. `None` if the state at every frame is stored
+    /// (explicit trajectories); a change of a stored parameter then changes every state by the same amount.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
@@ -201,8 +201,8 @@ pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the attributes of the stored parameters that an optimizer can change, because [`Deformation::jacobian`]
-    /// can differentiate by them.
+    /// Returns the attributes of the stored parameters that an optimizer can change: the attributes whose derivatives
+    /// [`Deformation::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
     /// Computes the state at `frame` of Gaussians with the parameters `stored`. Writes only the attributes `want` to
@@ -226,7 +226,7 @@ pub trait FeatureDecoder: Sync {
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// Source on a disk whose bytes can be fetched before they are used, by a thread that does nothing else.
+/// Fetching of bytes from a disk before a reader needs them. A thread that does nothing else calls [`Prefetch::fetch`].
 pub trait Prefetch: Sync {
     /// Returns the number of consecutive frames that are fetched and decoded together. Such a frame block starts at a
     /// multiple of this number.
