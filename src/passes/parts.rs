@@ -23,7 +23,8 @@ impl<'a> BlockSlices<'a> {
         parts
     }
 
-    /// Copies the attributes `want` of `block` to the slices, which must have been made for the same attributes.
+    /// Copies the attributes `want` of `block` to these slices. [`BlockSlices::split`] must have made them for the same
+    /// attributes.
     pub fn write(self, block: &Gaussians, want: Attributes) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));

@@ -107,8 +107,10 @@ pub struct ViewStates<'a, const S: usize> {
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool. If the subject
-    /// has features, these are blended and decoded to colors in the way of its model, without a background.
+    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool.
+    ///
+    /// If the subject has features, the renderer blends these in place of colors, and the decoder of its model computes
+    /// the color of each pixel from them. `background` is then ignored.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
         self.render_as(subject, self.states[subject], self.features(subject), background)
     }
@@ -119,9 +121,11 @@ impl<const S: usize> ViewStates<'_, S> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// Renders the Gaussians `state` in place of those of the subject with index `subject`, as [`ViewStates::render`]
-    /// does. `features` replaces the features of the subject and must have as many rows as `state` has Gaussians; with
-    /// `None`, colors are not decoded from features.
+    /// Renders the Gaussians `state` with the camera of this view, in place of the Gaussians of the subject with index
+    /// `subject`. Works like [`ViewStates::render`] otherwise.
+    ///
+    /// `features` replaces the features of the subject and must have one row per Gaussian of `state`. If it is `None`,
+    /// the Gaussians are rendered with their own colors.
     pub fn render_as(
         &self,
         subject: usize,
@@ -151,14 +155,16 @@ impl<const S: usize> ViewStates<'_, S> {
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
-    /// Features (values that take the place of colors) of the Gaussians of each subject that has them; empty for the
-    /// others.
+    /// Features (values that take the place of colors) of the Gaussians of each subject; empty for a subject whose
+    /// colors are not computed from features.
     features: [AttributeValues; S],
 }
 
 /// Reads the Gaussians of all `subjects` for the views `pictures` and calls `visit` with batches of these views, in
 /// order. `pictures` must be sorted by frame; their camera indices refer to `cameras`. Every frame is read once.
-/// Attributes that do not vary in time are read once into each buffer; there is one buffer per frame of a batch.
+///
+/// A batch has one buffer for each of its frames, which later batches use again. Attributes that do not vary in time
+/// are therefore read only once into each buffer.
 ///
 /// Memory: for each subject its reader, the frames that this reader keeps, and the Gaussians at every frame of a batch.
 ///
@@ -227,8 +233,10 @@ pub fn for_each_view_batch<const S: usize>(
 /// Set of workers, each a value of type `W` that accumulates results over the views passed to it. At most one worker
 /// per thread works at a time.
 ///
-/// Memory per Gaussian: its share of a reader; the attributes read, once for each frame of a batch (at most 4 × threads
-/// views and [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::views_together`] workers.
+/// Memory per Gaussian:
+/// - its share of a reader;
+/// - its attributes at each frame of a batch (at most 4 × threads views and [`Limits::frames_together`] frames);
+/// - its share of the data of each worker; there are at most [`Limits::views_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
     /// Workers that process no view at the moment.
