@@ -25,7 +25,8 @@ const NAME: &str = "view";
 /// Options of the command `view`, which writes a page that plays one or two models.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
-    /// Model to play, or the original of a compressed model. The split that these options request is ignored.
+    /// Model to play, or the original of a compressed model. [`InputOptions::split`] is ignored: the views of all
+    /// splits are used.
     pub original: InputOptions,
     /// Path of the compressed model to show beside the original, in any format.
     pub compressed: Option<PathBuf>,
