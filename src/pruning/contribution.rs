@@ -64,9 +64,10 @@ pub fn visible_contribution(
 
 /// Running sums of the contributions of every Gaussian to all views rendered so far.
 ///
-/// Memory per Gaussian: 44 bytes for its state in each frame that is held (a batch of frames that have 4 × threads
-/// views together, within `limits`), and 44 for the state of a block; for each view rendered at the same time 12 bytes
-/// of sums and the view's buffers ([`crate::render`]).
+/// Memory per Gaussian:
+/// - 44 bytes for its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - 44 bytes for its state while its block of Gaussians is read;
+/// - for each view rendered at the same time, 12 bytes of sums and the buffers of the view ([`crate::render`]).
 pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
@@ -81,8 +82,8 @@ impl RunningContribution {
         RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Renders the views `pictures` of `source`, in the order of frames, and adds the contributions of its Gaussians.
-    /// Calls `advance` after each view. The Gaussians of `source` must be those of all earlier calls. Fails if a frame
+    /// Renders the views `pictures` of `source`, in the order of frames, and adds the contributions of its Gaussians to
+    /// the sums. Every call must pass a source of the same Gaussians. Calls `advance` after each view. Fails if a frame
     /// cannot be read.
     pub fn add(
         &mut self,

@@ -32,7 +32,7 @@ pub struct Overrides {
 /// applies thresholds to the static and the dynamic score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// For each Gaussian, whether it stays.
+    /// For each Gaussian, whether it is kept.
     pub keep: Vec<bool>,
     /// Ranking of the Gaussians that the user does not drop, best first. Its first `counts.kept` Gaussians are those
     /// that stay.
@@ -41,9 +41,8 @@ pub struct Selection {
     pub counts: SelectionCounts,
 }
 
-/// Numbers of Gaussians at each stage of the selection. Without the user's overrides, `total` = `candidates` + number
-/// outside, and `kept` = `candidates` − `pruned_by_stage_2` + `rescued`. "Outside" are the Gaussians that stage 1 does
-/// not make candidates.
+/// Numbers of Gaussians at each stage of the selection. `total` = `candidates` + `rescued` + `pruned_by_stage_1`, and
+/// `kept` = `candidates` − `pruned_by_stage_2` + `rescued` + `forced_keep` − `forced_drop`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SelectionCounts {
     /// Number N of all Gaussians.

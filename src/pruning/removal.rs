@@ -15,21 +15,24 @@ use crate::source::{FrameSource, Ids};
 /// the ranking less than a different choice of views does.
 const PIXELS_PER_GAUSSIAN: f64 = 1.0;
 
-/// Returns the stride n of the views by which `count` Gaussians are ranked: only every n-th column and row of pixels is
-/// rendered. `pixels`: number of pixels of a view.
+/// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels
+/// is rendered. `pixels`: number of pixels of a view.
 pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
     pixel_stride(pixels, PIXELS_PER_GAUSSIAN * count as f64)
 }
 
 /// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
 /// it would cause, summed over the views `pictures`. Only every `stride`-th column and row of pixels is rendered. For
-/// `contrast_floor` see [`RemovalError::contrast_floor`]. Calls `advance` after each view. The thread count does not
-/// change a bit. Fails if a frame cannot be read.
+/// `contrast_floor` see [`RemovalError::contrast_floor`]. Calls `advance` after each view. The result does not depend
+/// on the number of threads. Fails if a frame cannot be read.
 ///
-/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes, where d is the SH degree, for its state in each
-/// frame that is held (a batch of frames that have 4 × threads views together, within `limits`) and once more for the
-/// state of a block; for each view rendered at the same time 8 bytes of sums and the view's buffers. Memory does not
-/// grow with the number of frames or views.
+/// Memory per Gaussian of `ids`, where d is the SH degree and a state has 44 + 12·(d + 1)² bytes:
+/// - its reader;
+/// - its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - its state while its block of Gaussians is read;
+/// - for each view rendered at the same time, 8 bytes of sums and the buffers of the view.
+///
+/// Memory does not grow with the number of frames or views.
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],

@@ -56,8 +56,9 @@ pub struct ScoreStage {
     pub user: UserOverrides,
 }
 
-/// Ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
-/// opacity) at or above which life spans count as short. The user is then told that linking frames may help.
+/// Minimum ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
+/// opacity) at which life spans count as short. The user is then told about linking, which joins Gaussians that
+/// continue one another in later frames.
 const SHORT_LIFE: usize = 4;
 
 /// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.

@@ -70,14 +70,14 @@ impl VisibilityStage {
         ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
-    /// Returns the stride n of the views by which `count` Gaussians are measured: only every n-th column and row of
-    /// pixels is rendered. `pixels`: number of pixels of a view.
+    /// Returns the stride n for the renders that measure the contributions of `count` Gaussians: only every n-th column
+    /// and row of pixels is rendered. `pixels`: number of pixels of a view.
     fn pixel_stride(&self, pixels: u64, count: usize) -> NonZeroU32 {
         let of_ranking = if self.is_preliminary { ranking_stride(pixels, count) } else { NonZeroU32::MIN };
         self.recipe.pixel_stride.max(of_ranking)
     }
 
-    /// Returns whether the views of a frame can be chosen as soon as the frame has been read, which is so if the number
+    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. This is so if the number
     /// of views is not limited. Otherwise views can be chosen only after the last frame.
     pub fn can_render_on_arrival(&self) -> bool {
         self.recipe.look_pictures == 0
@@ -117,9 +117,9 @@ impl VisibilityStage {
     }
 }
 
-/// Fraction of the Gaussians that the cameras must see at least, of those that are alive in any frame. Cameras that see
-/// fewer probably belong to another scene. Cameras of trained models see two thirds; those inside a scene that fills a
-/// room see a third.
+/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive in some frame.
+/// Cameras that see fewer probably belong to another scene. Cameras of trained models see two thirds; those inside a
+/// scene that fills a room see a third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
 
 /// Returns a warning for the user if very few of the Gaussians that are ever alive contribute to any view, so that the
