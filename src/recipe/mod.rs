@@ -107,8 +107,8 @@ impl Recipe {
         recipe
     }
 
-    /// Returns this recipe with `steps` optimization steps. The steps before each prune step (removal of the
-    /// lowest-ranked Gaussians) change in proportion.
+    /// Returns this recipe with `steps` optimization steps. Changes in proportion the number of optimization steps
+    /// before each prune step (removal of the lowest-ranked Gaussians).
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
@@ -228,9 +228,11 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
     }
 }
 
-/// Returns the values of all parameters: from `over` where it has them, otherwise from the preset that `over` names, or
-/// from the preset `fallback`. A named preset may itself name another preset. Without any preset, returns `over`. Fails
-/// if a named preset does not exist.
+/// Returns the parameters in `over`, completed by those of a preset. The preset is the one that the key `preset` of
+/// `over` names, otherwise `fallback`. It may itself be based on another preset.
+///
+/// Returns only the parameters in `over` if it names no preset and there is no fallback. Fails if the named preset does
+/// not exist.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
     over.remove("run");
@@ -247,8 +249,8 @@ fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Re
     Ok(table)
 }
 
-/// Replaces the values in `base` by those of `over`, table by table. Adds keys that `base` lacks; the typed parser
-/// refuses them later.
+/// Replaces the values in `base` by those of `over`, table by table. Also adds keys that `base` lacks: the later
+/// conversion to [`Recipe`] fails for an unknown key.
 fn overlay(base: &mut toml::Table, over: toml::Table) {
     for (key, value) in over {
         match (base.get_mut(&key), value) {
