@@ -33,8 +33,8 @@ impl Absent {
         self.ids().is_empty()
     }
 
-    /// Wraps `reader`, which reads the Gaussians with the ids `ids`, in a reader that makes the absent ones invisible.
-    /// Returns `reader` unchanged if none of these Gaussians is absent.
+    /// Wraps `reader`, which reads the Gaussians with the ids `ids`, in a reader that makes absent Gaussians invisible.
+    /// Returns `reader` itself if none of these Gaussians is absent.
     pub(super) fn hiding<'a>(&self, reader: Box<dyn BlockReader + 'a>, ids: &Ids<'_>) -> Box<dyn BlockReader + 'a> {
         let absent = self.ids();
         let rows = ids.iter().enumerate().filter(|(_, id)| absent.binary_search(&(*id as u32)).is_ok());
@@ -43,8 +43,8 @@ impl Absent {
     }
 }
 
-/// Reader that returns the Gaussians of another reader, but makes the absent ones invisible: those that have NaN or
-/// infinite values.
+/// Reader that returns the Gaussians of another reader, but makes the absent Gaussians (those with NaN or infinite
+/// values) invisible.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     /// Rows, in the data that `reader` returns, of the Gaussians to make invisible.

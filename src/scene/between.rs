@@ -13,11 +13,13 @@ const MIN_FRACTION: f64 = 0.15;
 /// direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
-/// Returns `count` new cameras, each at a random place on the path between two of `cameras`. Rotation and distance from
-/// the point where the optical axes meet are interpolated evenly. One of the two is chosen at random. The other is
-/// chosen at random among the cameras less than about 127° away from it, seen from that point; if there are none, it is
-/// the nearest camera at another position. (Paths between neighbors only would leave the middle of a rig empty.)
-/// Returns no camera if all cameras are at one position. The random numbers are the same in every run.
+/// Returns `count` new cameras, each at a random place on the path between two of `cameras`. Along the path, rotation
+/// and distance from the point where the optical axes meet are interpolated evenly. Returns no camera if all cameras
+/// are at one position. The random numbers are the same in every run.
+///
+/// The camera at the start of a path is chosen at random. The camera at its end is chosen at random among the cameras
+/// that are less than about 127° away, as seen from the point where the optical axes meet. If there are none, the
+/// nearest camera at another position is taken. (Paths between neighbors only would leave the middle of a rig empty.)
 pub fn cameras_between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);

@@ -24,7 +24,7 @@ pub struct InputOptions {
     pub conventions: TrainingConventions,
     /// Whether a folder with one PLY file per frame may lack frames.
     pub allow_gaps: bool,
-    /// Whether the Gaussians of successive frames are matched with each other and linked into tracks.
+    /// Choice whether the Gaussians of successive frames are matched with each other and linked into tracks.
     pub link: LinkMode,
     /// Number of frames at which a model that is continuous in time is evaluated; `None`: the times of the cameras are
     /// used.
@@ -116,10 +116,12 @@ pub struct OpenedInput {
 }
 
 /// Loads the cameras from the file or folder `path`; returns `None` if `path` is `None`. `times` states where the times
-/// of views come from, `clock` whether times in the camera file are normalized. If the camera file does not state the
-/// number of frames, the number of frames on which `input` was trained is used, else the number in `options`. The
-/// background color is the one in the camera file. If there is none, and the input is a sequence of frames (which
-/// states none either), the training background of the model in whose folder the cameras lie is used.
+/// of views come from, `clock` whether times in the camera file are normalized.
+///
+/// Values that the camera file does not state come from other places:
+/// - Number of frames: the number on which `input` was trained, else the number in `options`.
+/// - Background color: if `input` is a sequence of frames or `None`, the training background of the model in whose
+///   folder the cameras lie; otherwise none.
 ///
 /// # Errors
 /// Fails if the file does not exist or contains no cameras.

@@ -56,7 +56,8 @@ pub struct Scene {
     pub background: [f32; 3],
     /// Maximum amounts (frames, views, Gaussians) that passes over the scene keep in memory at a time.
     pub limits: Limits,
-    /// Maximum number of full reads of the input, from the memory plan that set `limits`; `None` before a plan is made.
+    /// Maximum number of times that the run reads the whole input, according to the memory plan that set `limits`;
+    /// `None` before a plan is made.
     pub planned_reads: Option<f64>,
     /// Measured times of this machine for this scene, as multiples of the times assumed for planning. Later stages
     /// estimate their time with these factors.
@@ -127,7 +128,7 @@ impl Scene {
     }
 
     /// Applies the memory plan `plan`: sets the limits for passes over this scene, and lets the input keep decoded
-    /// tiles in memory if the plan does.
+    /// tiles in memory if the plan says so.
     pub fn apply_plan(&mut self, plan: &MemoryPlan) {
         self.limits = plan.limits;
         self.planned_reads = Some(plan.full_reads());

@@ -67,9 +67,9 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     check_frames(OpenedInput { input, rig, notes }, path)
 }
 
-/// Loads the cameras that `options` name, or else those found with `input`; returns `None` if neither exist. The camera
-/// file of a model may count time differently from frames that have time stamps. If the normalized times of the views
-/// match no such frames, the times as the file states them are used, provided that these match.
+/// Loads the cameras that `options` name, or else the cameras found with `input`. Returns `None` if there are neither.
+/// The times in a camera file may be on another scale than the time stamps of frames. If the normalized times of the
+/// views are not among the time stamps, the times as the file states them are used, provided that they are.
 fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the image names of a still scene are not times.

@@ -12,7 +12,8 @@ use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of all views from cameras outside the rig. No data set uses this number.
 const VIEW_NUMBER: u32 = u32::MAX;
-/// Number of different cameras outside the rig that are created per view of the frame with the most views.
+/// Number of different cameras outside the rig that are created, as a multiple of the largest number of views at one
+/// frame.
 const CAMERAS_PER_VIEW: usize = 8;
 /// Maximum number of different cameras outside the rig.
 const MAX_CAMERAS: usize = 64;
@@ -25,9 +26,9 @@ const TRIES: usize = 64;
 /// Maximum number of iterations of the search for the direction of a cone that is nearest to a given direction
 /// ([`RigCone::angle`]).
 const MAX_DIRECTIONS: usize = 64;
-/// Tolerance of the search for the nearest direction of a cone. It ends if no direction of the cone brings a gain (dot
-/// product with the remainder) above this value. Vectors count as linearly dependent if their determinant is not above
-/// it.
+/// Tolerance of the search for the nearest direction of a cone. The search ends if every direction of the cone has a
+/// dot product with the remainder of at most this value. Vectors count as linearly dependent if their determinant is at
+/// most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
 /// Tolerance for the faces of a cone: sine of the angle below which a direction counts as being on a face, and distance
 /// of unit normals up to which two faces count as the same.
@@ -179,8 +180,8 @@ pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
     training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
 }
 
-/// Returns `camera` turned by `turn` about the point `focus`. The turned camera sees the scene as `camera` would see
-/// the scene after a turn about `focus` the other way.
+/// Returns `camera` after the rotation `turn` about the point `focus`. The scene looks to the new camera as it would
+/// look to `camera` after the inverse rotation of the scene about `focus`.
 fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
     let center = focus + turn * (camera.center() - focus);
     let rotation = camera.rotation * DMat3::from_quat(turn).transpose();
@@ -188,11 +189,11 @@ fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
 }
 
 impl Scene {
-    /// Adds views from cameras outside the rig to the schedule, so that Gaussians that only these views show are kept
-    /// and refined. `reach`, from 0 to 1, states how far outside the rig the quality of renders counts: angles from the
-    /// mean direction of the rig grow by a factor of up to 1 + `reach`, and every frame gets `reach` times as many
-    /// views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera outside the rig can be
-    /// found (see [`cameras_outside`]).
+    /// Adds views from cameras outside the rig to the views of every frame (`self.schedule`), so that Gaussians that
+    /// only these views show are kept and refined. `reach`, from 0 to 1, states how far outside the rig the quality of
+    /// renders counts. Angles from the mean direction of the rig grow by a factor of up to 1 + `reach`. Every frame
+    /// gets `reach` times as many views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera
+    /// outside the rig can be found (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
         if reach == 0.0 {
             return;
@@ -219,7 +220,8 @@ impl Scene {
         self.depend_on_views();
     }
 
-    /// Returns the cameras of the rig that the schedule uses, without the cameras added outside the rig.
+    /// Returns the cameras of the rig from which at least one view in `self.schedule` (the views at each frame) is
+    /// seen. Cameras that were added outside the rig are not included.
     pub fn rig_cameras(&self) -> Vec<Camera> {
         let used = self.schedule.used_cameras().into_iter().map(|index| index as usize);
         used.filter(|&index| index < self.rig.cameras.len()).map(|index| self.schedule.cameras[index].clone()).collect()

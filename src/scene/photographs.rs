@@ -43,10 +43,12 @@ impl Photographs {
     /// Finds the photographs of the views `pictures` in `folder`. Returns the views that have a photograph, and the
     /// paths of these photographs.
     ///
-    /// First, photographs are searched by the image paths in the camera file: the longest suffix of such a path for
-    /// which a file in `folder` exists. Only if this finds no photograph of any view, they are searched by names with
-    /// numbers: `tNNN_vNN.png` (frame, view), else `camNN/images/FFFF.png` as in DyNeRF (position of the view among the
-    /// folders `cam…`, frame).
+    /// First, photographs are found by the image paths in the camera file: a photograph is the file in `folder`
+    /// whose path is the longest suffix of the image path. Only if no view has such a photograph, photographs are
+    /// found by names with numbers:
+    /// - `tNNN_vNN.png`, with the numbers of frame and view,
+    /// - else `camNN/images/FFFF.png` as in DyNeRF, with the number of the frame. The folders `cam…`, sorted by their
+    ///   numbers, belong to the views 0, 1, 2 and so on.
     ///
     /// # Errors
     /// Fails if the folder cannot be read, if no view has a photograph, or if two views have the same photograph.

@@ -42,8 +42,8 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Packs the stream on standard input into a temporary container, or links its frames, and opens the result with its
-/// cameras.
+/// Opens the stream on standard input together with its cameras. The Gaussians of its frames are linked into tracks if
+/// [`is_linked`] says so; otherwise the frames are packed into a temporary container.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
