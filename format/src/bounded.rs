@@ -9,9 +9,10 @@
 //!
 //! The table shows compression factors (raw bytes / stored bytes) of three trained models, with zstd level 15 and
 //! bounds of .001 for positions, .005 for rotations and .01 for log scales and SH coefficients (`cargo bench --bench
-//! filters` of the program prints the table). "All" stores prediction errors (residuals) of all tracks, "moving" those
-//! of moving tracks only, in the order "by frame" or "by track". The last column also halves the step of static tracks
-//! where the tile becomes smaller:
+//! filters` of the program prints the table). Its columns are variants of the encoding. "All" stores the prediction
+//! errors (residuals) of all tracks, "moving" only those of moving tracks. "By frame" stores the prediction errors of
+//! one frame after the other, "by track" those of one track after the other. The last column is "moving, by track" with
+//! half the step for static tracks in tiles that become smaller that way:
 //!
 //! | column | all, by frame | all, by track | moving, by frame | moving, by track | half step where smaller |
 //! |---|---|---|---|---|---|
@@ -34,8 +35,8 @@ const HEAD_BYTES: usize = 16;
 /// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
 /// in another encoding.
 const VALUES_PER_EXCEPTION: usize = 16;
-/// Limit of the magnitude of a multiple of the quantization step: multiples are smaller, so that their second
-/// differences fit 32 bits.
+/// Limit of the absolute value of a multiple of the quantization step. All multiples are below this limit, so that the
+/// differences of their differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
 /// zstd level of the trial that decides whether static tracks use half the step. Half the step makes more tracks
 /// static, but each of them takes a bit more space.
@@ -92,12 +93,12 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step with which values have an error of at most `max_error`. The step is twice `max_error`,
-/// minus the error that rounding the largest decoded value to f32 may add.
+/// Returns the quantization step for an error of at most `max_error`. The step is 2 (`max_error` − r), where r is the
+/// largest error that rounding a decoded value to f32 may add. It is determined from the largest absolute value in
+/// `values`.
 ///
-/// Values whose neighboring f32 values are more than half of `max_error` apart are ignored when the largest value is
-/// determined. If the error of such a value exceeds `max_error`, the value is stored with its original bits, as an
-/// exception.
+/// Values so large that neighboring f32 numbers are more than half of `max_error` apart do not count as the largest. If
+/// the error of such a value exceeds `max_error`, the value is stored with its original bits, as an exception.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -110,8 +111,8 @@ struct Multiples {
     plane: usize,
     step: f64,
     halvings: u32,
-    /// Multiples, in the order of the tile's values. For a static track (all values stored as one multiple), the step
-    /// is that of [`static_step`].
+    /// Multiples of the quantization step, in the order of the tile's values. For a static track (all values stored as
+    /// one multiple), the step is the one that [`static_step`] returns; for other tracks it is `step`.
     values: Vec<u32>,
     /// Whether each track (one component of one Gaussian over all frames) is moving. A track that is not moving is
     /// static: all of its values are stored as one multiple.
@@ -121,9 +122,10 @@ struct Multiples {
 }
 
 impl Multiples {
-    /// Quantizes `values`: frames of `plane` values each, with an error of at most `max_error`. A track (one component
-    /// of one Gaussian over all frames) is static if one multiple of `step`, halved `halvings` times (0 or 1), is
-    /// within the error bound of all its values.
+    /// Quantizes `values`, which are frames of `plane` values each, with an error of at most `max_error`. A track (one
+    /// component of one Gaussian over all frames) is static if one multiple of its step is within the error bound of
+    /// all its values. The step of static tracks is `step`, halved `halvings` times (0 or 1); the step of all other
+    /// tracks is `step`.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);
         // Returns the multiple of `step` nearest to `x`, if it is within the error bound of all of `values`.
@@ -165,7 +167,8 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Returns only the multiples and exceptions (values stored with their original bits) of the first frame.
+    /// Drops the multiples and exceptions (values stored with their original bits) of all frames but the first. Returns
+    /// the rest.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -199,8 +202,8 @@ impl Multiples {
         moving.flat_map(move |track| (1..frames).map(move |frame| self.residual(order, track, frame)))
     }
 
-    /// Returns the order of prediction whose prediction errors take fewer bits: 1 or 2, the number of earlier frames
-    /// that predict a value.
+    /// Returns the order of prediction (number of earlier frames that predict a value), 1 or 2, with which the
+    /// prediction errors take fewer bits.
     fn order(&self) -> u8 {
         let cost = |order| self.residuals(order).map(|residual| u64::from(32 - residual.leading_zeros())).sum::<u64>();
         if cost(2) < cost(1) { 2 } else { 1 }
@@ -281,7 +284,7 @@ impl BoundedTracks {
     }
 
     /// Counts the moving tracks in the mask (one bit per track) at the start of `bytes`, the decompressed bytes of the
-    /// tile, and checks the length of `bytes`. An error says what was found.
+    /// tile, and checks the length of `bytes`. An error says what was found instead of a valid tile.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;

@@ -191,9 +191,9 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
 
 /// Decoder of one tile that is not raw (lossless or lossy encoding), frame by frame.
 ///
-/// Memory: a lossless tile takes as many bytes as its values, and two decoded frames. A lossy tile takes in addition
+/// Memory: for a lossless tile, 4 bytes per value of the tile, and two decoded frames. For a lossy tile, in addition
 /// 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th value is
-/// one). A raw tile takes nothing.
+/// one). A decoder that has loaded no tile takes no memory.
 #[derive(Debug, Default)]
 pub(crate) struct TileDecoder {
     order: u8,
@@ -255,9 +255,9 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes frame `frame` into `out`, which has one element for each value of a frame. For a later frame than the
-    /// last one decoded, the frames in between are decoded too; for any other frame, decoding starts again at the
-    /// first.
+    /// Decodes frame `frame` into `out`, which has one element for each value of a frame. A frame that is predicted
+    /// from earlier frames needs all of them: decoding goes on after the last decoded frame if `frame` is a later one,
+    /// and otherwise starts again at the first. With prediction order 0 only `frame` itself is decoded.
     pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
         if self.order == 0 || frame < self.next {
             self.next = if self.order == 0 { frame } else { 0 };
@@ -384,11 +384,11 @@ pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
-/// Returns the order of prediction (number of earlier frames that predict a value) whose differences take fewer bits: 1
-/// or 2, or 0 if there is only one frame.
+/// Returns the order of prediction (number of earlier frames that predict a value) with which the differences from the
+/// prediction take fewer bits: 1 or 2. Returns 1 for two frames, and 0 for a single frame.
 ///
-/// Compares every fourth value only: comparing all would take as long as the filter itself, and where the results are
-/// close, either order is good.
+/// Compares only every fourth value: comparing all would take as long as the filter itself. If the results are close,
+/// either order is good.
 fn best_order(bits: &[u32], plane: usize) -> u8 {
     let frames = bits.len() / plane;
     if frames < 3 {
@@ -439,8 +439,8 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     out
 }
 
-/// Computes the [`TileStats`] of values given as bits. Minimum and maximum are those of [`ordered`] integers, so the
-/// compiler can vectorize them and the order of the values does not matter.
+/// Computes the [`TileStats`] of values given as bits. Minimum and maximum are found by comparing [`ordered`] integers
+/// instead of floats, so the compiler can vectorize the loop and the order of the values does not matter.
 pub(crate) fn stats(bits: &[u32]) -> TileStats {
     const EXPONENT: u32 = 0x7f80_0000;
     let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);

@@ -249,8 +249,8 @@ impl Reader {
         self.times.len().div_ceil(self.layout.frame_block as usize) as u32
     }
 
-    /// Returns whether the values of a column differ between frames. Decided by the index alone: they do not differ if
-    /// all tiles of the column are constant and share their stored bytes.
+    /// Returns whether the values of a column differ between frames. This follows from the index alone: they do not
+    /// differ if all tiles of the column are constant and share their stored bytes.
     ///
     /// # Panics
     /// Panics if there is no such column.

@@ -273,12 +273,12 @@ impl Digest {
         Digest(hash)
     }
 
-    /// Adds the next tile to the hash; tiles come in the order of the index.
+    /// Adds the record of the next tile to the hash. Tiles must be added in the order of the index.
     pub(crate) fn tile(&mut self, tile: &TileRecord) {
         self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
     }
 
-    /// Returns the hash of all that was added so far.
+    /// Returns the hash of the header, the time stamps and the tiles added so far.
     pub(crate) fn value(&self) -> u64 {
         self.0.digest()
     }

@@ -23,9 +23,10 @@ pub struct VerifyReport {
 }
 
 impl Reader {
-    /// Reads the whole file and checks all that opening did not: every record equals its entry in the index, the stored
-    /// bytes of every tile have the recorded checksum and decode to values with the recorded statistics, and all bytes
-    /// in between are zero. Fails at the first difference. In a file that passes, no byte could be changed unnoticed.
+    /// Reads the whole file and checks all bytes that opening it did not check: every record equals its entry in the
+    /// index, the stored bytes of every tile have the recorded checksum and decode to values with the recorded
+    /// statistics, and all bytes in between are zero. Fails at the first difference. A change of any byte of the file
+    /// is found by opening or by this check.
     ///
     /// Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
     pub fn verify(&self) -> Result<VerifyReport> {

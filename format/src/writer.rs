@@ -338,7 +338,7 @@ impl Drop for Writer {
 }
 
 /// Checks that `times` are finite, strictly increasing and greater than `before`. The error holds the index of the
-/// first time that is not, and a description of it.
+/// first time that violates this, and a description of that time.
 pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
     let mut last = before;
     for (frame, &time) in times.iter().enumerate() {

@@ -51,11 +51,11 @@ impl Reader {
     /// values of the tile afterwards. Fails if there is no such tile, if its bytes are damaged, or if they cannot be
     /// read.
     ///
-    /// With `touched`, stored bytes are read in place from the memory map, under the conditions of [`Reader::tile`],
-    /// and their range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released
-    /// after this call, those of a raw tile after its last frame was read. Without `touched`, bytes are read by system
-    /// calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is read before its pages are
-    /// released.
+    /// If `touched` is given, stored bytes are read in place from the memory map, under the conditions of
+    /// [`Reader::tile`]. Their range is added to `touched`, so that [`Reader::release`] can release their pages: those
+    /// of a compressed tile after this call, those of a raw tile after its last frame was read. If `touched` is `None`,
+    /// bytes are read by system calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is
+    /// read before its pages are released.
     pub fn load(
         &self,
         at: TileId,
@@ -182,8 +182,8 @@ impl Reader {
         self.file.release(merged);
     }
 
-    /// Returns the loaded tile and the number of the stored frame that holds its frame `frame`: 0 if all frames are
-    /// equal.
+    /// Returns the loaded tile, and the index of its frame `frame` among its stored frames. This is `frame`, but 0 if
+    /// all frames are equal, because only one is stored then.
     fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
         let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
         assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
@@ -228,7 +228,8 @@ impl TileFrames {
 }
 
 impl TouchedPages {
-    /// Returns the number of bytes in the memory map that were read in place and have not been released.
+    /// Returns the number of bytes of tiles that were read in place from the memory map and whose pages have not been
+    /// released yet.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
