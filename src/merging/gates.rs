@@ -64,7 +64,7 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// Reads the values of Gaussian `i` from `states`.
+    /// Creates the appearance of the Gaussian in row `i` of `states`.
     pub fn new(states: &Gaussians, i: usize) -> Self {
         let log_scale = states.log_scale.row::<3>(i).map(f64::from);
         let mut sorted = log_scale;

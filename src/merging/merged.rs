@@ -1,5 +1,5 @@
-//! A sequence with explicit frames in which clusters are replaced by proxies (one Gaussian per cluster) while frames
-//! are read.
+//! A sequence in which proxies (one Gaussian per cluster) replace clusters of merged Gaussians. The proxies are
+//! computed while frames are read.
 //!
 //! The state of a proxy at a frame has the weighted mean and covariance of its members (the Gaussians of its cluster)
 //! at that frame. The weights are those of the reference frame for all frames, so the trajectory is Σ w_i x_i(t). No
@@ -39,10 +39,10 @@ pub struct MergedSequence<'a> {
 }
 
 impl<'a> MergedSequence<'a> {
-    /// Creates the sequence of the Gaussians `survivors` of `source`, in which proxies replace some of them. `clusters`
-    /// yields for each proxy its index in `survivors`, and the ids and weights of its members. Proxies are computed by
-    /// the parameters `merge`. A proxy is placed at the mean of its members; because its trajectory is explicit, it
-    /// need not be at its leader's position.
+    /// Creates the sequence of the Gaussians `survivors` of `source`, some of which are replaced by proxies. `clusters`
+    /// yields for each proxy the index in `survivors` of the Gaussian it replaces (its leader), and the ids and weights
+    /// of its members. Proxies are computed by the parameters `merge`, but always placed at the mean of their members:
+    /// their position is computed anew at every frame, so they need not move with the leader.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -110,10 +110,11 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every selected Gaussian, the index in `ids` of its own id (that of its leader if it is a proxy).
+    /// For every selected Gaussian, the index of its id in `ids`. A proxy has the id of its leader.
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// For every member of every proxy, the index of its id in `ids`, and its weight; one proxy after the other.
+    /// For every member of every proxy, the index of its id in `ids`, and its weight. The members of one proxy follow
+    /// one another.
     members: Vec<(u32, f64)>,
 }
 

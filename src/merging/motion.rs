@@ -42,9 +42,10 @@ pub struct PairMeasure {
 }
 
 impl PairMeasure {
-    /// Returns the alignment of the velocities a and b, A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1
-    /// for two static Gaussians, the cosine for equally fast ones, and small if one is ten times as fast as the other.
-    /// A is 1 if there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
+    /// Returns the alignment of the velocities a and b of the two Gaussians over the n steps, A = (2Σ a·b +
+    /// 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1 for two static Gaussians. It is the cosine of the angle
+    /// between the velocities for equally fast ones, and small if one is ten times as fast as the other. A is 1 if
+    /// there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
     ///
     /// `noise` is σ, the noise level of a step in scene units.
     pub fn alignment(&self, noise: f64) -> f64 {
@@ -131,8 +132,8 @@ pub struct PairMotion {
 
 impl PairMotion {
     /// Starts the measurement of `pairs`, each given as the indices of two nodes. `reference` yields the position of
-    /// every node at the reference frame. With the `motion` `Literal`, all steps count that end in a frame in which
-    /// both nodes are alive; with `Runs`, only those that also begin in such a frame.
+    /// every node at the reference frame. `motion` selects the steps that count: for `Literal`, all steps that end in a
+    /// frame in which both nodes are alive; for `Runs`, only those that also begin in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,

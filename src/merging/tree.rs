@@ -27,8 +27,8 @@ type NeighborCandidate = (u64, u32);
 
 /// List of the nearest points to a position found so far, up to the requested number.
 ///
-/// The list holds up to twice as many unsorted candidates before the farther half is dropped. A heap would move about
-/// log K candidates for each one found.
+/// The list collects up to twice the requested number K of candidates, unsorted, and then drops the farther half. A
+/// heap would move about log K candidates for each candidate added.
 #[derive(Debug, Default)]
 pub struct NearestPoints {
     query: u32,
@@ -142,8 +142,9 @@ impl Tree {
 }
 
 impl Node {
-    /// Returns a lower bound of (squared distance to `at`, index) for all points below this node. Each step of the sum
-    /// is monotone in f64, so rounding cannot raise the bound above the distance of a point in the node's box.
+    /// Returns a lower bound of the pair (squared distance to `at`, index) over all points below this node. Rounding to
+    /// f64 never raises the distance of the node's box above that of a point in it, because every operation of the sum
+    /// is monotone.
     fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)
