@@ -7,7 +7,8 @@ use super::workload::{MemoryPart, Workload};
 pub struct ResourceEstimate {
     /// Name of the stage.
     pub stage: &'static str,
-    /// Maximum number of times that the stage reads the whole input (all frames). It may be a fraction.
+    /// Maximum number of times that the stage reads the whole input (all frames), for example 0.5 if it reads half of
+    /// it.
     pub reads: f64,
     /// Estimated time of the stage on one processor core, in seconds. Computed from measured times of single
     /// operations.

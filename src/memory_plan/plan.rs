@@ -12,13 +12,13 @@ use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, format_duration};
 
 /// Divisor of the memory budget: all decoded tiles of a container (values of consecutive Gaussians × frames) stay in
-/// memory if they take at most 1/16 of the budget. If they do not stay, tiles are decoded again; the file system caches
-/// the stored bytes anyway. A larger share would thus save no more than decoding time, and leave less memory to other
-/// processes.
+/// memory if they take at most this part, 1/16, of the budget. Otherwise a tile is decoded again whenever it is needed,
+/// from stored bytes that the file system caches anyway. A larger part would thus save only decoding time, and leave
+/// less memory to other processes.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Functions that each halve one limit. Halving a limit slows a run; the functions that slow it most come first. If
-/// several functions free equally much memory, the last of them is chosen.
+/// Functions, each of which halves one limit. Halving a limit slows a run; the functions that slow it most come first.
+/// If several functions free equally much memory, the last of them is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -125,8 +125,8 @@ impl MemoryPlan {
         self
     }
 
-    /// Returns the maximum number of times that all stages together read the whole input; at most 1 if all decoded
-    /// tiles stay in memory.
+    /// Returns the maximum number of times that the whole input is read, summed over all stages. It is at most 1 if all
+    /// decoded tiles stay in memory.
     pub fn full_reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
         if self.limits.keeps_tiles { sum.min(1.0) } else { sum }

@@ -19,8 +19,8 @@ const PER_SLOT: u64 = 80;
 /// Bytes of memory per frame of a container that is being written: its time stamp (8 bytes), counted twice because the
 /// list of time stamps grows by being copied to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
-/// Bytes of memory per frame of an open input: its time stamp, once in the container's index and once in the sequence,
-/// and the number of Gaussians alive in the frame.
+/// Bytes of memory per frame of an open input: two copies of its time stamp (one in the container's index, one in the
+/// sequence), and the number of Gaussians alive in the frame.
 const PER_FRAME: u64 = 8 + 8 + 8;
 /// Bytes of memory per view in a list of views.
 const PER_PICTURE: u64 = 24;
@@ -45,7 +45,7 @@ pub struct Workload {
     pub varying: Attributes,
     /// Memory that the input and its readers take, and numbers of frames and Gaussians per tile of the input.
     pub input: MemoryProfile,
-    /// Number of different view numbers that the cameras use.
+    /// Number of distinct view numbers among the views of all cameras.
     pub viewpoints: u64,
     /// Number of pixels per image of the camera with the largest images.
     pub pixels: u64,
@@ -57,7 +57,7 @@ pub struct Workload {
     pub rig: u64,
     /// Number of threads that share the work.
     pub threads: u64,
-    /// Speed of this machine for the scene, with these threads.
+    /// Speed of this machine for this input when the work is shared by `threads` threads.
     pub throughput: Throughput,
 }
 
@@ -152,8 +152,8 @@ impl Workload {
         frames * self.state_bytes(columns & self.varying)
     }
 
-    /// Returns the memory that the readers of all threads take while they fill blocks of Gaussians, one block per
-    /// thread, including the buffers for decoding tiles.
+    /// Returns the memory that the readers of all threads take while each thread fills one block of Gaussians with
+    /// values. Includes the buffers for decoding tiles.
     pub fn filling_blocks(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
@@ -172,10 +172,11 @@ impl Workload {
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
-    /// Returns the memory of a pass over views as two lists of parts: parts in bytes per Gaussian, and parts of fixed
-    /// size in bytes. They cover the attributes `columns` of frames that are ready to be rendered, frames being read,
-    /// and views being rendered. `sums`: bytes per Gaussian of the results of the pass, which are counted once in total
-    /// and once more for each view being rendered.
+    /// Returns the memory of a pass over views as two lists of parts: parts that grow with the number of Gaussians, in
+    /// bytes per Gaussian, and parts of fixed size, in bytes. The parts are: frames that are ready to be rendered, with
+    /// their attributes `columns`; frames being read; and views being rendered, with the results of the pass. `sums` is
+    /// the number of bytes per Gaussian of these results, which are kept once for the whole pass and once more for each
+    /// view being rendered.
     pub fn view_pass_memory(
         &self,
         limits: &Limits,
@@ -219,9 +220,9 @@ impl Workload {
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns how often the whole input is read, at most, to get `frames` evenly spread frames; below 1 if only a part
-    /// is read. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only some
-    /// of its frames.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames; below 1
+    /// if only a part is read. Tiles are read as a whole. A tile is read several times if the memory limit lets readers
+    /// keep only some of its frames.
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -233,15 +234,16 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns how often the whole input is read, at most, as [`Workload::full_reads`] does, but for Gaussians with
-    /// arbitrary ids that are read in blocks. A tile with Gaussians of two such blocks is read for each of them.
+    /// Returns the maximum number of times that the whole input is read, like [`Workload::full_reads`], but for blocks
+    /// of Gaussians with arbitrary ids. A tile may contain Gaussians of two such blocks; it is then read for each of
+    /// them.
     pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
     }
 
     /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians. The
-    /// last argument gives the time of one view per Gaussian and per pixel.
+    /// [`RenderCost`] gives the time of one view per Gaussian and per pixel.
     pub fn render_seconds(
         &self,
         pictures: f64,
@@ -251,7 +253,8 @@ impl Workload {
         pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
-    /// Returns a copy of this workload for renders of only every `stride`-th pixel in each direction.
+    /// Returns a copy of this workload with the number of pixels for renders of only every `stride`-th pixel in each
+    /// direction.
     pub fn on_grid(&self, stride: NonZeroU32) -> Workload {
         Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
     }
@@ -320,7 +323,7 @@ pub struct RenderCost {
     gaussian: f64,
     /// Seconds on one processor core per pixel.
     pixel: f64,
-    /// Function that returns the ratio of [`Throughput`] by which the time is multiplied.
+    /// Function that picks the ratio by which both times are multiplied, for example [`Throughput::render_time`].
     pace: fn(&Throughput) -> f64,
 }
 
