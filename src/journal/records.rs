@@ -108,7 +108,8 @@ pub struct FieldSummary {
     /// Mean PSNR of renders with the half-precision field compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if the choice did not need it.
+    /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if `rounding` alone decided
+    /// that half precision is used.
     pub result: Option<f64>,
     /// Minimum value of `rounding` for which half precision is used, dB.
     #[serde(deserialize_with = "number")]
@@ -253,7 +254,7 @@ pub struct Forecast {
     pub measured: bool,
     /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,
-    /// Expected times of all stages in order.
+    /// Expected processor time of each stage, in the order of the stages.
     pub stages: Vec<StageForecast>,
 }
 
@@ -269,8 +270,8 @@ pub struct TermSummary {
     /// 99th percentile: value that 99% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
-    /// Whether the two percentiles differ. If they are equal, the term only separates Gaussians with values above the
-    /// percentiles from all others.
+    /// Whether `p1` and `p99` differ. If they are equal, the normalized term is 1 for Gaussians above this value and 0
+    /// for all others.
     pub active: bool,
 }
 
