@@ -41,7 +41,8 @@ impl CacheDir {
         }
     }
 
-    /// Makes all keys used from now on depend on `context`, too.
+    /// Makes all cache keys that are created from now on depend on `context`, in addition to the values they already
+    /// depend on.
     pub(super) fn depend_on(&mut self, context: CacheKey) {
         self.context = self.context.extended_by(&context);
     }
@@ -65,7 +66,8 @@ impl CacheDir {
         Ok(found)
     }
 
-    /// Returns descriptions of the inputs to which stored shards of `stage` with a key other than `key` belong.
+    /// Finds the stored shards of `stage` whose key is not `key`. Returns the descriptions of the inputs to which they
+    /// belong.
     pub(super) fn foreign_inputs(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
         let is_foreign = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
