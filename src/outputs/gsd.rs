@@ -37,8 +37,9 @@ const CENTIMETERS: f64 = 100.0;
 /// Number of bits per axis of the Morton code.
 const MORTON_BITS: u32 = 10;
 
-/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message with the loss of the format. Some sources
-/// decode several frames together; at most `held` decoded frames are then kept in memory.
+/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message for the user: number of Gaussians and
+/// frame rate of the file, and the parts of the input that it does not contain. Some sources decode several frames
+/// together; at most `held` decoded frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -96,7 +97,7 @@ fn describe_sequence(name: &str, most: usize, frames: &[Value]) -> Value {
     })
 }
 
-/// Returns the side length in pixels of the square textures of `count` Gaussians.
+/// Returns the side length in pixels of square textures with at least one pixel per Gaussian, for `count` Gaussians.
 fn side(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
