@@ -180,8 +180,8 @@ pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
     training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
 }
 
-/// Returns `camera` after the rotation `turn` about the point `focus`. The scene looks to the new camera as it would
-/// look to `camera` after the inverse rotation of the scene about `focus`.
+/// Returns `camera` after the rotation `turn` about the point `focus`. The turned camera sees what `camera` would see
+/// if the scene were rotated the other way about `focus`.
 fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
     let center = focus + turn * (camera.center() - focus);
     let rotation = camera.rotation * DMat3::from_quat(turn).transpose();
