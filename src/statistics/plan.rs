@@ -86,8 +86,8 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If the frames
-    /// turn out to be evenly spaced, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
+    /// Creates the plan for a stream whose frames have not arrived yet. The plan assumes that the frames are evenly
+    /// spaced. If this proves true, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
@@ -100,7 +100,8 @@ impl ScanPlan {
         }
     }
 
-    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`.
+    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`: whether
+    /// the plans differ at most in the numbers of frames and of (frame, view) pairs.
     pub fn can_finish(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pair_count: arriving.pair_count, ..self.clone() }
     }

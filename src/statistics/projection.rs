@@ -25,9 +25,9 @@ const JACOBIAN_CLAMP: f64 = 1.3;
 const DILATION_PX2: f64 = 0.3;
 /// Half the side of a projected Gaussian's bounding box, in standard deviations.
 const REACH: f64 = 3.0;
-/// Number of Gaussians that pass through one step of the projection before the next step. In a single loop over all
-/// steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap two
-/// iterations.
+/// Number of Gaussians for which one step of the projection is computed before the next step begins. In a single loop
+/// over all steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap
+/// two iterations.
 const BLOCK_LANES: usize = 32;
 /// Constant 2⁵². Adding it to x in [0, 2⁵²) leaves x, rounded to an integer, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;

@@ -198,8 +198,8 @@ impl<'a> BlockScan<'a> {
     /// sequence.
     ///
     /// # Panics
-    /// Panics if frames are missing, or if `plan` differs from the plan with which this scan began in more than the
-    /// frames that were not known then.
+    /// Panics if frames are missing, or if `plan` does not belong to this scan: only the number of frames and of
+    /// (frame, view) pairs may differ from the plan with which the scan began.
     pub fn finish_with_plan(mut self, plan: &ScanPlan) -> BlockStatistics {
         self.life.count_repeats();
         self.motion.count_steady_frames();

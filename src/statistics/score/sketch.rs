@@ -75,8 +75,8 @@ impl FloatSketch {
     }
 }
 
-/// Returns the histogram key of `value`: its f32 bits without the lowest `dropped` bits, mapped so that keys order as
-/// values do.
+/// Returns the histogram key of `value`: its f32 bits, mapped so that keys order as values do, without the lowest
+/// `dropped` bits.
 fn key(value: f64, dropped: u32) -> u32 {
     let bits = (value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32 + 0.0).to_bits();
     // The bits of negative floats order backward, so all of them are inverted. Positive floats must come after negative
@@ -85,7 +85,8 @@ fn key(value: f64, dropped: u32) -> u32 {
     ordered >> dropped
 }
 
-/// Returns the value whose bits were mapped to `ordered` by the order-preserving map.
+/// Returns the value of a histogram key `ordered` from which no bits were dropped; the inverse of the mapping in
+/// [`key`].
 fn value_of(ordered: u32) -> f64 {
     let bits = if ordered >> 31 == 1 { ordered ^ (1 << 31) } else { !ordered };
     f64::from(f32::from_bits(bits))
@@ -96,7 +97,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Returns the `p`-th percentile by nearest rank of `values`, which must be sorted.
+    /// Returns the `p`-th percentile by nearest rank of the finite values of `values`, found by sorting; `None` if no
+    /// value is finite.
     fn sorted_percentile(values: &[f64], p: u32) -> Option<f64> {
         let mut finite: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
         finite.sort_by(|a, b| a.partial_cmp(b).unwrap());
