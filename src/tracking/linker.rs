@@ -21,7 +21,7 @@ const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
 const MIN_FOR_CUT: usize = 16;
 
-/// Links the Gaussians of successive frames into tracks. Takes the frames one by one in time order.
+/// Linker of the Gaussians of successive frames into tracks. It takes the frames one by one in time order.
 #[derive(Default)]
 pub struct Linker {
     /// Tracks that may still continue, in the order of their numbers.
@@ -125,8 +125,9 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the indices in `tracks` of the tracks that `links` leaves without a Gaussian for the first time although
-    /// one of the Gaussians with the given `appearances` lies at the track's expected position and looks like it.
+    /// Returns the indices in `tracks` of the tracks whose place another Gaussian has taken. `links` leaves such a
+    /// track without a Gaussian for the first time, although a similar Gaussian is at the track's expected position.
+    /// `appearances` has the Gaussians of the frame.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

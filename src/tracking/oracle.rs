@@ -72,7 +72,8 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     }
 }
 
-/// Returns the difference in size, shape and color between two Gaussians, in the units of link costs.
+/// Returns the difference in size, shape and color between two Gaussians: the part of A in the module documentation
+/// without opacity.
 fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
     let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
@@ -100,11 +101,15 @@ impl SlowTrack {
 }
 
 impl SlowLinker {
-    /// Returns (probability that the link is wrong, track) for every track that a round has linked. `candidates` holds
-    /// all possible links of the round as (cost, track, Gaussian). `gaussian_of` holds the Gaussian of every linked
-    /// track, and `taken` the track of every linked Gaussian. `cost` returns the cost of a link between a track and a
-    /// Gaussian. `are_duplicates` gets a candidate track and Gaussian and the partners that both have now, and returns
-    /// whether the candidate is no rival because of near-duplicates.
+    /// Returns the pair (probability that the link is wrong, track) for every track that a round has linked.
+    ///
+    /// - `candidates`: all possible links of the round as (cost, track, Gaussian).
+    /// - `gaussian_of`: the Gaussian of every linked track.
+    /// - `taken`: the track of every linked Gaussian.
+    /// - `cost`: returns the cost of a link between a track and a Gaussian.
+    /// - `are_duplicates`: gets the track and the Gaussian of a candidate, then the Gaussian that the track is linked
+    ///   to and the track that the Gaussian is linked to, if any. Returns whether the candidate is no rival because of
+    ///   near-duplicates.
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
@@ -264,14 +269,18 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
     (std::array::from_fn(|c| at.position[c] + (frame - last) as f64 * v[c]), frame - last)
 }
 
-/// Pairs of tracks. Key: the later track and the bits of the pair's cost. Value: the earlier track, the number of
-/// frames in which both were present, whether the two are close, and whether the earlier track has ended.
+/// Pairs of a track and an earlier track. Key: number of the later track, and bits of the cost of the pair. Value:
+/// number of the earlier track, number of frames in which both tracks were present, whether both tracks are close, and
+/// whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks of one Gaussian (one track ends where and when a similar one begins), and returns for every track the
-/// number of its joined track. `r` scales the distance and `q` the difference in appearance in the cost of a pair.
-/// `in_doubt` are tracks that began because a link was probably wrong. `succeeded` holds (frame, track) for every track
-/// that is missing in the frame although a Gaussian like it is in its place.
+/// Joins tracks that belong to the same Gaussian: one track ends where and when a similar one begins. Returns for every
+/// track the number of its joined track.
+///
+/// - `in_doubt`: tracks that began because a link was probably wrong.
+/// - `succeeded`: (frame, track) of every track that is missing in the frame although a similar Gaussian is in its
+///   place.
+/// - `r` and `q`: factors on the distance and on the difference in appearance in the cost of a pair.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,

@@ -5,8 +5,8 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track.
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Largest amount by which the speed of a track lengthens the unit of distance in the cost of its links, in sizes of
-/// its Gaussian.
+/// Maximum amount that the speed of a track adds to the unit of distance in the cost of its links, as a multiple of the
+/// size of its Gaussian.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
@@ -19,9 +19,9 @@ pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round of linking: `reach` scales the distance and `strictness` the difference in appearance in the
-/// cost of a link, which may be at most 1. `includes_missing` states whether tracks without a Gaussian in the previous
-/// frame take part.
+/// Parameters of a round of linking. A link is possible if its cost is at most 1; in this cost, `reach` scales the
+/// distance and `strictness` the difference in appearance. `includes_missing` states whether tracks without a Gaussian
+/// in the previous frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
@@ -40,8 +40,9 @@ pub(super) struct OpenTrack {
     pub(super) appearance: ComparedAppearance,
     /// Whether the track began with a Gaussian whose link to another track was dropped as probably wrong.
     pub(super) is_in_doubt: bool,
-    /// Whether, when the track was missing for the first time, a Gaussian at its expected position looked like it. The
-    /// track then continues only with a Gaussian that equals its last one bit by bit.
+    /// Whether another Gaussian took the place of the track's Gaussian: in the first frame without a Gaussian of this
+    /// track, a similar Gaussian was at its expected position. The track then continues only with a Gaussian that
+    /// equals its last one bit by bit.
     pub(super) is_succeeded: bool,
 }
 
