@@ -32,8 +32,8 @@ impl Deltas {
         }
     }
 
-    /// Prepares for the deltas of `rows` Gaussians: resizes the deltas of the `active` attributes and stores the other
-    /// arguments.
+    /// Resizes the deltas of the `active` attributes to `rows` Gaussians, so that new deltas can be written. Sets the
+    /// fields [`Deltas::active`] and [`Deltas::multiply_rotation`] to the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);

@@ -14,7 +14,7 @@ use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Outputs of all layers, and derivatives, for one group of Gaussians.
+/// Outputs of all layers for one group of Gaussians, and the derivatives that the backward pass computes from them.
 #[derive(Default)]
 struct JacobianGroup {
     features: Vec<CacheLine>,

@@ -42,15 +42,18 @@ pub struct Network {
 #[derive(Debug, Clone)]
 struct NetworkLayer {
     linear: Linear,
-    /// Whether the layer reads the encodings of position and time before the output of the previous layer.
+    /// Whether the layer has a skip connection: its input is then the encodings of position and time, followed by the
+    /// output of the previous layer.
     has_skip: bool,
 }
 
-/// Linear output layer (head) that computes the offset of one attribute, or of three of its components.
+/// Linear output layer (head) that computes the offset of one attribute. For screw motions there are two heads for the
+/// position: one computes the rotation part w, the other the translation part v.
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Attributes,
-    /// First component of the attribute that the layer computes.
+    /// Index of the first plane of the attribute in [`PredictedMotion`] that the layer computes: 3 for the translation
+    /// part v of a screw motion, otherwise 0.
     plane: usize,
     output: Linear,
 }
@@ -64,8 +67,8 @@ pub struct EncodedPositions {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians: the outputs of its heads. Attributes for which the
-/// network has no head, or that were not requested, are empty.
+/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute stays empty if the
+/// network has no head for it, or until [`Network::motion`] is asked for it.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
     /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
@@ -81,11 +84,11 @@ pub struct PredictedMotion {
     pub color: AttributeValues,
 }
 
-/// Inputs and outputs of layers for one group of Gaussians.
+/// Buffers for the inputs and outputs of the layers, for one group of [`LANES`] Gaussians.
 #[derive(Default)]
 struct NetworkScratch {
-    /// Encodings of position and time, the input of the first layer. For a layer with a skip connection the output of
-    /// the layer before it follows.
+    /// Input of the first layer: the encodings of position and time. For a layer with a skip connection, the output of
+    /// the previous layer is appended.
     input: Vec<CacheLine>,
     /// Output of the layer that is evaluated now.
     last: Vec<CacheLine>,

@@ -81,7 +81,7 @@ pub(super) struct Planes {
     pub(super) levels: Vec<Level>,
 }
 
-/// Linear interpolation at a coordinate between the two nearest texels along one axis.
+/// Two neighboring texels along one axis, and their weights for linear interpolation at a coordinate between them.
 #[derive(Debug, Clone, Copy)]
 pub struct Tap {
     /// Index of the texel at or below the coordinate.
@@ -97,8 +97,8 @@ pub struct Tap {
 pub(super) struct PreparedPlanes {
     /// Products of the samples of the three planes without time, `[rows, width]` with one row per Gaussian.
     product: Vec<f32>,
-    /// Positions for interpolation on the lines of the three planes with time, `[rows, levels, 3]` with one row per
-    /// Gaussian and the axes x, y, z.
+    /// Texels and weights for interpolation along x, y and z in the three planes with time: `[rows, levels, 3]` with
+    /// one row per Gaussian.
     taps: Vec<Tap>,
 }
 
@@ -153,11 +153,11 @@ pub fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// Returns the number of leading rows of a plane over an axis and time that no time ≥ 0 reads, so that they need not be
-/// stored.
+/// Returns the number of rows at the start of a feature plane that are not read at any time ≥ 0, so that they need not
+/// be stored. Returns 0 for tensors that are not planes over an axis and time.
 ///
-/// `name` and `shape` are those of the tensor; rows are its third extent. Returns 0 for tensors that are not planes
-/// with time. Rows span the times −1 to 1, but models use times from 0 on, so about half of each plane is never read.
+/// `name` and `shape` are those of the tensor of the plane; its third extent is the number of rows. Rows span the times
+/// −1 to 1, but models use times from 0 on, so about half of each plane is never read.
 pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
@@ -238,7 +238,7 @@ impl Planes {
         prepared
     }
 
-    /// Interpolates the planes with time at `time`. Returns one line per axis for every level.
+    /// Interpolates the planes with time at `time`. Returns, for every level, one line for each of the axes x, y and z.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
@@ -249,9 +249,9 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// Writes the features of `lanes` Gaussians of the prepared block, beginning with Gaussian `start`, into `out`
-    /// `[width, LANES]`. `lines` are the planes with time, interpolated at the wanted time. Values of unused lanes are
-    /// 0.
+    /// Writes the features at one time of `lanes` Gaussians of the prepared block, from index `start` on, into `out`
+    /// `[width, LANES]`. `lines` are the planes with time, interpolated at this time ([`Planes::lines`]). Values of
+    /// unused lanes are 0.
     #[inline(always)]
     pub(super) fn features(
         &self,

@@ -3,8 +3,8 @@
 use super::Noise;
 use crate::{Tensor, Tensors};
 
-/// Number of outputs of the hidden layers. Deliberately not a multiple of the number of outputs that a layer sums
-/// together.
+/// Number of outputs of the hidden layers. Deliberately not a multiple of 4, the number of outputs that a layer
+/// computes together.
 const WIDTH: usize = 22;
 
 /// Number of values in the encoding of a position: its 3 components, and their sines and cosines in 10 octaves.
