@@ -112,11 +112,12 @@ pub(super) trait BlendSink {
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether a splat is blended first in all groups of pixels with even index and then in the groups with odd index.
-    /// [`BlendSink::swap_even_odd`] is called after each half.
+    /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index, if a vector
+    /// holds one group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the sums over even and over odd groups in the accumulator. Called after the even groups and after the odd
-    /// groups if a vector holds only one group of eight pixels.
+    /// Returns `accumulator` with its sums over even and over odd groups swapped, if a vector holds one group of eight
+    /// pixels. Called twice per splat: after the groups with even index, and after the groups with odd index. Returns
+    /// `accumulator` unchanged by default.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -270,9 +271,9 @@ impl BlendKernel {
 
 /// Number of splats whose footprints in the tile are computed together, before any of them is blended.
 ///
-/// The footprint of a splat tells which groups of pixels the splat touches. If a footprint were computed directly
-/// before its splat is blended, every mispredicted end of the loop over groups would wait for this computation and for
-/// the memory that it reads.
+/// The footprint of a splat tells which groups of pixels the splat touches, and thus how often the loop over groups
+/// runs. The processor often mispredicts the end of this loop. If a footprint were computed directly before its splat
+/// is blended, the processor would notice each misprediction only after this computation and its reads from memory.
 const LOOKAHEAD: usize = 16;
 
 /// Footprint of one splat in the rows of a tile. In a row, alpha at the column x is the opacity times 2 to the power of
@@ -283,14 +284,15 @@ struct TileFootprint {
     pair: usize,
     /// Set of the groups of pixels in which the splat may be visible, one bit per group.
     groups: u32,
-    /// Position of the center of the splat along y, relative to the upper edge of the tile, pixels.
+    /// Position of the center of the splat along y, relative to the first row of the tile, in pixels of the image.
     v: f32,
-    /// Position of the largest alpha along x in each row, relative to the left edge of the tile, pixels.
+    /// For each row, the position along x at which alpha is largest, relative to the first column of the tile, in
+    /// pixels of the image: `middle` in the formula of [`TileFootprint`].
     middles: TileLine,
-    /// Exponent (of 2) of the largest alpha in each row.
+    /// For each row, the exponent (of 2) of alpha where it is largest: `level` in the formula of [`TileFootprint`].
     levels: TileLine,
-    /// First and last column in which the splat is drawn, as offsets from the left edge of the tile in pixels; `None`
-    /// if no column of the tile is excluded.
+    /// First and last column in which the splat is drawn, as offsets from the first column of the tile in pixels of the
+    /// image; `None` if no column of the tile is excluded.
     drawn_columns: Option<[f32; 2]>,
 }
 
@@ -348,7 +350,7 @@ impl TileFootprint {
     }
 }
 
-/// Exponent (of 2) of the alpha in a row in which a splat is not drawn: it makes alpha 0.
+/// Value of [`TileFootprint::levels`] in a row in which a splat is not drawn: it makes alpha 0.
 const EXCLUDED_LEVEL: f32 = -1e9;
 
 /// Blends splats over a tile like [`BlendKernel::tile`], with vectors of type `V`.
@@ -436,10 +438,11 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     transmittance
 }
 
-/// Returns the set `live` of vectors of pixels without the vectors `ended`, in which all pixels have ended.
+/// Returns the set `live` of vectors of pixels without the vectors in `ended`, whose pixels have all ended. Each bit
+/// stands for one vector.
 ///
-/// This is a separate cold function, so that the processor predicts a branch around it. If the difference were computed
-/// for every splat, the groups of the next splat would wait for the pixels of this one.
+/// The function is cold and not inlined, so that its call is a branch, which the processor predicts. If the set were
+/// instead computed for every splat, the next splat could not begin before all pixels of this one are blended.
 #[cold]
 #[inline(never)]
 fn remove_ended(live: u32, ended: u32) -> u32 {

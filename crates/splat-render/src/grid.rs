@@ -53,10 +53,10 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Converts the rectangle `rect` of tiles of the image to tiles of the grid, which have 16×16 pixels of the grid
-    /// each. Returns the tiles that contain a pixel of the grid that lies in `rect`, at most `half[0]` pixels from `at`
-    /// horizontally and at most `half[1]` vertically. `size` is the size of the image in pixels. The result may be
-    /// empty.
+    /// Returns the rectangle of tiles of the grid (16×16 pixels of the grid each) that a splat can change; it may be
+    /// empty. `rect` are the tiles of the full image that the splat can change, `at` is its center, `half` half its
+    /// width and height, and `size` the size of the image, in pixels. The result contains every pixel of the grid that
+    /// lies in `rect` and at most `half` from `at` on each axis.
     pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
         if self.stride == 1 {
             return rect;
@@ -76,7 +76,8 @@ impl PixelGrid {
         TileRect { x0, x1, y0, y1 }
     }
 
-    /// Returns the number of columns (`axis` 0) or rows (`axis` 1) of the grid before column or row `pixel` of the image.
+    /// Returns the number of columns of the grid to the left of column `pixel` of the image (`axis` 0), or the number
+    /// of rows of the grid above row `pixel` of the image (`axis` 1).
     fn count_before(self, axis: usize, pixel: u32) -> u32 {
         pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
     }
