@@ -35,11 +35,11 @@ use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
 /// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
-/// the recipe file, if it records the options of an earlier run.
+/// the recipe file, if this file records the options of an earlier run.
 ///
 /// # Errors
-/// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal
-/// is invalid.
+/// Fails if the recipe or the goal (a quality or a size on disk) is invalid, or if the recipe file records cameras,
+/// times or photographs that do not exist.
 pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
     let kind = requested_kind(&args.format, &args.output)?;
@@ -176,7 +176,8 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
     }
 }
 
-/// Returns the library's options for comparing two models, without a file for the scores.
+/// Returns the library's options for comparing the renders of two models. The options request no CSV file of the
+/// scores; the caller can add one.
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
@@ -342,7 +343,7 @@ pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Opt
     Ok(if version == 4 { Some(OutputKind::Spz4) } else { kind })
 }
 
-/// Returns the library's name of the output format `kind`.
+/// Converts the output format `kind` from the type of the argument parser to the type of the library.
 fn output_kind(kind: OutputKindArg) -> OutputKind {
     match kind {
         OutputKindArg::Model => OutputKind::Model,
@@ -362,7 +363,8 @@ fn output_kind(kind: OutputKindArg) -> OutputKind {
     }
 }
 
-/// Returns the library's name of the split `named`; `None` for all views.
+/// Converts the split `named` from the type of the argument parser to the type of the library. Returns `None` for the
+/// views of all splits.
 fn split(named: SplitArg) -> Option<Split> {
     match named {
         SplitArg::Train => Some(Split::Train),
@@ -391,7 +393,8 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the facts about the training of the model that the options `trained` of the command line state.
+/// Returns the training conventions (facts about the training that model files do not record) that the command line
+/// states in `trained`.
 fn conventions(trained: &Trained) -> TrainingConventions {
     let zero_rotation = trained.zero_rotation.map(|handling| match handling {
         ZeroRotationArg::Drop => ZeroRotation::Drop,
@@ -401,8 +404,8 @@ fn conventions(trained: &Trained) -> TrainingConventions {
     TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
-/// Returns the library's options for opening an input. Temporary files go to `--scratch-dir`, otherwise beside
-/// `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
+/// Returns the library's options for opening an input. Temporary files go to the folder that `--scratch-dir` names.
+/// Without this option, they go beside `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
 pub(super) fn input_options(
     input: Input,
     cameras: Option<Cameras>,

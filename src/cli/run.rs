@@ -89,8 +89,8 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     printed
 }
 
-/// Runs the command `score`, which writes a table of statistics and scores. Prints its notes and the number of
-/// Gaussians that the recipe keeps.
+/// Runs the command `score`, which writes a table of the statistics and scores of all Gaussians. Prints notes, and the
+/// number of Gaussians that a compression with the recipe would keep before merging.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
