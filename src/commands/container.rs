@@ -46,8 +46,8 @@ const PACK_STAGE: &str = "pack";
 pub enum StoragePrecision {
     /// All values exact to the bit, with the given compression.
     Exact(Compression),
-    /// Errors of the listed attributes within their bounds, all other values exact to the bit. The second field is the
-    /// level of zstd compression.
+    /// Values of the listed attributes with at most the listed errors, all other values exact to the bit. The second
+    /// field is the level of zstd compression.
     Within(Vec<MaxError>, i32),
 }
 
@@ -158,8 +158,8 @@ fn pack_arriving(
     Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
-/// Returns the report on packing the container `output`, from the given numbers. `larger`: reason why the container is
-/// larger than the input, if it is.
+/// Returns the report on the packed container with the path `output`. `bytes`: size of the container. `larger`: reason
+/// why the container is larger than the input, if it is.
 fn packed(
     output: &Path,
     gaussians: usize,

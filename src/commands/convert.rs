@@ -23,11 +23,12 @@ use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_input};
 
-/// Approximate bytes of memory per Gaussian while curves are fitted to its track (its values at all frames) and
-/// encoded: a few curve segments.
+/// Approximate bytes of memory per Gaussian for the curve segments that are fitted to its track (its values at all
+/// frames), and for their encoding. Assumes a few segments per Gaussian.
 const FITTED_BYTES: u64 = 4 * 600;
 
-/// Bytes of memory per Gaussian and frame for the images in which a `.tsog` file stores single frames.
+/// Bytes of memory per Gaussian and frame for the images of a `.tsog` file that stores every frame by itself instead of
+/// curves.
 const FRAME_IMAGE_BYTES: u64 = 8 * 4 + 64;
 
 /// Returns whether `convert` writes a container to `output`. `requested`: requested format; `None`: the format follows
@@ -36,8 +37,9 @@ pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
     OutputKind::from_path(output, requested, OutputKind::Model) == OutputKind::Gseq
 }
 
-/// Writes all Gaussians of `input` to `output` in the format `requested`. `None`: the format follows from the name of
-/// the output; for a folder, it is the input's own model format, or one PLY file per frame for a sequence.
+/// Writes all Gaussians of `input` to `output` in the format `requested`. If `requested` is `None`, the format follows
+/// from the name of the output. For a folder, it is the input's own model format, or one PLY file per frame if the
+/// input has no model format (a container or a frame stream).
 ///
 /// # Errors
 /// Fails if the input cannot be read or cannot be written in this format, or if the output exists already.

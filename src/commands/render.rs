@@ -195,8 +195,8 @@ impl RenderJob<'_> {
         self.for_each_view(pictures, encode, |bytes| to.write_record(&bytes))
     }
 
-    /// Renders the views `pictures`. Calls `render_one` with each view and its render, from any thread, and then `take`
-    /// with each value that `render_one` returned, in the order of the views.
+    /// Renders the views `pictures`. Calls `render_one` with each view and its finished render, from any thread. Passes
+    /// the values that `render_one` returns to `take`, in the order of the views.
     fn for_each_view<T: Send>(
         &self,
         pictures: &[FrameView],
@@ -222,8 +222,8 @@ impl RenderJob<'_> {
     }
 }
 
-/// Reads the image files of the views `pictures`, which [`RenderJob::spill`] wrote, back from `spill`, and writes each
-/// to the path that `path` returns for its view.
+/// Copies the image files of the views `pictures` from `spill`, to which [`RenderJob::spill`] wrote them, to the paths
+/// that `path` returns for the views.
 fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {

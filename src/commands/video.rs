@@ -31,8 +31,8 @@ const VIEWS_BETWEEN_STOPS: usize = 24;
 pub enum VideoCamera {
     /// Camera of the view with this number, which may move over time; `None`: the view with the lowest number.
     View(Option<u32>),
-    /// Path through the cameras of the views with these numbers, in order; empty: through the cameras of all views by
-    /// number.
+    /// Path through the cameras of the views with these numbers, in this order. If the list is empty: path through the
+    /// cameras of all views, by increasing view number.
     Path(Vec<u32>),
 }
 
@@ -71,8 +71,9 @@ pub struct VideoReport {
     pub notes: Vec<String>,
 }
 
-/// Renders a video of an input, one image per frame in order. Along a path through a still (a model without motion),
-/// the camera moves from image to image.
+/// Renders a video of an input, with one image per frame of the model, in order. Exception: if a camera path leads
+/// through a still (a model without motion), the video has a fixed number of images from each camera of the path to the
+/// next.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
@@ -122,9 +123,10 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
-/// Removes the times from the shots (views of the scene) of `opened`, so that every camera can show every frame, and
-/// returns a copy of the shots with their times. Does nothing and returns `None` if there are no cameras, or if
-/// `has_other_frames` is false, because the frames are then at the times of the cameras.
+/// Removes the times from the shots (views of the scene) of `opened`, so that every camera can show every frame.
+/// Returns a copy of the shots from before, with their times. Does nothing and returns `None` in two cases:
+/// - There are no cameras.
+/// - `has_other_frames` is false: the frames are at the times of the cameras.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -184,8 +186,8 @@ fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> R
     }
 }
 
-/// Returns the part of `shots` (views of the scene, sorted by view number) with the view number `view`. Fails if there
-/// are none; `flag` is the option that the error names.
+/// Returns the shots (views of the scene) with the view number `view`. `shots` must be sorted by view number. Fails if
+/// there is no such shot; the message names the command line option `flag`.
 fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
     views.find(|shots| shots[0].view == view).ok_or_else(|| {
