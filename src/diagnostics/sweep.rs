@@ -36,13 +36,13 @@ pub struct SweepOptions {
     pub steps: Vec<u32>,
     /// Fraction of the Gaussians that the runs listed in `steps` keep, in (0, 1].
     pub steps_at: f64,
-    /// Number of times that each point of the curves is run, at least 1. The median time is reported.
+    /// Number of runs for each point of the trade-off curves, at least 1. The median time of these runs is reported.
     pub runs: usize,
     /// Maximum number of frames at which results are compared with the original, evenly spaced; `None`: all frames.
     pub max_frames: Option<usize>,
     /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of the command `evaluate`.
     pub background: Option<[f32; 3]>,
-    /// Path of the output folder, for `sweep.json`, `sweep.csv`, `knobs.csv` and the page with the curves.
+    /// Path of the output folder, for `sweep.json`, `sweep.csv`, `knobs.csv` and the page with the trade-off curves.
     pub output: PathBuf,
     /// Policy for an output path that already exists.
     pub overwrite: Replace,
@@ -154,22 +154,23 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-/// Returns the number of Gaussians that merging without pruning leaves, according to the points in `found`; `None`
-/// until this point is measured.
+/// Returns the number of Gaussians that remain after merging without pruning, according to the points in `found`.
+/// Returns `None` if merging without pruning has not been measured yet.
 fn merge_only_count(found: &TradeOff) -> Option<usize> {
     let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether `method` is merging without pruning and cannot reach `fraction`, because merging alone leaves more
-/// Gaussians, according to the points in `found`.
+/// Returns whether `method` is merging without pruning and merging alone leaves more Gaussians than `fraction` allows,
+/// according to the points in `found`.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
     let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// Measures one point of the curves by running `method`, whose recipe or baseline is `means`. `fraction`: fraction of
-/// the Gaussians to keep; `None`: the method chooses their number. Stores the number of compared views in `found`.
+/// Measures and returns one point of the trade-off curves by running `method`, whose recipe or baseline is `means`.
+/// `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their number. Also sets the number of
+/// compared views in `found`.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,

@@ -59,7 +59,8 @@ pub struct TestSceneReport {
 /// Generates the test scene, writes it to a container and compresses this container.
 ///
 /// # Errors
-/// Fails if the requested number of Gaussians is impossible, if the compression fails, or if a file cannot be written.
+/// Fails if `kept` is not a valid fraction or number of the Gaussians of the scene, if the compression fails, or if a
+/// file cannot be written.
 pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     options.kept.resolve_count(options.gaussians)?;
     let Some(output) = &options.output else {

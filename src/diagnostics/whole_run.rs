@@ -21,8 +21,8 @@ use crate::scene::{InputOptions, Scene};
 pub(crate) struct WholeRun<'a> {
     /// Input and cameras. The split that these options request is ignored: Gaussians are scored by the training views.
     pub(crate) input: &'a InputOptions,
-    /// Path of a folder that does not exist yet. It is created to hold the result while this is measured, and then
-    /// deleted.
+    /// Path of a folder that does not exist yet. It is created to hold the result of a run, and deleted once this
+    /// result has been measured.
     pub(crate) scratch: &'a Path,
     /// File name of the result, which determines the output format.
     pub(crate) name: &'a str,

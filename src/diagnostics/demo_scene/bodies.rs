@@ -16,7 +16,7 @@ pub enum DemoBody {
     /// Gaussians can be merged.
     Wall,
     /// Near-duplicates of Gaussians of the walls: shifted by up to a tenth of their size, a little smaller and less
-    /// opaque, of the same color. Without motion; the first Gaussians to be merged.
+    /// opaque, of the same color. Without motion. Merging is expected to merge these Gaussians first.
     Double,
     /// Opaque Gaussians behind the back wall, invisible to every camera. Without motion. A ranking by visibility prunes
     /// them first, a ranking by opacity or size does not.

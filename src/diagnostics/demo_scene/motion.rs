@@ -56,7 +56,7 @@ pub(super) enum DemoMotion {
 pub(super) const CLOTH_WIDTH: f64 = 1.2;
 /// Amplitude of the wave at the free edge of the cloth, scene units.
 const SWING: f64 = 0.18;
-/// Number of wavelengths of the wave that the width of the cloth holds.
+/// Width of the cloth, in wavelengths of its wave.
 const WAVES: f64 = 1.5;
 /// Number of periods that the wave of the cloth makes during the sequence.
 const PASSES: f64 = 2.0;
@@ -129,34 +129,35 @@ impl DemoGaussian {
     }
 }
 
-/// Pseudo-random numbers of the Gaussian whose id is the value of the field. Each number is a hash of this id and of
+/// Pseudo-random numbers of one Gaussian; the field is the id of the Gaussian. Each number is a hash of this id and of
 /// the index of the number, which is called channel. So the numbers do not depend on the order in which Gaussians are
 /// read.
 #[derive(Clone, Copy)]
 pub(super) struct GaussianRandom(pub(super) u64);
 
 impl GaussianRandom {
-    /// Returns the random number of the Gaussian with the index `channel`, in [0, 1).
+    /// Returns random number `channel` of the Gaussian, in [0, 1).
     pub(super) fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
         (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
     }
 
-    /// Returns the random number of the Gaussian with the index `channel`, in [−1, 1).
+    /// Returns random number `channel` of the Gaussian, in [−1, 1).
     pub(super) fn signed(self, channel: u64) -> f64 {
         2.0 * self.unit(channel) - 1.0
     }
 
-    /// Returns the random number of the Gaussian with the index `channel`, in [`low`, `high`].
+    /// Returns random number `channel` of the Gaussian, in [`low`, `high`].
     pub(super) fn between(self, channel: u64, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit(channel)
     }
 }
 
-/// Channel (index of a random number in [`GaussianRandom`]) of the random brightness of a Gaussian's color, for
-/// Gaussians of every object. The channels that a single object uses start at 0.
+/// Channel (index of a random number in [`GaussianRandom`]) of the random brightness of a Gaussian's color. Used for
+/// Gaussians of every object; the channels that a single object uses start at 0.
 const TINT: u64 = 100;
-/// First channel of the random view dependence of a Gaussian's color, for Gaussians of every object.
+/// First of the channels (indices of random numbers in [`GaussianRandom`]) of the random view dependence of a
+/// Gaussian's color. Used for Gaussians of every object.
 const SHEEN: u64 = 200;
 
 /// Returns a Gaussian without motion that has the given attributes. `scale`: standard deviations along its axes, scene

@@ -192,8 +192,8 @@ fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) 
     DemoGaussian { motion: point.motion, ..made }
 }
 
-/// Returns point `k` of a sequence on the unit sphere whose first n points are spread evenly for every n. Each of n
-/// points stands for the area 2τ/n.
+/// Returns point `k` of a sequence on the unit sphere whose first n points are spread evenly for every n. So each of n
+/// points represents an area of 4π/n on the sphere.
 fn on_sphere(k: usize) -> DVec3 {
     let DVec2 { x: turn, y: height } = spread(k);
     let z = 2.0 * height - 1.0;

@@ -84,8 +84,7 @@ impl Knob {
         }
     }
 
-    /// Returns the reason, as text for the user, why this knob cannot be varied for a scene or recipe that has no
-    /// settings for it.
+    /// Returns the reason, as text for the user, why a scene or recipe can have no settings for this knob.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
@@ -320,8 +319,8 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the schedule (list of views per frame) without the views of some frames: the views of at most `most` frames
-/// remain, which are evenly spaced over the frames that have views. `most` counts as 1 if it is 0.
+/// Returns the schedule (list of views per frame) with the views of at most `most` frames, evenly spaced over the
+/// frames that have views. The other frames keep no views. A `most` of 0 counts as 1.
 fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let most = most.max(1);
@@ -339,9 +338,9 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     thinned
 }
 
-/// Returns the bytes of memory of a schedule that [`thin_frames`] makes for at most `most` frames: one entry for each
-/// frame that keeps its views, and one for the frames without views up to the next. Returns 0 if `thin_frames` makes no
-/// new schedule, because the input has at most `most` frames.
+/// Returns the bytes of memory of a schedule that [`thin_frames`] makes for at most `most` frames. The schedule has two
+/// entries for each frame that keeps its views: one for this frame, and one for the frames without views that follow.
+/// Returns 0 if `thin_frames` makes no new schedule, because the input has at most `most` frames.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }

@@ -34,19 +34,20 @@ const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 /// Values that are tried for the number of mantissa bits of the histogram from which percentiles are found.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
-/// Result of a ranking with one setting: value and step size h of the varied parameter (errors grow with a power of h),
-/// cost, errors, and ids of the kept Gaussians.
+/// Result of a ranking with one setting: value and step size h of the varied parameter, cost, errors, and ids of the
+/// kept Gaussians. An error of order p is proportional to h^p.
 struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
-    /// Errors by name, without those that compare the kept Gaussians with the ones that the finest setting keeps.
+    /// Errors by name, without the errors of the kept Gaussians against those of the finest setting. [`Bench::curve`]
+    /// adds these.
     errors: BTreeMap<String, f64>,
     kept: Vec<u32>,
 }
 
-/// Recipe of one setting to measure. `value` is the value of the varied parameter in it, `step` its step size h (errors
-/// grow with a power of h).
+/// Recipe of one setting to measure. `value`: value of the varied parameter. `step`: step size h of this value; an
+/// error of order p is proportional to h^p.
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -109,15 +110,15 @@ impl Bench<'_> {
         measure.visible.as_ref().map(look).transpose()
     }
 
-    /// Returns the result of `contributions` for `recipe`, and the time and memory of computing it.
+    /// Returns the result of [`Bench::contributions`] for `recipe`, and the time and memory of computing it.
     fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
         self.repeats.measure_cost(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// Ranks the Gaussians with each of `variants` and with the finest setting, and returns the measurements as the
-    /// curve of the parameter `name`, the finest setting last. The third argument describes the finest setting: its
-    /// value and step size, the contributions measured with it, and their cost. `own`: value of the parameter in the
-    /// recipe.
+    /// Ranks the Gaussians with each of `variants` and with the finest setting. Returns the measurements as the curve
+    /// of the parameter `name`, the finest setting last. The third argument belongs to the finest setting: value and
+    /// step size, contributions measured with this setting, and cost of measuring them. `own`: value of the parameter
+    /// in the recipe.
     fn pass_curve(
         &self,
         name: &str,
@@ -191,9 +192,9 @@ impl Bench<'_> {
         }))
     }
 
-    /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`, and
-    /// returns the kept Gaussians and the cost. `value` is the value of the varied parameter, `step` its step size h
-    /// (errors grow with a power of h).
+    /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`. Returns
+    /// the kept Gaussians and the cost. `value`: value of the varied parameter. `step`: step size h of this value; an
+    /// error of order p is proportional to h^p.
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
@@ -209,8 +210,8 @@ impl Bench<'_> {
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
-    /// Measures how precise percentiles are that are found in one pass over the values, by histograms with several
-    /// numbers of mantissa bits. The reference are exact percentiles.
+    /// Measures the errors of percentiles that are found in one pass over the values, by histograms with several
+    /// numbers of mantissa bits. The reference is exact percentiles.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
@@ -247,10 +248,10 @@ impl Bench<'_> {
         })
     }
 
-    /// Adds to each ranking in `tried` the errors of its kept Gaussians against the last ranking, the finest, and
-    /// returns the rankings as the curve of the parameter `name`. `against`: description of the finest setting. `own`:
-    /// value of the parameter in the recipe. `expected`: orders of convergence that theory predicts, by name of the
-    /// error.
+    /// Compares the Gaussians that each ranking in `tried` keeps with those that the last ranking keeps, which is the
+    /// finest setting, and adds the errors. Returns the rankings as the curve of the parameter `name`. `against`:
+    /// description of the finest setting. `own`: value of the parameter in the recipe. `expected`: orders of
+    /// convergence that theory predicts, by name of the error.
     fn curve(
         &self,
         name: &str,
@@ -289,14 +290,14 @@ fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     counts
 }
 
-/// Returns the relative error |count / expected − 1| of the number `count`, whose correct value is `expected`.
+/// Returns the relative error |count / expected − 1| of `count`, whose correct value is `expected`.
 fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized,
-/// compared with those of `exact`. Percentiles of combined scores (static and dynamic) are skipped, because `scores`
-/// and `exact` differ in the values of which they are percentiles.
+/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized. The
+/// correct percentiles are those in `exact`. Leaves out the percentiles of the combined scores (static and dynamic):
+/// `scores` and `exact` have different combined scores, so their percentiles are not comparable.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
     let pairs = pairs.filter(|(term, _)| !matches!(term.of, ScoredQuantity::Static | ScoredQuantity::Dynamic));

@@ -75,8 +75,8 @@ impl Bench<'_> {
         })
     }
 
-    /// Measures complete runs with several numbers of optimization steps of refinement and of target views. All runs
-    /// end at the same number of Gaussians. Returns `None` if the recipe does not refine.
+    /// Measures complete runs with several numbers of optimization steps and several numbers of target views of
+    /// refinement. All runs end at the same number of Gaussians. Returns `None` if the recipe does not refine.
     pub(super) fn refining(&self) -> Result<Option<PrecisionKnob>> {
         let base = &self.recipe.refine;
         if base.refine.0.is_empty() || base.refine_steps == 0 {
@@ -154,8 +154,9 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Compresses the input by `recipe` in complete runs of the program and returns the quality of the result and the
-    /// cost. `value` is the value of the varied parameter, `step` its step size h (errors grow with a power of h).
+    /// Compresses the input by `recipe` in complete runs of the program. Returns the quality of the result and the
+    /// cost. `value`: value of the varied parameter. `step`: step size h of this value; an error of order p is
+    /// proportional to h^p.
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
@@ -170,8 +171,9 @@ impl Bench<'_> {
     }
 
     /// Compresses `input` by `recipe` in complete runs of the program, and compares the digest of the result with
-    /// `expected`, the digest of the first setting's result. If `expected` is `None`, sets it to the digest. Returns
-    /// the cost, and the error 1 if the digests differ, else 0. `value`: value of the varied parameter.
+    /// `expected`, the digest of the first setting's result. The call for the first setting gets `None` and stores its
+    /// digest in `expected`. Returns the cost, and 0 as the error if the digests are equal, else 1. `value`: value of
+    /// the varied parameter.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

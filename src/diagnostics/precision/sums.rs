@@ -28,7 +28,7 @@ const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 /// Description, in the results, of the reference with which sums are compared.
 const AGAINST: &str = "f64, compensated";
 
-/// Sum of numbers of type `T` that are added one after the other.
+/// Running sum of numbers of type `T`, which are added one after the other.
 trait Sum<T: Float>: Default {
     fn add(&mut self, value: T);
     fn total(self) -> f64;
@@ -136,8 +136,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Calls `sums` with each length in [`PLAYED`] and returns the errors of the statistics that it computes against
-    /// `expected`, which has one entry per length, and the cost.
+    /// Computes statistics for each length in [`PLAYED`] by `sums`. Returns, for each length, the errors of these
+    /// statistics and the cost of computing them. `expected`: correct statistics, one entry per length.
     fn measure_lengths(
         &self,
         expected: &[SummedStatistics],
@@ -158,8 +158,8 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the index of the frame that is shown at place `k` of a sequence that plays `count` frames, at least 2,
-/// forward and backward again and again.
+/// Returns the index of the frame at place `k` of a sequence that plays `count` frames forward and backward again and
+/// again. With three frames, the sequence is 0, 1, 2, 1, 0, 1, 2 …. `count` must be at least 2.
 fn ping_pong_index(k: usize, count: usize) -> usize {
     let turn = 2 * (count - 1);
     let at = k % turn;

@@ -43,7 +43,8 @@ pub(super) fn states() -> CaseResult {
 
 /// Compares the Jacobian (derivative of deformed positions with respect to stored positions) of the deformation field
 /// with finite differences of the field's f64 definition, taken over a distance of 2e-6. Errors are relative to 1 +
-/// |value|; the bound allows for f32 derivatives of products of six samples.
+/// |value|; the bound allows for rounding in f32 of derivatives of products of six samples, one from each feature
+/// plane.
 pub(super) fn derivative() -> CaseResult {
     CaseResult::new("field's derivative", "of positions: differences in f64", 1e-5, || {
         let (config, time, step) = (plain_config(), 0.37, 1e-6);

@@ -86,9 +86,9 @@ pub(super) fn proxy() -> CaseResult {
     })
 }
 
-/// Merges eight exact copies of a Gaussian; a ninth copy far away must stay alone. The proxy must have the position,
-/// scales and SH coefficients of the copies to the bit. Its opacity must be the one that each rule of [`ProxyOpacity`]
-/// gives, in f32.
+/// Merges eight exact copies of a Gaussian, once with each rule of [`ProxyOpacity`]; a ninth copy far away must stay
+/// alone. The proxy must have the position, scales and SH coefficients of the copies to the bit, and the opacity that
+/// the rule gives, in f32.
 pub(super) fn duplicates() -> CaseResult {
     CaseResult::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = random_gaussians(6, 1, 0);

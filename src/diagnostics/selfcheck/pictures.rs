@@ -39,8 +39,8 @@ pub(super) fn one_gaussian() -> CaseResult {
 }
 
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
-/// per pixel in f32. A pixel is skipped if alpha or transmittance of a Gaussian in it is within a fraction of 1e-4 of a
-/// threshold of the renderer, because f32 may then decide differently; such pixels are few.
+/// per pixel in f32. Skips the few pixels in which alpha or transmittance of a Gaussian is so close to a threshold of
+/// the renderer (relative difference below 1e-4) that f32 may decide differently.
 pub(super) fn many_gaussians() -> CaseResult {
     CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));

@@ -6,8 +6,8 @@ use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
-/// Compares percentiles that the program finds with a histogram with the value at the same rank of the sorted values.
-/// They must be equal to the bit.
+/// Compares the percentiles that the program finds by a histogram with the values of the same rank in the sorted list
+/// of all values. They must be equal to the bit.
 pub(super) fn percentiles() -> CaseResult {
     CaseResult::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -23,8 +23,8 @@ pub(super) fn percentiles() -> CaseResult {
     })
 }
 
-/// Compares the box that the percentiles 1, 50 and 99 of the positions along each axis define with the values at the
-/// same ranks of the sorted positions. They must be equal to the bit.
+/// Compares the percentiles 1, 50 and 99 of the positions along each axis, which form a [`RobustBox`], with the values
+/// of the same rank in the sorted list of all positions. They must be equal to the bit.
 pub(super) fn robust_box() -> CaseResult {
     CaseResult::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();

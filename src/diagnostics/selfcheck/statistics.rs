@@ -51,9 +51,9 @@ pub(super) fn motion_of_any_size() -> CaseResult {
     })
 }
 
-/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. The coordinate of the Gaussian at the time
-/// t, a whole number, is t². With m as the mean time step, its velocity between the times t and t' is m·(t + t'), and
-/// its turns (second differences) are 2m². Sums have 40 terms in f64.
+/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. All times t are whole numbers, and one
+/// coordinate of the Gaussian is t². With m as the mean time step, its velocity between the times t and t' is m·(t +
+/// t'), and its turns (second differences) are 2m². Sums have 40 terms in f64.
 pub(super) fn uneven_frames() -> CaseResult {
     CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -252,8 +252,9 @@ fn resting(count: usize) -> Gaussians {
     frame
 }
 
-/// Returns `frames` frames of `count` Gaussians with new random attributes in every frame. They lie before a camera at
-/// the origin, some behind it. In a third of the frames a Gaussian is not alive.
+/// Returns `frames` frames of `count` Gaussians with new random attributes in every frame. The Gaussians lie in front
+/// of a camera at the origin, a few of them behind it. A third of the opacities, chosen at random, are so low that the
+/// Gaussian mostly does not count as alive.
 fn random_frames(count: usize, frames: usize) -> Vec<Gaussians> {
     let mut random = Random(3);
     let mut frame = |_| {

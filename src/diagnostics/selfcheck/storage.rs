@@ -23,7 +23,7 @@ use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Writes frames to a lossless container, reads them back, and compares every bit. The values include NaN and −0, and
-/// an attribute whose last frame in a block of frames equals the first.
+/// rotations that are the same in the last frame of a block of frames as in its first frame.
 pub(super) fn container() -> CaseResult {
     CaseResult::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
@@ -126,8 +126,8 @@ fn model() -> (ArchiveContent, QuantizationSteps) {
     (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
-/// Returns the number of entries of [`ATTRIBUTES`] that the Gaussians of `content` have: those from position to
-/// opacity, and one per SH degree up to their own.
+/// Returns how many entries of [`ATTRIBUTES`] the Gaussians of `content` have: all entries from position to opacity,
+/// and one entry for each SH degree from 0 to the SH degree of the Gaussians.
 fn used_attributes(content: &ArchiveContent) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }

@@ -9,8 +9,8 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 pub struct OracleRender {
     /// Colors (red, green, blue) of the `height · width` pixels, row by row.
     pub rgb: Vec<[f64; 3]>,
-    /// For each pixel, whether alpha or transmittance of a Gaussian in it is within a fraction of 1e-4 of a threshold
-    /// of the renderer, so that f32 may decide differently.
+    /// For each pixel, whether f32 may decide differently from f64: alpha or transmittance of a Gaussian in the pixel
+    /// is so close to a threshold of the renderer that their relative difference is below 1e-4.
     pub doubtful: Vec<bool>,
     /// Sum of alpha · transmittance over the sampled pixels, for each Gaussian.
     pub sum: Vec<f64>,
