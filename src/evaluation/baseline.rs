@@ -15,8 +15,8 @@ use crate::pipeline::stages::write::write_without_companions;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
 
-/// Property by which a baseline ranks the Gaussians. Those with the largest values are kept; ties are ordered by a hash
-/// of the id.
+/// Property by which a baseline ranks the Gaussians. It keeps the Gaussians with the largest values; ties are ordered
+/// by a hash of the id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
     /// Ranking by opacity, largest first.
@@ -51,8 +51,8 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// Returns those `target_count` of `ids` that have the largest values of the property `baseline`, in increasing order.
-/// `state`: attributes of the Gaussians.
+/// Returns the `target_count` ids in `ids` with the largest values of the property by which `baseline` ranks, sorted by
+/// id. `state`: attributes of the Gaussians, in the row of their id.
 fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;

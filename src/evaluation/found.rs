@@ -125,8 +125,8 @@ pub struct TruthComparison {
 /// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::outside::RigCone)).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct RigSides {
-    /// Means over the views inside: in the directions of the training cameras and between them. `None` if there are no
-    /// such views.
+    /// Means over the views inside the rig: in the directions of the training cameras and between them. `None` if there
+    /// are no such views.
     pub inside: Option<QualityMeans>,
     /// Means over the views outside the rig.
     pub outside: QualityMeans,
@@ -193,10 +193,9 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages the scores of views. The closure `score` returns the score to be averaged, or `None` to leave a view
-    /// out. Returns `None` if no view is left.
-    ///
-    /// `pictures` must be sorted by frame.
+    /// Averages scores over all `pictures`, over the frames of each view, and over the views of each frame. `pictures`
+    /// must be sorted by frame. `score` returns the score to average, or `None` to leave out this view at this frame.
+    /// Returns `None` if no score is left.
     pub fn from_views(
         pictures: &[ViewScores],
         score: impl Fn(&ViewScores) -> Option<ImageScore>,

@@ -32,7 +32,7 @@ pub enum Method {
 }
 
 impl Method {
-    /// All methods, the presets of this project first.
+    /// List of all methods, the presets of this project first.
     pub const ALL: [Method; 10] = [
         Method::Default,
         Method::NoRefine,
@@ -62,12 +62,14 @@ impl Method {
         }
     }
 
-    /// Returns the method that differs from this one by refinement. `None` unless this method is [`Method::NoRefine`].
+    /// Returns the same method with refinement: [`Method::Default`] for [`Method::NoRefine`], `None` for any other
+    /// method.
     pub fn with_refinement(self) -> Option<Method> {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
-    /// Returns how this method compresses: by a recipe, of which given stages run, or by a baseline.
+    /// Returns the recipe by which this method compresses, with the stages that run (pruning, merging or both), or the
+    /// baseline by which it prunes.
     ///
     /// # Errors
     /// Fails only if a built-in preset does not parse.
@@ -108,8 +110,8 @@ impl Method {
     }
 }
 
-/// Recipe or baseline by which a method compresses. A recipe comes with the stages of it that run: pruning, merging or
-/// both.
+/// Recipe or baseline by which a method compresses. The second field of a recipe states which stages run: pruning,
+/// merging or both.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),
@@ -118,8 +120,8 @@ pub(crate) enum MethodKind {
 /// Name of the recipe parameter that the option `--steps` varies.
 pub(crate) const STEPS: &str = "refine_steps";
 
-/// Returns [`Method::Default`] with `steps` refinement steps. The number of steps before each prune step changes in
-/// proportion.
+/// Returns the preset `default` with `steps` optimization steps of refinement, as a method. The number of steps before
+/// each prune step changes in proportion to `steps`.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
     Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.with_refinement_steps(steps)), PruneOrMerge::Both))
 }

@@ -98,8 +98,8 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     Ok(evaluation)
 }
 
-/// Returns the estimate of the memory and time for rendering and comparing two models. In `work`, the number of
-/// Gaussians is the larger of both models.
+/// Returns the estimate of the memory and time for rendering and comparing two models. The number of Gaussians in
+/// `work` must be that of the larger model.
 pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = pictures::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
@@ -170,8 +170,8 @@ impl ModelPair {
         })
     }
 
-    /// Plans the memory of the comparison within `budget` and sets the limits of the scene. `needs` returns the
-    /// resource estimates of the stages that will run.
+    /// Plans the memory of the comparison within `budget`. Sets the limits of the scene (such as the numbers of frames
+    /// and views in memory at a time) by this plan. `needs` returns the resource estimates of the stages that will run.
     ///
     /// # Errors
     /// Fails if the stages cannot run within `budget`.
@@ -194,9 +194,10 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views and returns the evaluation. With a cache folder, several runs can each compute a shard (a
-    /// range of the views). A run of one shard stores the scores of its views and ends with [`Error::ShardDone`]; a run
-    /// without this limit joins the scores of all shards.
+    /// Compares all views and returns the evaluation. With a cache folder, several runs can share the work in shards
+    /// (ranges of the views):
+    /// - A run that is limited to one shard stores the scores of its views and ends with [`Error::ShardDone`].
+    /// - A run without such a limit computes the missing shards and joins the scores of all shards.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -206,9 +207,9 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// Compares all views as the first stage of a longer run. Does the same as [`ModelPair::evaluate`], except that a
-    /// run of one shard returns the evaluation, and so goes on to the next stage, if the results of all shards are in
-    /// the cache.
+    /// Compares all views, as [`ModelPair::evaluate`] does, but as the first stage of a longer run. The difference: a
+    /// run that is limited to one shard returns the evaluation if the scores of all shards are in the cache, so that it
+    /// can go on to the next stage.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -231,8 +232,8 @@ impl ModelPair {
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// Renders every view and returns the values of `observe` for all views, in order. Differs from
-    /// [`ModelPair::observe`] in that no scores are computed, and in that the work is done as the stage `name`, which
+    /// Renders every view and returns the values of `observe` for all views, in order. `observe` gets the same
+    /// arguments as in [`ModelPair::observe`], but no scores are computed. The work is done as the stage `name`, which
     /// can be divided into shards.
     ///
     /// # Errors
@@ -258,8 +259,8 @@ impl ModelPair {
         })
     }
 
-    /// Computes one value per view with `compute`, as the stage `name`, which can be divided into shards (ranges of
-    /// views). Returns the values of all views in order.
+    /// Computes one value per view, as the stage `name`, which can be divided into shards (ranges of views). `compute`
+    /// returns the values of a range of views. Returns the values of all views in order.
     fn compute_sharded<T: Serialize + DeserializeOwned>(
         &self,
         name: &str,
@@ -324,8 +325,8 @@ impl ModelPair {
         })
     }
 
-    /// Returns for every view whether its camera is outside the rig of the training cameras (their directions and those
-    /// between them). Returns `false` for all views if there are no training cameras.
+    /// Returns, for every view, whether its camera is outside the rig of the training cameras, that is, outside the
+    /// cone that their directions span. Returns `false` for all views if there are no training cameras.
     fn outside_views(&self) -> Vec<bool> {
         let rig = &self.scene.rig;
         let cone = RigCone::new(&training_cameras(rig));
@@ -343,9 +344,11 @@ impl ModelPair {
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders some views again and returns the values of `see` for them. `places`: indices of these views in
-    /// [`Evaluation::views`]. Arguments of `see`: the index, the frame state of the original, the camera, and the
-    /// images of the view. (To keep the renders of all views would take memory that grows with frames and views.)
+    /// Renders some views again and returns the values of `see` for them, sorted by the index of the view. `places`:
+    /// indices of these views in [`Evaluation::views`], in any order. Arguments of `see`: the index, the frame state of
+    /// the original, the camera, and the images of the view.
+    ///
+    /// Renders are not kept from the comparison, because they would take memory that grows with frames and views.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -374,7 +377,8 @@ impl ModelPair {
     }
 
     /// Renders `pictures` with both models and returns the values of `see` for them, in order. `see` gets the render of
-    /// the original, then that of the compressed model. `pictures` may be any views of the cameras of the scene.
+    /// the original, then that of the compressed model. `pictures` may be any views of the cameras of the scene, and
+    /// must be sorted by frame.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
@@ -395,8 +399,8 @@ impl ModelPair {
         Ok(found)
     }
 
-    /// Measures and returns the time that rendering one view takes with each model, milliseconds. The times differ
-    /// between runs.
+    /// Measures and returns the median time of rendering one view with each model, milliseconds. The times differ
+    /// between runs. Returns `None` if there are no views, or if a thread cannot be started.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -409,8 +413,8 @@ impl ModelPair {
         self.compressed.source().info().count
     }
 
-    /// Calls `visit` with one batch of the views `pictures` after another. Each view in a batch has the frame states of
-    /// the original and of the compressed model.
+    /// Calls `visit` with batches of the views `pictures`, in order. A batch holds, for each of its views, the frame
+    /// states of the original and of the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
         for_each_view_batch(
@@ -422,8 +426,9 @@ impl ModelPair {
         )
     }
 
-    /// Returns, for the views in `range`, the scores and the values of `observe`. First renders again the images that
-    /// the temporal errors in `range` need: of every view in it, the last image before `range`.
+    /// Returns, for the views in `range`, the scores and the values of `observe`. The temporal error of a view compares
+    /// it with the image of the same view at an earlier frame. So the last image before `range` of every view in
+    /// `range` is rendered again first.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -489,9 +494,9 @@ impl ModelPair {
     }
 }
 
-/// Returns the last image before a range of images, for every view in the range. `all`: (frame, view) pairs of all
-/// images by frame; the range begins at index `start`, and `range` holds its pairs. The result is in the order of
-/// `all`.
+/// Returns, for every view that occurs in a range of images, the last image of this view before the range. `all`:
+/// (frame, view) pairs of all images, sorted by frame. `range`: pairs of the images in the range, which begins at the
+/// index `start` of `all`. The result is in the order of `all`.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =
@@ -535,8 +540,8 @@ impl RenderedViews {
     }
 }
 
-/// Computes the scores of the image `a` against the image `b`. `before` holds the images of the same kind as `a` and
-/// `b` at the previous frame of the view; without them there is no temporal error.
+/// Computes the scores of the image `a` against the image `b`. `before`: images that correspond to `a` and `b` at the
+/// previous frame of the view; if `None`, no temporal error is computed.
 fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageScore {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
     ImageScore { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }

@@ -27,8 +27,8 @@ pub struct PrecisionDiagram {
     pub frames_scored: usize,
     /// Number of views, at these frames, that are used for scoring and ranking.
     pub pictures: usize,
-    /// Number of views on which settings are judged, by renders of their results and of the whole model. These are test
-    /// views if there are any.
+    /// Number of views on which the settings are judged: there, renders of their results are compared with renders of
+    /// the whole model. Test views are used if there are any.
     pub judged: usize,
     /// File of the cameras, or description of the virtual rig.
     pub cameras: String,
@@ -36,13 +36,13 @@ pub struct PrecisionDiagram {
     pub kept: usize,
     /// Number of threads of all measurements except those that vary the number of threads.
     pub threads: usize,
-    /// Maximum number of runs of each setting. There are fewer if the runs so far took
-    /// [`PrecisionDiagram::max_setting_seconds`] seconds in all.
+    /// Maximum number of runs of each setting. There are fewer if the total time of its runs reaches
+    /// [`PrecisionDiagram::max_setting_seconds`].
     pub runs: usize,
     /// Total time in seconds of the runs of one setting after which this setting is not run again.
     #[serde(rename = "enough")]
     pub max_setting_seconds: f64,
-    /// Results of the knobs (settings, or groups of settings) that were varied.
+    /// Results of the varied knobs (parameters, or groups of parameters).
     pub knobs: Vec<PrecisionKnob>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -71,7 +71,7 @@ impl ErrorSource {
     }
 }
 
-/// Results of a knob: a setting, or group of settings, that trades run time for error.
+/// Results of one knob: a parameter, or a group of parameters, that trades run time for error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionKnob {
     /// Name of the knob, as in the option `--knobs`.
@@ -106,13 +106,13 @@ pub struct PrecisionCurve {
     pub sufficient_value: Option<f64>,
 }
 
-/// Measurements at one value of a parameter ("setting").
+/// Measurements with one setting, that is, at one value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
     /// Value of the varied parameter.
     pub value: f64,
-    /// Step size h that belongs to this value: an error of order p grows as h^p. If sums over frames cause the error, h
-    /// is the number of frames.
+    /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, whose
+    /// rounding errors grow with the number of frames, h is this number.
     pub step: f64,
     /// Time and memory of the runs with this setting.
     pub cost: Cost,
@@ -138,20 +138,23 @@ pub struct ObservedOrder {
 /// Error name: root mean square error of renders of the model that a setting yields, against renders of the whole
 /// model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Error name: error that a setting adds to renders, relative to the error [`RENDER_ERROR`] of the finest setting,
-/// which counts as the error of the compressed model itself (see [`added_error`]).
+/// Error name: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
+/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
-/// Error name: Jaccard distance between two sets of Gaussians, those kept with a setting and those kept with the finest
-/// setting.
+/// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
+/// keeps.
 pub const SELECTION_DISTANCE: &str = "kept";
-/// Error name: relative error of the number of Gaussians that the thresholds of the recipe keep.
+/// Error name: relative error, against the finest setting, of the number of Gaussians that the thresholds of the recipe
+/// keep.
 pub const COUNT_ERROR: &str = "staying";
-/// Error name: largest relative error of the percentiles P1 and P99, by which scores are normalized.
+/// Error name: largest relative error, against exact percentiles, of the percentiles P1 and P99 by which scores are
+/// normalized.
 pub const PERCENTILE_ERROR: &str = "percentiles";
-/// Error name: 1 if the bytes of the result with a setting differ from those with the first setting, else 0.
+/// Error name: 1 if the result with a setting differs in any byte from the result with the first setting, else 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
-/// Upper limit of the error [`ADDED_ERROR`] at the value [`PrecisionCurve::sufficient_value`] and at all finer values.
+/// Upper limit of a small error [`ADDED_ERROR`]: at [`PrecisionCurve::sufficient_value`] and at all finer values, the
+/// error is below this limit.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of a diagram for the error with the name `error`.
@@ -168,9 +171,10 @@ pub fn axis_label(error: &str) -> String {
 }
 
 impl PrecisionCurve {
-    /// Creates the curve of one parameter from its measurements `marks`, and computes the observed order of every
-    /// error. `against`: description of the reference values. `own`: value in the recipe. `expected`: orders that
-    /// theory predicts, by the name of the error. Infinite errors are removed.
+    /// Creates the curve of the parameter `name` from its measurements `marks`, and computes the observed order of
+    /// every error. `against`: description of the reference values of the errors. `own`: value of the parameter in the
+    /// recipe. `expected`: orders of convergence that theory predicts, by the name of the error. Removes infinite
+    /// errors, which JSON cannot represent.
     pub fn new(
         name: &str,
         against: &str,

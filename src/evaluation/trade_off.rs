@@ -30,7 +30,7 @@ pub struct TradeOff {
     pub runs: usize,
     /// Measurements in the order of the option `--methods`, then by decreasing requested fraction.
     pub points: Vec<TradeOffPoint>,
-    /// Measurements of the parameters that were varied.
+    /// Curves of quality against time, one for each varied parameter.
     pub knobs: Vec<EffortCurve>,
     /// Notes for the user.
     pub notes: Vec<String>,
@@ -59,8 +59,8 @@ pub struct TradeOffPoint {
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Measurements of one method at one fraction of kept Gaussians for several values of one parameter: quality against
-/// time.
+/// Curve of quality against time: measurements of one method at one fraction of kept Gaussians, for several values of
+/// one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortCurve {
     /// Name of the parameter in the recipe.
@@ -91,13 +91,14 @@ impl TradeOff {
         text
     }
 
-    /// Returns the points as a CSV table with one row per point (method and kept fraction). A missing value is an empty
-    /// field.
+    /// Returns the measurements of the methods ([`TradeOff::points`]) as a CSV table with one row per point (method and
+    /// kept fraction). A missing value is an empty field.
     pub fn csv(&self) -> String {
         table(&COLUMNS, self.points.iter().map(|point| self.row(point)))
     }
 
-    /// Returns the curves as a CSV table with one row per value of every varied parameter.
+    /// Returns the measurements of the varied parameters ([`TradeOff::knobs`]) as a CSV table with one row per value of
+    /// a parameter.
     pub fn knobs_csv(&self) -> String {
         let settings = self.knobs.iter().flat_map(|knob| knob.settings.iter().map(move |setting| (knob, setting)));
         let row = |(knob, setting): (&EffortCurve, &EffortSetting)| {
@@ -122,7 +123,7 @@ impl TradeOff {
         ]
     }
 
-    /// Returns the points and curves as a table for the terminal.
+    /// Returns the measurements of the methods and of the varied parameters as a table for the terminal.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let _ = writeln!(
