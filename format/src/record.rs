@@ -74,7 +74,8 @@ impl fmt::Display for Record {
 }
 
 impl FooterRecord {
-    /// Returns the length in bytes of the footer's payload (8 per frame and 64 per tile), or `None` if it overflows.
+    /// Returns the length in bytes of the footer's payload (8 per frame and 64 per tile), or `None` if this number
+    /// overflows.
     pub(crate) fn payload_bytes(&self) -> Option<u64> {
         self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD_BYTES)?)
     }
