@@ -29,8 +29,7 @@ pub struct AppearanceThresholds {
 }
 
 impl AppearanceThresholds {
-    /// Creates the tests from the thresholds of the pass `pass`, and from the thresholds in `merge` that all passes
-    /// share.
+    /// Creates the thresholds from those of the pass `pass` and those in `merge`, which all passes share.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         AppearanceThresholds {
             d0: pass.d0,

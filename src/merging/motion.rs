@@ -72,7 +72,8 @@ pub struct MotionThresholds {
 }
 
 impl MotionThresholds {
-    /// Creates the test from the thresholds of `merge`. `unit`: length of one unit of the recipe, in scene units.
+    /// Creates the thresholds from those in `merge`, converted to scene units. `unit` is the unit of the recipe's
+    /// lengths, in scene units.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
@@ -182,7 +183,7 @@ impl PairMotion {
         self.frames += 1;
     }
 
-    /// Returns the measure of each pair over all frames added, in the order in which the pairs were given.
+    /// Returns the [`PairMeasure`] of each pair over all frames added, in the order in which the pairs were given.
     pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
         let measure = move |pair: NodePair| {

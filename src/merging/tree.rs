@@ -62,7 +62,7 @@ impl NearestPoints {
         }
     }
 
-    /// Returns whether a point could still be among the nearest if its squared distance is `bound` or more.
+    /// Returns whether a point with a squared distance of `bound` or more could still be one of the nearest.
     pub fn could_improve_at(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
@@ -97,7 +97,7 @@ pub struct Tree {
 }
 
 impl Tree {
-    /// Builds a tree over `points` and reorders them in the order of its leaves.
+    /// Builds a tree over `points`, and sorts `points` in the order of the tree's leaves.
     pub fn new(points: &mut [TreePoint]) -> Self {
         let depth = points.len().div_ceil(MAX_LEAF_POINTS).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
