@@ -101,15 +101,15 @@ pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<
 /// Effect on renders of writing the deformation field of the result in half precision (2 bytes per value).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FieldSummary {
-    /// Whether the field is written in half precision.
+    /// Whether the deformation field is written in half precision.
     pub half: bool,
     /// Number of views on which renders were compared.
     pub pictures: usize,
-    /// Mean PSNR of renders with the half-precision field compared with renders with the exact field, dB.
+    /// Mean PSNR of renders with the half-precision deformation field, compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if `rounding` alone decided
-    /// that half precision is used.
+    /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if
+    /// `rounding` alone decided that half precision is used.
     pub result: Option<f64>,
     /// Minimum value of `rounding` for which half precision is used, dB.
     #[serde(deserialize_with = "number")]
@@ -117,7 +117,8 @@ pub struct FieldSummary {
 }
 
 impl FieldSummary {
-    /// Returns a text with the measured values that explain why the field is or is not written in half precision.
+    /// Returns a text with the measured values that explain why the deformation field is or is not written in half
+    /// precision.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
