@@ -88,7 +88,7 @@ pub fn format_list(listed: &[StoredResult]) -> String {
 }
 
 /// Removes all cache entries from the work folder `folder`, and the folder itself if it is empty then. Returns the
-/// number of removed files and of their bytes.
+/// number of removed files, and the number of their bytes.
 ///
 /// # Errors
 /// Fails if the folder cannot be read or a file cannot be removed.

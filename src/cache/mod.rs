@@ -167,7 +167,7 @@ impl Cache {
     /// results of all ranges in order. The combined result must not depend on how the units are divided.
     ///
     /// # Errors
-    /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
+    /// Fails if `compute` or `join` fails or the folder cannot be used. A run that is limited to one shard ends with
     /// [`Error::ShardDone`] once this shard is stored.
     pub fn compute_in_shards<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,

@@ -68,7 +68,7 @@ impl Spill {
 }
 
 impl SpillWriter {
-    /// Creates an unnamed file in `folder`. The system removes it when the process ends.
+    /// Creates the writer of an unnamed file in `folder`. The system removes the file when the process ends.
     ///
     /// # Errors
     /// Fails if the folder does not exist or the system refuses.
@@ -78,8 +78,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
-    /// Creates a cache entry that gets the path `target` when it is complete. `key` is its cache key, `about` the
-    /// description of its input.
+    /// Creates the writer of a cache entry that gets the path `target` when it is complete. `key` is its cache key,
+    /// `about` the description of its input.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
