@@ -116,7 +116,7 @@ struct PackedFrame {
 }
 
 impl PackedFrame {
-    /// Packs the visible Gaussians of `state` into textures.
+    /// Packs the visible Gaussians of `state` into textures, without those that have a value that is not finite.
     fn new(state: &Gaussians) -> PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();
@@ -186,8 +186,8 @@ fn half_bytes(value: f64) -> [u8; 2] {
     f16::from_f64(value.clamp(-most, most)).to_le_bytes()
 }
 
-/// Returns the Morton code of the position `place`, which is in scene units, within the box from `low` to `high`, which
-/// are in centimeters.
+/// Returns the Morton code of the position `place` within the box from `low` to `high`. `place` is in scene units, the
+/// box in centimeters, both in Unreal's axes.
 fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     let most = f64::from((1u32 << MORTON_BITS) - 1);
     (0..3).fold(0, |code, axis| {

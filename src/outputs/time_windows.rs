@@ -289,7 +289,8 @@ mod tests {
         );
     }
 
-    /// Returns `lines` Gaussians, and the error of a fit with `states` compared states that are all off by `position`.
+    /// Returns `lines` Gaussians, and the error of a fit in which `states` states were compared and each position is
+    /// off by `position`.
     fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, FitError) {
         let mut misfit = FitError::default();
         (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));
