@@ -211,7 +211,7 @@ impl Rows {
         self.d.is_empty()
     }
 
-    /// Appends the statistics in `next`, those of the following block of Gaussians, and leaves `next` empty.
+    /// Appends the statistics in `next`, which belong to the following block of Gaussians. Leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
             match statistic.accessors() {

@@ -39,8 +39,7 @@ pub struct FrameView {
 }
 
 impl FrameView {
-    /// Returns the name `tNNN_vNN` of the view, made of frame index and view number, with more digits for larger
-    /// numbers.
+    /// Returns the name of the view, such as `t012_v03` for frame 12 and view 3. Larger numbers have more digits.
     pub fn name(&self) -> String {
         format!("t{:03}_v{:02}", self.frame, self.view)
     }
