@@ -97,8 +97,8 @@ impl Deltas {
     /// Computes the stored attributes `raw` that these deltas and masks turn into `state`, for the attributes `want`.
     /// This is the inverse of [`Deltas::apply`].
     ///
-    /// The result is exact up to rounding, and for rotations up to the length of the quaternion. If a mask or a
-    /// rotation delta is zero, no stored value leads to `state`, and the result is not finite.
+    /// The result is exact up to rounding, except for the length of quaternions. If a mask or a rotation delta is zero,
+    /// no stored value leads to `state`, and the result is not finite.
     pub fn invert(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);

@@ -153,8 +153,8 @@ impl JacobianGroup {
         head.hidden.activate::<FMA>(input, &mut self.hidden);
     }
 
-    /// Returns the derivative of a position component with respect to the position along `axis`, from its derivatives
-    /// with respect to the plane features in `gradient`.
+    /// Returns the derivative of a position component with respect to the position along `axis`, by the chain rule: the
+    /// sum over the plane features of `gradient` times `slopes`.
     #[inline(always)]
     fn axis_derivative(&self, axis: usize) -> CacheLine {
         let mut sums = CacheLine([0.0; LANES]);

@@ -219,9 +219,9 @@ impl Network {
 
     /// Computes the encoding of the stored positions `position` (`[3, N]`).
     ///
-    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. The values for k = 0 are computed in f64. The
-    /// values for k + 1 follow from those for k by the double-angle formulas. Each doubling doubles the error, from
-    /// 1e-16 at first to 1e-13 at the last octave.
+    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32 precision. The values for k = 0 are computed in
+    /// f64. The values for k + 1 follow from those for k by the double-angle formulas. Each doubling doubles the error,
+    /// from 1e-16 at first to 1e-13 at the last octave.
     pub fn encode(&self, position: &AttributeValues) -> EncodedPositions {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
