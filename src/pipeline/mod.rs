@@ -70,9 +70,9 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
     run_stages(scene, &plan, None, request, Journal::default())
 }
 
-/// Returns one line of text for each stage of a run of `request` that several processes can divide among themselves:
-/// the name of the stage and its number of units of work, such as blocks of Gaussians or views. The lines have the
-/// order in which the stages run. Opens the input and reads nothing else.
+/// Returns a line of text for each divisible stage of a run of `request`, in the order in which the stages run. Several
+/// processes can share the work of a divisible stage. The line holds the name of the stage and its number of units of
+/// work, such as blocks of Gaussians or views. Opens the input, but reads nothing else.
 ///
 /// # Errors
 /// Fails if the input cannot be opened, if the request is invalid, or if the memory budget is too small for it.

@@ -1,12 +1,13 @@
-//! Opens a scene and computes its statistics. A stream is measured while it arrives, so that it is read only once.
+//! Opens a scene and computes the statistics of its Gaussians. For a stream they are computed while its frames arrive,
+//! so that the frames are read only once.
 //!
-//! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). When measuring, also the
-//! running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes each) and the memory of
-//! [`RunningContribution`].
+//! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). If statistics are computed
+//! while frames arrive, also the running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes
+//! each) and the memory of [`RunningContribution`].
 //!
 //! The time span and the number of frames are known only at the end of the stream. Until then two assumptions are made:
-//! frames are evenly spaced, and views have exactly the times of frames. If an assumption proves wrong, the packed
-//! frames are measured again from the container; the result is the same in both cases.
+//! frames are evenly spaced, and every view has exactly the time of a frame. If an assumption proves wrong, the
+//! statistics are computed again from the packed frames in the container; the result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
@@ -40,13 +41,15 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens the scene that `options` describe and sets its limits within the memory budget. `plan` makes the plan of the
-/// run from facts about the scene. Returns the scene, the plan of the run, and, if the input is a stream that was
-/// measured while it arrived (see [`receive_measured`]), the statistics of the Gaussians.
+/// Opens the scene that `options` describe, and sets limits on what its stages keep in memory, so that the run stays
+/// within the memory budget. `plan` makes the plan of the run from facts about the scene. For a stream it is called
+/// before any frame is read, unless frames have to be linked (see [`is_linked`]).
+///
+/// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
+/// they were computed while it arrived (see [`receive_measured`]).
 ///
 /// # Errors
-/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails. `plan` is called before any frame of a
-/// stream is read.
+/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails.
 pub fn open_to_measure(
     options: &InputOptions,
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
@@ -202,10 +205,10 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about a stream before it is received: its maximum memory if the user asked for the forecast, or the
-/// numbers of frames that fit the memory limit if the user asked for the plan. `peak`: maximum memory, bytes. `most`:
-/// maximum number of frames that fit the memory limit. `to_measure`: maximum number of frames that can be measured
-/// while they arrive.
+/// Sends a message about memory before a stream is received, if the user asked for one:
+/// - for the forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
+/// - for the plan ([`Verbosity::Plan`]): `most`, the number of frames that fit the memory limit, and `to_measure`, the
+///   number of frames up to which memory suffices to compute statistics while they arrive.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {

@@ -75,8 +75,8 @@ impl RunPlan {
         Ok(if fits(&with_quality) { with_quality } else { plan })
     }
 
-    /// Returns the plan of [`RunPlan::within_memory`], but without the stage that measures the quality of the result.
-    /// `fits` returns whether a plan stays within the memory limit.
+    /// Returns the plan that [`RunPlan::within_memory`] describes, but without the stage that measures the quality of
+    /// the result. `fits` tells whether a given plan stays within the memory limit.
     fn refining_within_memory(
         request: &Request,
         input: InputMeta,
@@ -236,9 +236,9 @@ impl RunPlan {
         self.search.is_some() || self.stages.is_open_ended()
     }
 
-    /// Returns one line of text for each stage that several processes can divide among themselves: its name and its
-    /// number of units of work, such as blocks of Gaussians or views. The name is that of the stage's cache entries
-    /// (files with results).
+    /// Returns a line of text for each divisible stage, whose work several processes can share. The line holds the name
+    /// of the cache entries of the stage (files with results) and its number of units of work, such as blocks of
+    /// Gaussians or views.
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }

@@ -57,7 +57,8 @@ pub struct Planning<'a> {
 }
 
 impl Planning<'_> {
-    /// Returns the requested number of Gaussians divided by that of the input; `None` if no number was requested.
+    /// Returns the requested number of Gaussians divided by the number of Gaussians in the input; `None` if no number
+    /// was requested.
     pub fn target_fraction(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
@@ -78,20 +79,20 @@ impl Planning<'_> {
 /// Parts of refinement that are omitted because they do not fit within the memory limit (`--memory`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum MemoryFallback {
-    /// Nothing is omitted: full refinement.
+    /// Full refinement; no part is omitted.
     #[default]
     Nothing,
-    /// Time-varying deltas are omitted: the values that refinement adds to stored parameters are constant in time.
+    /// Refinement without time-varying deltas: the values that it adds to stored parameters are constant in time.
     ConstantInTime {
         /// Smallest memory limit, bytes, with which the added values would vary in time.
         required_bytes: u64,
     },
-    /// In addition to time-varying deltas, the refinement of SH coefficients above degree 0 is omitted.
+    /// Refinement without time-varying deltas and without SH coefficients above degree 0.
     WithoutHarmonics {
         /// Smallest memory limit, bytes, with which SH coefficients above degree 0 would be refined.
         required_bytes: u64,
     },
-    /// Refinement is omitted completely.
+    /// No refinement.
     WithoutRefinement {
         /// Smallest memory limit, bytes, with which at least a part of refinement would run.
         required_bytes: u64,

@@ -1,5 +1,6 @@
-//! Measurement of the quality of a compressed model in a search for a quality. The search compares models on some of
-//! the views. The other views are held back from the search, and give the quality that is reported.
+//! Measurement of the quality of a compressed model during the search for the smallest model with a requested quality.
+//! The search compares models on some of the views. The other views are held back from the search, and give the quality
+//! that is reported.
 
 use rayon::prelude::*;
 

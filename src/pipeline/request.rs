@@ -28,8 +28,8 @@ pub enum PruneOrMerge {
 pub enum Target {
     /// Exact number of Gaussians.
     Count(u64),
-    /// Fraction of the input's Gaussians, above 0 and at most 1. The product is rounded to the nearest number, at least
-    /// 1.
+    /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1. The resulting number of
+    /// Gaussians is rounded to the nearest one, at least 1.
     Ratio(f64),
 }
 
@@ -124,11 +124,12 @@ impl Request {
 }
 
 impl Target {
-    /// Returns the requested number of output Gaussians for an input of `count` Gaussians.
+    /// Returns the requested number of output Gaussians for an input of `count` Gaussians. For an input without
+    /// Gaussians, returns 0 whatever number was requested.
     ///
     /// # Errors
-    /// Fails if the fraction is not above 0 and at most 1, or if the number is not from 1 to `count`. For an input
-    /// without Gaussians the number is always 0.
+    /// Fails if a fraction is not above 0 and at most 1. Also fails if `count` is above 0 and the number is not from 1
+    /// to `count`.
     pub fn resolve_count(self, count: usize) -> Result<usize> {
         let wanted = match self {
             Target::Count(wanted) => wanted,

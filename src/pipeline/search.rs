@@ -44,11 +44,11 @@ const NAME: &str = "search";
 const FIRST_FRACTION: f64 = 0.2;
 /// Usual number of sizes (numbers of Gaussians) that are tried; used for estimates of time.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Maximum number of sizes (numbers of Gaussians) that are tried. If all of them fail, the model of all Gaussians that
-/// may stay is tried as well.
+/// Maximum number of sizes (numbers of Gaussians) that are tried. If all of them fail, the model of all Gaussians in
+/// the ranking is tried as well; the ranking leaves out Gaussians that are always dropped.
 const MAX_SIZES: usize = 8;
-/// Ratio of the smallest size (number of Gaussians) that passed to the largest that failed, at or below which the
-/// search ends.
+/// Ratio of two sizes (numbers of Gaussians) at which the search ends: the smallest size with the requested quality,
+/// divided by the largest size without it.
 const SAME_SIZE_RATIO: f64 = 1.04;
 /// Approximate cost of halving the number of Gaussians, from which the search guesses its next size. First number:
 /// decrease of the PSNR against the original, dB; used if a minimum PSNR is requested. Second number: factor by which
@@ -152,7 +152,7 @@ impl SearchStage {
     }
 
     /// Finds the smallest model with the requested quality. Stores the model and the summary of the search in `run`. If
-    /// no size reaches the quality, stores the model of all Gaussians that may stay.
+    /// no tried size reaches the quality, stores the model of all Gaussians in the ranking.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read, or if there are too few views for a search.
@@ -276,9 +276,10 @@ impl SearchStage {
         Ok(Some(found))
     }
 
-    /// Tries sizes (numbers of Gaussians) between the number that must stay and the number that may stay. Returns the
-    /// smallest tried model that has the requested quality, or the model of all Gaussians that may stay if no tried
-    /// model has it. Also returns every tried size with the PSNR or the loss of PSNR of its model, dB.
+    /// Tries sizes (numbers of Gaussians) from the number of protected Gaussians, which are always kept, to the number
+    /// of Gaussians in the ranking. Returns the smallest tried model that has the requested quality. If no tried model
+    /// has it, returns the model of all Gaussians in the ranking. Also returns every tried size with the quality of its
+    /// model, dB (see [`TriedSize::value`]).
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
@@ -355,7 +356,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the minimum PSNR or the maximum loss of PSNR, dB, that the search must reach.
+    /// Returns the limit, dB, that the search must keep to: the minimum PSNR or the maximum loss of PSNR.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,

@@ -27,7 +27,8 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// Fraction of the Gaussians that the last pruning round leaves if the run searches for a quality and does not refine.
+/// Fraction of the Gaussians that the last pruning round leaves if the run searches for the smallest model with a
+/// requested quality and does not refine.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
@@ -35,8 +36,8 @@ const SEARCH_RANK_FRACTION: f64 = 0.02;
 pub enum Phase {
     /// Stages that read the frames of the input and make a ranking of all Gaussians.
     Rank,
-    /// Stages that make a compressed model with a given number of Gaussians from the ranking. A search for a quality
-    /// repeats these stages, once for every number of Gaussians that it tries.
+    /// Stages that make a compressed model with a given number of Gaussians from the ranking. A search for the smallest
+    /// model with a requested quality repeats these stages, once for every number of Gaussians that it tries.
     Reduce,
     /// Stages that turn the compressed model into output files: quantization, measurement of the quality, and writing.
     Write,
@@ -107,8 +108,8 @@ pub trait Stage: Debug + Send + Sync {
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Kinds of statistics of the Gaussians that were already computed while the input, a stream, arrived. The default
-/// (none) holds for all other inputs.
+/// Kinds of statistics of the Gaussians that were already computed while the input, a stream, arrived. For other inputs
+/// no kind was, which is the default.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
     /// Whether the scan of all frames was done. It gives all statistics of the Gaussians except their visible
@@ -154,17 +155,17 @@ impl CountPlan {
     }
 
     /// Returns the number of Gaussians that ranking leaves, if the input has `all` Gaussians and the output is to have
-    /// `wanted`. A search for a quality ranks only once, for all numbers that it tries; so in a search the result is
-    /// the number for the smallest model that it may try.
+    /// `wanted`. If the run searches for the smallest model with a requested quality, ranking runs only once for all
+    /// models that are tried. Then returns the number for the smallest of these models, whatever `wanted` is.
     pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
         self.count_before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
-    /// Returns a line of text for display that states how many of the `all` Gaussians of the input ranking and
-    /// refinement leave. `target` is the number of Gaussians in the output, if known; `merges` tells whether survivors
-    /// (Gaussians that are not removed) are merged.
+    /// Returns a line of text for display: how many Gaussians are left after ranking and how many refinement then
+    /// removes. `all` is the number of Gaussians in the input, and `target` the number in the output, if known.
+    /// `merges` tells whether survivors (Gaussians that are not removed) are merged.
     pub(super) fn text(&self, target: Option<usize>, all: usize, merges: bool) -> String {
         let share =
             |count: usize| format!("{count} of {all} Gaussians ({:.0}%)", 100.0 * count as f64 / all.max(1) as f64);
@@ -290,8 +291,8 @@ impl StageList {
 pub enum PreparedArchive {
     /// Encoded model or point cloud, ready to be written.
     Content(EncodedArchive),
-    /// Error bounds of the values in an archive of frames. The frames are read, rounded within these bounds and written
-    /// later.
+    /// Error bounds of the values in an archive of frames. The frames are computed and rounded within these bounds only
+    /// when the archive is written.
     Frames(ErrorBounds),
 }
 
@@ -322,7 +323,7 @@ pub struct RunState<'a> {
     pub arrived: Option<Measured>,
     /// Statistics and scores of all Gaussians.
     pub scored: Option<Arc<Scored>>,
-    /// Ranking of all Gaussians that may stay, most important first.
+    /// Ranking of all Gaussians except those that are always dropped, most important first.
     pub ranking: Option<Arc<Ranking>>,
     /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
@@ -333,10 +334,10 @@ pub struct RunState<'a> {
     pub template: CompressedModel,
     /// Compressed model in the state in which the last stage left it.
     pub result: CompressedModel,
-    /// Number of Gaussians that refinement is to leave of the model in [`result`](RunState::result).
+    /// Number of Gaussians of the model in [`result`](RunState::result) that are to be left after refinement.
     pub refine_to: usize,
     /// Refined models after prune steps (removals of the lowest-ranked Gaussians), from which the refinement of a
-    /// smaller model continues. Present only in a search for a quality.
+    /// smaller model continues. Present only in a search for the smallest model with a requested quality.
     pub prune_steps: Option<PrunedModels<'a>>,
     /// Numbers of Gaussians that the merge stage merged, if it ran.
     pub merge: Option<MergeSummary>,
@@ -395,7 +396,7 @@ impl<'a> RunState<'a> {
         self.scored.clone().ok_or_else(|| Error::internal("a stage needs scores before they were computed"))
     }
 
-    /// Returns the ranking of all Gaussians that may stay.
+    /// Returns the ranking of all Gaussians except those that are always dropped.
     ///
     /// # Errors
     /// Fails with an internal error if no earlier stage has computed it.

@@ -29,18 +29,19 @@ pub struct GoalSummary {
     /// Requested kind of quality: `min_psnr` (PSNR against the original) or `max_loss` (loss of PSNR against
     /// photographs), both in dB.
     pub name: String,
-    /// Requested PSNR or loss, dB.
+    /// Requested value, dB: minimum PSNR against the original, or maximum loss of PSNR against photographs.
     pub asked: f64,
-    /// PSNR or loss of the output on the views that the search used, dB.
+    /// Quality of the output on the views that the search used, dB: PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "number")]
     pub searched: f64,
-    /// PSNR or loss of the output on views that the search did not use, dB.
+    /// Quality of the output on views that the search did not use, dB: PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "number")]
     pub held: f64,
     /// Names of the views that the search did not use. A name consists of frame and view number; the name of a view
     /// from a camera between those of the scene has only the frame.
     pub held_pictures: Vec<String>,
-    /// Every number of Gaussians that was tried, with its PSNR or loss on the views that the search used, dB.
+    /// Every number of Gaussians that was tried, with the quality of its model on the views that the search used, dB:
+    /// PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
 }
@@ -66,10 +67,11 @@ pub struct ArchiveSummary {
     /// Number of bits that each attribute and each tensor takes in the archive, by name; empty for an archive of
     /// frames.
     pub bits: BTreeMap<String, f64>,
-    /// Measurements from which the quantization steps were derived. Each entry has the name of an attribute or tensor,
-    /// log2 of its quantization step (in an archive of frames: of twice its error bound), the squared error of renders
-    /// if only this attribute or tensor is quantized with this step, and the number of bits that it takes then (in an
-    /// archive of frames: its bits in some blocks of Gaussians).
+    /// Measurements from which the quantization steps were derived, one entry for each attribute or tensor:
+    /// - its name;
+    /// - log2 of its quantization step (in an archive of frames: of twice its error bound);
+    /// - squared error of renders if it alone is quantized with this step;
+    /// - number of bits that it takes with this step (in an archive of frames: in some blocks of Gaussians only).
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
@@ -186,7 +188,7 @@ impl MergeSummary {
 pub enum SummaryDetail {
     /// Number of Gaussians, size, quality, time, output and a few notes.
     Most,
-    /// In addition every stage, omitted stages with reasons, and all notes.
+    /// Number of Gaussians, size, quality, time and output, every stage, omitted stages with reasons, and all notes.
     All,
 }
 

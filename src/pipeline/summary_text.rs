@@ -213,8 +213,10 @@ fn row(out: &mut String, name: &str, before: &str, after: &str, comment: &str) -
     writeln!(out, "{}", line.trim_end())
 }
 
-/// Returns the ratio of `before` and `after` as text, such as "10.0× fewer", where `word` is "fewer"; or "2.0× larger"
-/// if `after` is larger. The text is empty if both are equal or `after` is 0.
+/// Returns the ratio of `before` and `after` as text:
+/// - if `after` is smaller, for example "10.0× fewer", where `word` is "fewer";
+/// - if `after` is larger, for example "2.0× larger";
+/// - if both are equal or `after` is 0, an empty text.
 fn times(before: u64, after: u64, word: &str) -> String {
     match after {
         0 => String::new(),

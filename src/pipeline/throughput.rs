@@ -25,10 +25,10 @@ use crate::source::{Ids, ReadPlan};
 
 /// Maximum duration of the calibration, as a fraction of the expected duration of the run.
 const MAX_TIME_FRACTION: f64 = 0.04;
-/// Maximum duration of the calibration with all threads busy, seconds.
+/// Maximum duration of the calibration, seconds, if it keeps all threads busy.
 const MAX_SECONDS: f64 = 1.0;
-/// Number of frames that the calibration reads of each block of Gaussians. If the input stores more frames than this
-/// together, the calibration reads all frames that are stored together.
+/// Number of frames that the calibration reads of each block of Gaussians. If the input decodes frames in groups of
+/// more than this number, the calibration reads one whole group.
 const FRAMES_PER_BLOCK: u64 = 16;
 /// Number of views that each thread renders for each of three measurements: the time of computing contributions, of
 /// computing removal errors, and of rendering images.

@@ -12,7 +12,7 @@ const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
 /// Lowest and highest ratio of measured to estimated core-seconds of runs without a calibration.
 const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
 /// Lowest and highest ratio of measured to estimated core-seconds of runs whose amount of work depends on intermediate
-/// results, such as a search for a quality, in which the number of refinements is not known in advance.
+/// results. An example is a search for a requested quality: it is not known in advance how often it refines a model.
 const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
 /// Minimum fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is
 /// not divided among threads.

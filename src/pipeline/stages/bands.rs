@@ -26,7 +26,7 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name in the list of omitted work that says that no SH degree was dropped.
+/// Name under which the journal records that no SH degree was dropped, in its list of the work that the run omitted.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
 /// Returns the SH degree of a result of `scene` if the user asks for at most `degree`. This is `degree`, or the degree
@@ -93,7 +93,7 @@ impl ShDegreeStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds three states (all Gaussians at one frame) and
-    /// renders of them. `left` is the fraction of the Gaussians in the result.
+    /// renders of them. `left`: number of Gaussians in the result divided by that in the input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) =
             (work.state_bytes(Attributes::all()), work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));

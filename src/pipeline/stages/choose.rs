@@ -67,7 +67,8 @@ impl Stage for Choose {
 
 impl Choose {
     /// Returns the resource estimate of the stage. Its memory holds the merged and the pruned model, two states (all
-    /// Gaussians at one frame), and rendered views. `left` is the fraction of the Gaussians in the result.
+    /// Gaussians at one frame), and rendered views. `left`: number of Gaussians in the result divided by that in the
+    /// input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         // The trajectories of proxies, which replace merged clusters, are computed from all members.
@@ -98,9 +99,14 @@ impl Choose {
     }
 
     /// Compares the model `merged` with the same number of unmerged Gaussians from the top of the ranking, by mean PSNR
-    /// against the original on views used for scoring. Returns the model with the higher PSNR, or the unmerged one if
-    /// both are equal. If the unmerged model is better and no exact number was requested, the returned model has as
-    /// many Gaussians as selection kept. Merging that is discarded is recorded in the journal.
+    /// against the original on views used for scoring.
+    ///
+    /// - If `merged` has the higher PSNR, returns it.
+    /// - Otherwise, if an exact number of Gaussians was requested, returns the unmerged model.
+    /// - Otherwise returns an unmerged model with as many Gaussians from the top of the ranking as the selection by
+    ///   scores keeps.
+    ///
+    /// Records merging that is discarded in the journal.
     ///
     /// # Errors
     /// Fails if frames cannot be read.

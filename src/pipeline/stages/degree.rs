@@ -1,10 +1,10 @@
 //! Stage `degree`: finds the SH degree that gives the best quality for a requested size on disk.
 //!
 //! A Gaussian of SH degree 3 takes as many bytes as three and a half of degree 0. Whether more Gaussians or more SH
-//! coefficients give better renders depends on the scene. For each degree, from the highest down, the stage refines as
-//! many Gaussians as fit the size with a fraction of the optimization steps. It stops at the first degree whose quality
-//! on validation views is no better than that of the degree before. The best degree is then refined in full by the
-//! stage `refine`.
+//! coefficients give better renders depends on the scene. The stage tries degrees from the highest down: it takes as
+//! many Gaussians of this degree as fit the size, and refines them with a fraction of the usual optimization steps. It
+//! stops at the first degree whose quality on validation views is no better than that of the degree before. The best
+//! degree is then refined in full by the stage `refine`.
 //!
 //! Memory: that of refinement.
 

@@ -70,7 +70,8 @@ impl FieldPrecisionStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds two states (all Gaussians at one frame), rendered
-    /// views, and a second copy of the deformation field. `left` is the fraction of the Gaussians in the result.
+    /// views, and a second copy of the deformation field. `left`: number of Gaussians in the result divided by that in
+    /// the input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let per_gaussian = vec![
@@ -132,9 +133,8 @@ impl FieldPrecisionStage {
     }
 }
 
-/// Returns the minimum PSNR, dB, that a coarser version of a result must have, measured between its renders and renders
-/// of the result. This is `result`, the PSNR of the result against the original, plus `margin`, but at most
-/// [`MAX_USEFUL_PSNR`].
+/// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result.
+/// It is `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]; `result` is the PSNR of the result against the original.
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }

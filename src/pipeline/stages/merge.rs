@@ -1,8 +1,10 @@
 //! Stage `merge`: replaces clusters of similar survivors (Gaussians that are not removed) by one Gaussian each, a
 //! proxy.
 //!
-//! Memory: [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive, plus the memory of survivors and candidate pairs
-//! stated in [`crate::merging`], and of pairs measured at the same time stated in [`crate::merging::motion_pass`].
+//! Memory:
+//! - [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive;
+//! - the memory of survivors and of candidate pairs, stated in [`crate::merging`];
+//! - the memory of the pairs that are measured at the same time, stated in [`crate::merging::motion_pass`].
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -48,8 +50,8 @@ pub(crate) const PAIRS: &str = "pairs";
 /// Minimum number of pairs of Gaussians for which the measurement of their motion is divided into shards.
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
-/// Bytes of memory per Gaussian that may survive, for its id, its state with base colors only, a flag whether the state
-/// is finite, and its merge class. Ids count twice because merging is tried on subsets.
+/// Bytes of memory per Gaussian that may survive. They hold its id in the list of all such Gaussians and in the subset
+/// on which merging is tried, its state with base colors only, a flag whether the state is finite, and its merge class.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
 /// Assumed number of sets of survivors on which merging is tried until it leaves the requested number of Gaussians;
@@ -221,11 +223,13 @@ impl MergeStage {
     }
 }
 
-/// Returns about the largest number m of survivors, up to `all`, whose merging leaves at most `target` Gaussians. (For
-/// m = `target` this always holds.) `merged` returns the number of Gaussians that merging m survivors leaves. This
-/// number grows with m except for small dips, so the interval of possible m is narrowed by the secant method. The
-/// search ends early if merging leaves at most a thousandth of `target` too few; merging can then do without that many
-/// joins to leave exactly `target`.
+/// Returns about the largest number m of survivors, up to `all`, that can be merged so that at most `target` Gaussians
+/// are left. (m = `target` always satisfies this.) `merged` returns for a number m the number of Gaussians that are
+/// left after m survivors are merged.
+///
+/// The number left grows with m except for small dips, so the interval of possible m is narrowed by the secant method.
+/// The search ends early if the number left is below `target` by at most a thousandth of it; the caller then makes
+/// fewer joins, so that exactly `target` Gaussians are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -354,9 +358,10 @@ impl<'a> Trial<'a> {
     }
 }
 
-/// Returns each of `pairs` with the similarity of motion of its two Gaussians, in any order. The pairs hold indices in
-/// `pool`, the ids of the Gaussians in memory, whose positions at the reference frame are `reference`. A large number
-/// of pairs is sorted by position and divided into shards.
+/// Measures the similarity of motion of the two Gaussians of each pair in `pairs`. Returns the pairs with their
+/// similarities, in no particular order. The pairs hold indices in `pool`, the ids of the Gaussians in memory;
+/// `reference` holds the positions of these Gaussians at the reference frame. If there are many pairs, sorts them by
+/// position in space and divides them into shards.
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,

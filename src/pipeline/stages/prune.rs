@@ -48,14 +48,17 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors (Gaussians that are not removed). If Gaussians are not pruned by rank, this is
-    /// the number of all Gaussians that may stay, which are those in `ranked`. Otherwise it is the number that the
-    /// thresholds of the recipe select, or `target` (the requested number) if given. If merging later reduces the
-    /// survivors to the target, it is the number of all Gaussians that may stay, because only merging can tell how many
-    /// it needs.
+    /// Returns the number of survivors (Gaussians that are not removed):
+    /// - if Gaussians are not pruned by rank: all Gaussians in `ranked`;
+    /// - otherwise, if no number of Gaussians is requested (`target` is `None`): the number that the thresholds of the
+    ///   recipe select;
+    /// - otherwise, if survivors are not merged later: `target`;
+    /// - otherwise: all Gaussians in `ranked`, because merging later reduces them to `target`, and only merging can
+    ///   tell how many it needs.
     ///
     /// # Errors
-    /// Fails if the target is below the number of Gaussians that must stay or above the number that may stay.
+    /// Fails if the target is below the number of Gaussians that must stay, or above the number of Gaussians in
+    /// `ranked`.
     pub(crate) fn survivors(
         &self,
         scene: &Scene,

@@ -37,11 +37,12 @@ const MOST_VIEWS: usize = 60;
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take.
 const SHARE: f64 = 0.02;
-/// Maximum amount read from the input. Unit: reading the frames of the measured views once. They are read for the
-/// original, for the result (whose frames are computed from the same input), and for the timed views.
+/// Maximum number of times that the frames of the measured views are read: for the original, for the result (whose
+/// frames are computed from the same input) and for the timed views.
 const READS: f64 = 2.5;
-/// Maximum amount read from the input, in the unit of [`READS`], for a result with proxies (Gaussians that replace
-/// merged clusters). It is higher because the members of a cluster lie in several blocks of the input.
+/// Maximum number of times that the frames of the measured views are read for a result with proxies (Gaussians that
+/// replace merged clusters). It is higher than [`READS`] because the members of a cluster lie in several blocks of the
+/// input.
 const MERGED_READS: f64 = 6.0;
 /// Bytes that must remain free within the memory limit, beyond the estimate: this optional stage runs only if memory is
 /// plentiful.
@@ -99,8 +100,8 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
-    /// Returns the resource estimate of the stage, which renders views of the original and of the result. `left` is the
-    /// fraction of the Gaussians in the result.
+    /// Returns the resource estimate of the stage, which renders views of the original and of the result. `left`:
+    /// number of Gaussians in the result divided by that in the input.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
         let of_views = pictures::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
@@ -117,8 +118,8 @@ impl QualityStage {
     }
 
     /// Measures the quality of the result of `run`. Returns `None` if the result is an archive of frames: its frames
-    /// exist only once it is written. If there are no test views but validation views of refinement, takes the PSNR on
-    /// these from the journal.
+    /// exist only once it is written. If refinement used validation views and there are no test views, takes the PSNR
+    /// on the validation views from the journal.
     fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;
@@ -193,9 +194,10 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     Ok((mean(|score| score.0), mean(|score| score.1)))
 }
 
-/// Returns the median time of rendering one view of the original, and that of the result, on one thread, in
-/// milliseconds. The evaluation of the deformation field is not included. Each view is rendered once before its time is
-/// taken, to fill the processor's caches. Returns `None` if there are no views or a thread cannot be started.
+/// Returns two median times, in milliseconds: of rendering a view of the original, and of rendering a view of the
+/// result, on one thread. The evaluation of the deformation field is not included. Each view is rendered once before
+/// its time is taken, to fill the processor's caches. Returns `None` if there are no views or a thread cannot be
+/// started.
 pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<Option<RenderTime>> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
     let views = spread_views(views.to_vec(), TIMED_VIEWS);

@@ -40,15 +40,16 @@ pub(crate) const BALANCING_ROUNDS: usize = 2;
 const MAX_STEP_CHANGE: f64 = 2.5;
 /// Smallest mean squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
-/// Range of the final change that all quantization steps get in common, octaves (doublings): from the finest to the
+/// Range, in octaves (doublings), of the common change of all quantization steps at the end: from the finest to the
 /// coarsest steps.
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
-/// Number of bisection steps that find the final common change within [`OCTAVE_RANGE`].
+/// Number of bisection steps that find the common change of all quantization steps within [`OCTAVE_RANGE`].
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range of the final change that all quantization steps get in common if the archive has a byte limit, octaves
-/// (doublings): from the coarsest to the finest steps. The change is chosen so that the archive just fits the limit.
+/// Range, in octaves (doublings), of the common change of all quantization steps at the end if the archive has a byte
+/// limit: from the coarsest to the finest steps. The change is chosen so that the archive is as large as the limit
+/// allows.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
-/// Number of bisection steps that find the final common change within [`BYTES_OCTAVE_RANGE`].
+/// Number of bisection steps that find the common change of all quantization steps within [`BYTES_OCTAVE_RANGE`].
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
 /// Returns the number of views on which an archive is compared with the result before quantization, if each view has
@@ -85,7 +86,8 @@ pub(crate) enum QualityTarget {
 
 impl QualityTarget {
     /// Returns the requirement for an archive of a result whose PSNR against the original is `level`, dB. `psnr` is the
-    /// value of the option `--archive-psnr`, if given; `asked` is what the goal of the run requires.
+    /// value of the option `--archive-psnr`, if given; `asked` is the requirement that follows from the goal of the
+    /// run.
     pub(crate) fn new(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
         match (psnr, asked) {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
@@ -106,8 +108,9 @@ impl QualityTarget {
         }
     }
 
-    /// Returns the PSNR, dB, between renders of the archive and renders of the result before quantization that
-    /// corresponds to the requirement. `level` is the PSNR of the result before quantization against the original, dB.
+    /// Returns the PSNR, dB, that renders of the archive must have against renders of the result before quantization.
+    /// `level` is the PSNR of the result before quantization against the original, dB; the returned PSNR depends on it
+    /// if the requirement is a maximum loss or a byte limit.
     pub(crate) fn required_psnr(self, level: f64) -> f64 {
         match self {
             QualityTarget::Close(psnr) => psnr,

@@ -31,8 +31,9 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
     }
 
-    /// Returns whether the run removes at most the fraction `hardly_seen` of the Gaussians, whose removal hardly
-    /// changes renders. Then the result may be close enough to the original without refinement.
+    /// Returns whether refinement may be unnecessary, because the run removes only Gaussians whose removal hardly
+    /// changes renders. `hardly_seen` is the fraction of such Gaussians. The result may then be close enough to the
+    /// original without refinement.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
         input.left >= 1.0 - hardly_seen
     }

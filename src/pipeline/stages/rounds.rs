@@ -1,11 +1,11 @@
 //! Stage `rounds`: ranks the Gaussians by removal error (squared error of renders caused by removing one) in pruning
 //! rounds, each of which measures the errors anew on a smaller model.
 //!
-//! For strong reductions, one measurement on the full model is not enough: when a Gaussian is removed, those behind it
-//! become visible, and others that it made redundant are needed. So each round measures the survivors (Gaussians not
-//! removed so far), ranks them by [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors
-//! of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a larger one.
-//! Memory: see [`removal_error`].
+//! For strong reductions, one measurement on the full model is not enough. When a Gaussian is removed, Gaussians behind
+//! it become visible, and others become necessary that were redundant beside it. So each round measures the survivors
+//! (Gaussians not removed so far), ranks them by [`RemovalError`](crate::render::RemovalError) and removes the lowest.
+//! The survivors of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a
+//! larger one. Memory: see [`removal_error`].
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -44,8 +44,8 @@ pub(crate) struct Rounds {
     /// groups it uses errors measured in earlier rounds.
     pub turns: usize,
     /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
-    /// difference between a Gaussian and what is behind it. Without it, a Gaussian with the color of its background
-    /// would have the removal error 0.
+    /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
+    /// color of its background.
     pub contrast_floor: f64,
     /// Smallest fraction of the Gaussians of the input that the last round is assumed to leave; bounds the number of
     /// rounds in estimates.
@@ -163,10 +163,12 @@ impl Rounds {
         turns
     }
 
-    /// Ranks the Gaussians of the ranking `before` (all that may stay) anew by pruning rounds, until a round leaves at
-    /// most `fewest`, and returns the new ranking. Gaussians that must stay come first, then the other survivors of the
-    /// last round, then the Gaussians removed in each round, those of the last round first. Within each of these sets,
-    /// Gaussians are ordered by removal error; ties keep the order of `before`.
+    /// Ranks the Gaussians of the ranking `before` anew by pruning rounds, until a round leaves at most `fewest`, and
+    /// returns the new ranking.
+    ///
+    /// The new ranking begins with the Gaussians that must stay, by id. The other survivors of the last round follow,
+    /// then the Gaussians removed in each round, from the last round to the first. Each of these sets is sorted by
+    /// descending removal error; ties keep the order of `before`. If no round is needed, returns `before`.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -229,9 +231,13 @@ impl Rounds {
         sizes
     }
 
-    /// Runs round number `round` (from 0) on the given state, and returns the new state, in which `left` of the
-    /// removable Gaussians are left. `turns` holds the groups of views, `key` is the cache key of the whole ranking;
-    /// only every `stride`-th pixel in each direction is used. The views of the round can be divided among shards.
+    /// Runs a pruning round and returns the new state. The views of the round can be divided among shards.
+    ///
+    /// - `state`: state before the round; `turns`: all groups of views;
+    /// - `round`: number of the round, from 0;
+    /// - `key`: cache key of the whole ranking;
+    /// - `left`: number of removable Gaussians that the round leaves;
+    /// - `stride`: only every `stride`-th pixel of a view in each direction is rendered.
     fn round(
         &self,
         scene: &Scene,

@@ -24,9 +24,11 @@ use crate::scene::Scene;
 
 /// Name of both stages in plans, progress and summaries.
 const NAME: &str = "size";
-/// Fraction of the byte limit that may remain unused. The first stage ends its search once no more than this is unused.
+/// Fraction of the byte limit that may remain unused. The search for the number of Gaussians that fit the limit ends
+/// once at most this fraction is unused.
 const MAX_UNUSED: f64 = 0.01;
-/// Maximum number of sizes (numbers of Gaussians) for which the first stage writes an output to measure its bytes.
+/// Maximum number of sizes (numbers of Gaussians) for which the search for the number that fits writes an output to
+/// measure its bytes.
 const MAX_TRIED: usize = 8;
 /// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
 const RANKING_VIEWS: usize = 48;
@@ -50,7 +52,8 @@ pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
-    /// Whether the number of Gaussians that fit is also found for lower SH degrees.
+    /// Whether lower SH degrees are tried as well: the number of Gaussians that fit the byte limit is then found for
+    /// each of them.
     drops_bands: bool,
 }
 
@@ -107,9 +110,10 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]): for the SH degree of
-    /// `template`, and if `drops` also for lower degrees in decreasing order, ending with the first degree at which all
-    /// Gaussians fit. `template` holds the other settings of the model, `recipe` is the size of the recipe file, bytes.
+    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees.
+    /// The first degree is that of `template`. If `drops`, lower degrees follow in decreasing order, up to the first
+    /// degree at which all Gaussians fit. `template` holds the other settings of the model, `recipe` is the size of the
+    /// recipe file, bytes.
     ///
     /// # Errors
     /// Fails in the cases in which [`ByteLimit::count`] fails.
@@ -253,11 +257,12 @@ impl ByteLimit {
     }
 }
 
-/// Returns the number of Gaussians to try next if `count` Gaussians take too many bytes. `part` is the fraction of
-/// their bytes that may be used; `tried` is the number of sizes tried before. The result is at least `protected` (the
-/// number of Gaussians that must stay, less than `count`) and less than `count`. After [`MAX_TRIED`] sizes, the result
-/// is at most half of `count` (or `protected`). So the search ends after at most 32 more sizes, however bytes depend on
-/// the number of Gaussians.
+/// Returns the number of Gaussians to try next if an output with `count` Gaussians takes too many bytes. `part`: number
+/// of bytes that the Gaussians may take, divided by the number that they take. `protected`: number of Gaussians that
+/// must stay, less than `count`. `tried`: number of sizes tried before.
+///
+/// The result is at least `protected` and less than `count`. After [`MAX_TRIED`] sizes, it is at most half of `count`
+/// (or `protected`). So the search ends after at most 32 more sizes, however bytes depend on the number of Gaussians.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)

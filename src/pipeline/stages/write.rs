@@ -186,8 +186,8 @@ impl WriteStage {
         self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
-    /// Returns the resource estimate of the stage. Its memory holds the result, which has the fraction `left` of the
-    /// Gaussians, and write buffers.
+    /// Returns the resource estimate of the stage. Its memory holds the result and write buffers. `left`: number of
+    /// Gaussians in the result divided by that in the input.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let is_solved = work.input.reduced > 0;
@@ -241,9 +241,9 @@ impl WriteStage {
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Returns the total size, in bytes, of all output files for the model `compressed`, with a recipe file of `recipe`
-    /// bytes. Measures it by writing the result to a scratch folder, which is then deleted; the summary is counted with
-    /// an assumed maximum.
+    /// Returns the total size, in bytes, of all output files for the model `compressed`. Measures it by writing the
+    /// result to a scratch folder, which is then deleted. `recipe` is the size of the recipe file in bytes; for the
+    /// summary, an assumed maximum size is counted.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
