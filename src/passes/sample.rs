@@ -57,7 +57,7 @@ impl ViewSampler {
         taken.map(move |&(view, camera)| FrameView { frame, view, camera })
     }
 
-    /// Returns `schedule` reduced to the selected views.
+    /// Returns a schedule with only those views of `schedule` that this sampler selects.
     fn thin(mut self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
