@@ -241,8 +241,8 @@ impl ChunkFiles {
         Ok(fs::metadata(path).map_err(failed())?.len())
     }
 
-    /// Writes the page and, as separate files, its chunks into `folder`. Sets the file names in `stage`, the
-    /// description of the scene. Returns the names of all written files, and their total size in bytes.
+    /// Writes the page into `folder`, and its chunks as separate files beside it. Stores the names of the chunk files
+    /// in `stage`, the description of the scene. Returns the names of all written files, and their total size in bytes.
     ///
     /// # Errors
     /// Fails if a file cannot be read or written.
