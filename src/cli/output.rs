@@ -24,8 +24,8 @@ pub(super) fn print(text: &str) -> Result<()> {
     write(printable(text).as_bytes())
 }
 
-/// Prints a result as JSON if `is_json`, else as text. The functions `json` and `text` return the result; only one of
-/// them is called. In JSON, control characters are written as escapes.
+/// Prints a result as JSON if `is_json`, else as text. `json` and `text` return the result in these two forms; only one
+/// of them is called. In JSON, control characters are written as escapes.
 ///
 /// # Errors
 /// Fails as [`print`].

@@ -55,7 +55,7 @@ impl Shared {
 }
 
 impl Display {
-    /// Returns a display; `is_quiet` hides progress.
+    /// Creates a display of the library's events; `is_quiet` hides progress.
     pub(super) fn new(is_quiet: bool) -> Self {
         let bars = MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10));
         Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
@@ -277,7 +277,7 @@ struct Log {
 }
 
 impl Log {
-    /// Begins a log of `task` now. Its lines start with `name`.
+    /// Begins the log of `task`, whose time runs from now. The log lines start with `name`.
     fn new(name: String, task: Task<'_>, shared: Arc<Shared>) -> Log {
         let (done, next) = (AtomicU64::new(0), AtomicU64::new(LOG_INTERVAL_SECONDS));
         let is_nested = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;

@@ -71,7 +71,7 @@ impl RecipeFlags {
         )))
     }
 
-    /// Returns the recipe that results from all recipe options.
+    /// Returns the recipe that results from all recipe options of the command line.
     ///
     /// # Errors
     /// Fails if the file cannot be read, or if a parameter is unknown or out of range.
@@ -212,8 +212,7 @@ fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     }
 }
 
-/// Parses the merge pass `text`: the four thresholds `EPSILON,D0,RHO,TAU_M` of a pass. Fails with a message for other
-/// texts.
+/// Parses the text of a merge pass: its four thresholds `EPSILON,D0,RHO,TAU_M`. Fails with a message for other texts.
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
