@@ -105,8 +105,8 @@ pub fn convert(
     Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 
-/// Returns the resource estimate (memory and time) of writing all frames once in the format `kind`, with curve fitting
-/// where the format needs it.
+/// Returns the resource estimate (memory and time) of writing all frames once in the format `kind`, including the fit
+/// of curves for formats that store curves.
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let state_bytes = work.state_bytes(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs) || is_windowed(kind);

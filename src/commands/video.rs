@@ -221,7 +221,7 @@ struct FilmSource<'a> {
 }
 
 impl FilmSource<'_> {
-    /// Renders each view of every model in `subjects`, joins the renders of a view from left to right, and adds the
+    /// Renders each view with every model in `subjects`, joins the renders of a view from left to right, and adds the
     /// joined images to `film` in order.
     fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = self.events.task(NAME, "frames", self.views.len() as u64);
