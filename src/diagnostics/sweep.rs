@@ -132,7 +132,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     Ok(found)
 }
 
-/// Opens the input and returns the result of the sweep, still without measured points, and the file name for outputs of
+/// Opens the input. Returns the result of the sweep, which has no measured points yet, and the file name for outputs of
 /// the same kind as the input.
 fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&with_training_views(&options.input))?;

@@ -32,8 +32,8 @@ pub enum DemoBody {
     /// Cloud without motion, whose Gaussians each fade from opaque to invisible or from invisible to opaque. Of the
     /// statistics, only the variance of the opacity and the life span differ from those of a wall.
     Fading,
-    /// Flying sparks, each visible for an eighth of the sequence around its own time: disjoint life spans, and no
-    /// motion outside of a spark's life span.
+    /// Flying sparks, each visible for an eighth of the sequence around its own time. The life spans of many sparks do
+    /// not overlap. A spark does not move outside of its life span.
     Spark,
     /// Hanging wires, each a row of needle-shaped Gaussians that are 25 times longer than thick. Without motion; they
     /// cover little area in a render, but are visible.

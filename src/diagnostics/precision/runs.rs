@@ -37,8 +37,8 @@ const FRAMES_COMPARED: usize = 12;
 const WHOLE: &str = "renders of the whole model: every held-out view of up to 12 frames";
 
 impl Bench<'_> {
-    /// Measures complete runs that prune and then merge, with several merging radii and numbers of merging passes. All
-    /// runs end at the same number of Gaussians.
+    /// Measures complete runs that prune and then merge, with several merging radii and several numbers of merging
+    /// passes. All runs end at the same number of Gaussians.
     pub(super) fn merging(&self) -> Result<PrecisionKnob> {
         let plain = self.recipe.without_refinement();
         let pass = plain.merge.passes.first().copied();

@@ -8,7 +8,7 @@ use crate::deform::synthetic::{Noise, plain_config, random_tensors};
 use crate::deform::{Deltas, Field, FieldConfig, LayerBuffers};
 use crate::model::{Attributes, Gaussians};
 
-/// Compares frame states that the program computes with a deformation field with the definition of the field in f64,
+/// Compares the frame states that the program computes by a deformation field with the f64 definition of this field,
 /// for several configurations of the field. The error of a value is relative to 1 + |value|; the bound allows about 60
 /// roundings in f32.
 pub(super) fn states() -> CaseResult {

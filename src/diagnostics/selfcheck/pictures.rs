@@ -124,8 +124,10 @@ pub(super) fn harmonics() -> CaseResult {
     })
 }
 
-/// Compares the largest gradients of each attribute with finite differences of a loss of f64 renders, between parameter
-/// values that are 6e-5 apart. Errors are relative to each gradient; gradients are f32 sums of terms of both signs.
+/// Compares the 20 largest gradients of each attribute with finite differences. The gradients are those of the squared
+/// error of a render; the differences are those of the same error of f64 renders at parameter values that are 6e-5
+/// apart. Errors are relative to the expected gradient; the gradients of the program are f32 sums of terms of both
+/// signs.
 pub(super) fn gradients() -> CaseResult {
     CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
@@ -167,8 +169,8 @@ pub(super) fn gradients() -> CaseResult {
     })
 }
 
-/// Compares PSNR in dB with its value from a sum of squared whole numbers, and SSIM with its definition. The f64 sums
-/// of 786,432 squares lose at most 1e-12.
+/// Compares PSNR in dB with its value from an exact sum of squared whole numbers, and SSIM with its definition. The f64
+/// sums of 786,432 squares lose at most 1e-12.
 pub(super) fn comparison() -> CaseResult {
     CaseResult::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);
@@ -200,8 +202,11 @@ fn undoubtful_scene() -> (Gaussians, Camera) {
 }
 
 /// Returns the 16 real spherical harmonics up to degree 3 in the direction `toward`, from its angles θ and φ:
-/// √2·K·P(cos θ)·cos mφ for order m > 0, with sin |m|φ instead for m < 0, and K·P(cos θ) for m = 0. P is an associated
-/// Legendre function and K its normalization.
+/// - order m > 0: √2·K·P(cos θ)·cos mφ
+/// - order m < 0: √2·K·P(cos θ)·sin |m|φ
+/// - order m = 0: K·P(cos θ)
+///
+/// P is an associated Legendre function and K its normalization.
 fn basis(toward: DVec3) -> [f64; 16] {
     let (height, angle) = (toward.z, toward.y.atan2(toward.x));
     std::array::from_fn(|k| {

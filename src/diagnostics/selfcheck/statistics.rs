@@ -15,8 +15,8 @@ use crate::statistics::{BlockScan, ScanPlan};
 const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
 /// Compares the statistics of motion and opacity (D, κ, V and the number of frames in which a Gaussian is alive) with
-/// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, the rounding error of a sum of 40
-/// terms is about 1e-15, that of a variance larger by a few digits.
+/// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, a sum of 40 terms has a rounding
+/// error of about 1e-15; a variance loses a few more digits.
 pub(super) fn motion() -> CaseResult {
     CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -160,10 +160,10 @@ pub(super) fn projected_area() -> CaseResult {
     })
 }
 
-/// Compares the contribution C of a needle-shaped Gaussian with a formula for its projected area. With variances a and
-/// b px² along its axes in the image, and rotated about the line of sight, the Gaussian has det Σ = (a + 0.3)(b + 0.3).
-/// If this were computed from the entries of Σ, no digit would be correct. Errors are relative to max(C, 1 px), as in
-/// [`projected_area`].
+/// Compares the contribution C of a needle-shaped Gaussian with a formula for its projected area. The Gaussian has the
+/// variances a and b, in px², along its axes in the image, and these axes are rotated in the image plane. With 0.3 px²
+/// added to both variances, its projected covariance Σ has det Σ = (a + 0.3)(b + 0.3). A computation of det Σ from the
+/// entries of Σ would leave no correct digit. Errors are relative to max(C, 1 px), as in [`projected_area`].
 pub(super) fn needle_on_screen() -> CaseResult {
     CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);

@@ -81,9 +81,9 @@ pub(super) fn archive_grid() -> CaseResult {
     })
 }
 
-/// Encodes a model as an archive and decodes it. The decoded Gaussians must equal the originals rounded to the
-/// quantization grid, and the other stored data must equal the originals, to the bit: prediction and entropy coding of
-/// an archive are lossless.
+/// Encodes a model as an archive, decodes it, and compares every bit, because the prediction and entropy coding of an
+/// archive are lossless. The decoded Gaussians must equal the original Gaussians after rounding to the quantization
+/// grid. The other stored data must equal the originals.
 pub(super) fn archive_codes() -> CaseResult {
     CaseResult::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
@@ -165,8 +165,8 @@ struct MemoryFrames {
 
 impl MemoryFrames {
     /// Creates 1100 Gaussians (more than one block of Gaussians) at 70 frames (more than two blocks of frames).
-    /// Positions wander, opacities jump, rotations return to their first value in the last frame of a block, and scales
-    /// and colors are constant.
+    /// Positions wander and opacities jump. Rotations have the same values in the first and in the last frame of a
+    /// block, and others between. Scales and colors are constant.
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);

@@ -3,7 +3,8 @@
 use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
 
-/// Returns a camera near the origin that looks along +z, rotated a little so that no axis is special.
+/// Returns a camera near the origin that looks approximately along +z. It is rotated a little, so that its axes are not
+/// parallel to the world axes.
 pub fn tilted_camera(width: u32, height: u32) -> Camera {
     Camera {
         width,

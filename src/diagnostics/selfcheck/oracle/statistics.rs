@@ -57,9 +57,9 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan:
     OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 
-/// Returns the projected area of Gaussian `i` within the image, in px²: the area of its 3σ ellipse, found by projecting
-/// its 3-D covariance, times the part of the ellipse's bounding box that lies inside the image. Returns 0 if the
-/// Gaussian is not beyond the near plane.
+/// Returns the projected area of Gaussian `i` within the image, in px²: the area of its 3σ ellipse, times the fraction
+/// of the bounding box of this ellipse that lies inside the image. The ellipse is found by projecting the 3-D
+/// covariance. Returns 0 if the Gaussian is not beyond the near plane.
 pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
