@@ -242,7 +242,8 @@ pub(crate) fn jaccard_distance(a: &[u32], b: &[u32]) -> f64 {
 }
 
 /// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`: √(`error`²
-/// − `finest`²) / `finest`, because independent errors add in squares. Returns 0 if `error` is below `finest`.
+/// − `finest`²) / `finest`. `error` is the whole error of the setting; independent errors add in squares. Returns 0 if
+/// `error` is below `finest`.
 pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }
