@@ -186,7 +186,8 @@ fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     Some(CubicTrack { opacity: peak, ..curve })
 }
 
-/// Returns one curve for `track` whose time window has the mean and the variance of the track's opacity over time.
+/// Returns one curve for `track`. Its time window has the same mean and the same variance over time as the opacity of
+/// the track.
 fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
