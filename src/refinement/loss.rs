@@ -35,9 +35,9 @@ pub(super) struct RenderQuality {
 }
 
 impl Loss {
-    /// Returns the derivative of the loss with respect to each color value of the render `picture`; `target` has the
-    /// values of the target view as 16-bit integers. Derivatives are multiplied by the number of values and by a factor
-    /// that is the same for all views. They are 0 for values outside [0, 1], because a screen clamps these.
+    /// Returns the derivative of the loss with respect to each color value of the render `picture`, multiplied by the
+    /// number of values and by a factor that is the same for all views. `target` has the values of the target view as
+    /// 16-bit integers. For values outside [0, 1] the derivative is 0, because a screen clamps these.
     pub(super) fn slope(&self, picture: &Image, target: &[u16]) -> Image {
         let mut slope = picture.clone();
         for (value, &wanted) in slope.data.iter_mut().zip(target) {

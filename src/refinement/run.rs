@@ -129,7 +129,8 @@ impl EpochSampler {
         self.pictures[self.at - 1]
     }
 
-    /// Takes views until the number of views taken since the beginning is `taken`, to continue an interrupted run.
+    /// Skips views of the random order until `taken` views have been taken since the beginning. Used to continue an
+    /// interrupted run.
     fn skip_to(&mut self, taken: usize) {
         while self.taken < taken {
             self.next();
@@ -362,8 +363,8 @@ impl<'a> RefineRun<'a> {
         format!("{}-steps", self.stage)
     }
 
-    /// Continues the current phase of `timer` from its last checkpoint and returns its progress. Returns `None` if
-    /// there is no checkpoint of this phase.
+    /// Restores the optimizer and the position in the random order of views from the last checkpoint of the current
+    /// phase of `timer`. Returns the progress of this phase, or `None` if there is no checkpoint of it.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
         let kept: Option<ResumePoint<KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
             self.scene.work.load(&self.checkpoint_name(), timer.key)?;
