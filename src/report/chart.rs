@@ -324,7 +324,7 @@ struct SeriesStyle {
 }
 
 impl SeriesStyle {
-    /// Returns the style with the index `number` modulo [`LOOKS`], drawn solid.
+    /// Returns the style with the index `number` modulo [`LOOKS`], with solid lines and filled marks.
     fn from_number(number: usize) -> SeriesStyle {
         SeriesStyle { number: number % LOOKS, hollow: false }
     }

@@ -57,7 +57,7 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
-/// Returns the HTML of the conditions under which the diagrams were measured, and of the notes.
+/// Returns the HTML of a paragraph on the conditions under which the diagrams were measured, followed by the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \

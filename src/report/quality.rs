@@ -19,7 +19,7 @@ pub(super) fn charts(results: &[Analysis], names: &[String]) -> String {
     wrapped(charts)
 }
 
-/// Returns the HTML of the charts by frame of the quality measures other than PSNR.
+/// Returns the HTML of charts over the frames, one for each quality measure other than PSNR.
 pub(super) fn other_charts(results: &[Analysis], names: &[String]) -> String {
     let mut charts = by_frame(results, names, "SSIM", "SSIM", &|means| Some(means.ssim));
     charts += &by_frame(results, names, "Temporal error", "error", &|means| means.temporal);

@@ -54,8 +54,8 @@ pub struct ChosenRender {
     pub flip: Option<f64>,
 }
 
-/// Chooses the renders that the page shows from the comparison `found`, the worst first. A render that is chosen for
-/// several reasons occurs once, with all its reasons.
+/// Returns the renders that the page shows, chosen from the comparison `found`; the worst render comes first. A render
+/// that is chosen for several reasons occurs once, with all its reasons.
 pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     let pictures = &found.views;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
