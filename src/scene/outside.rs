@@ -20,8 +20,7 @@ const MAX_CAMERAS: usize = 64;
 /// Smallest angle between the direction of a camera and the nearest direction of the rig at which the camera counts as
 /// outside the rig, radians (2°).
 pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
-/// Number of random cameras tried per new camera that is wanted; the search for cameras outside the rig ends after
-/// that.
+/// Maximum number of random cameras that are tried for each wanted camera outside the rig.
 const TRIES: usize = 64;
 /// Maximum number of iterations of the search for the direction of a cone that is nearest to a given direction
 /// ([`RigCone::angle`]).
