@@ -130,8 +130,8 @@ impl<'a> RunningScan<'a> {
         }
     }
 
-    /// Adds the next frames, which are all frames of `source`. `cameras` lists for each of them the cameras that see
-    /// it.
+    /// Adds all frames of `source` to the scan; they follow the frames that were added before. `cameras` lists for each
+    /// of these frames the cameras that see it.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

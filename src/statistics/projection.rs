@@ -250,7 +250,8 @@ fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) 
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))
 }
 
-/// Returns the length of [center − reach, center + reach] inside [0, size]; not positive if the interval lies outside.
+/// Returns the length of the part of the interval [center − reach, center + reach] that lies inside [0, size]. Returns
+/// 0 or less if the interval lies outside.
 #[inline(always)]
 fn overlap(center: f64, reach: f64, size: f64) -> f64 {
     let (low, high) = (center - reach, center + reach);

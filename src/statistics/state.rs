@@ -117,8 +117,9 @@ impl BlockState {
     }
 }
 
-/// Returns the largest |x| of `values`, or a non-finite number if any value is not finite. Without their signs, floats
-/// order as their bits do, with infinity and NaN last; integers are compared many at a time.
+/// Returns the largest |x| of `values`, or a non-finite number if any value is not finite. Compares the bits as
+/// integers, many at a time: without the sign, the bits of floats have the order of their values, with infinity and NaN
+/// last.
 #[inline(always)]
 fn largest_magnitude(values: &[f32]) -> f32 {
     f32::from_bits(values.iter().fold(0, |largest, x| largest.max(x.abs().to_bits())))

@@ -461,7 +461,7 @@ proptest! {
     }
 }
 
-/// Returns the Gaussians of `from` in `range`.
+/// Returns the Gaussians of `from` with the indices in `range`.
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
     for column in Attributes::all().iter() {
