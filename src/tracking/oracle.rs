@@ -280,7 +280,7 @@ type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 /// - `in_doubt`: tracks that began because a link was probably wrong.
 /// - `succeeded`: (frame, track) of every track that is missing in the frame although a similar Gaussian is in its
 ///   place.
-/// - `r` and `q`: factors on the distance and on the difference in appearance in the cost of a pair.
+/// - `r` and `q`: in the cost of a pair, `r` scales the distance and `q` the difference in appearance.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,

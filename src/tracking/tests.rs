@@ -25,8 +25,8 @@ impl UniformNumbers {
     }
 }
 
-/// Returns `count` Gaussians in a cube of side 1. Their scales are such that about `crowd` Gaussians lie within the
-/// largest scale of each one.
+/// Returns `count` Gaussians in a cube of side 1. Their scales vary around half the side of a cube that holds about
+/// `crowd` of these Gaussians.
 fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;

@@ -33,7 +33,8 @@ pub(super) struct Round {
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
-    /// Number of frames from the track's last Gaussian to the next frame: 1 if it had a Gaussian in the previous frame.
+    /// Number of frames from the last frame in which the track had a Gaussian to the frame that is linked next: 1 if no
+    /// frame lies between them.
     pub(super) frames_since_seen: u32,
     /// Velocity, scene units per frame; `None` until the track has a second Gaussian.
     pub(super) velocity: Option<[f32; 3]>,
