@@ -67,9 +67,9 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Returns this plan with another maximum number of frames that a reader keeps in memory after it has decoded a
-    /// tile; at least 1. A tile holds several consecutive frames. A small maximum saves memory but makes the reader
-    /// decode tiles repeatedly.
+    /// Returns a copy of this plan with the limit `frames` (at least 1): the maximum number of frames that a reader
+    /// keeps in memory after it has decoded a tile. A tile holds several consecutive frames. A small limit saves memory
+    /// but makes the reader decode tiles repeatedly.
     pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
@@ -246,8 +246,8 @@ pub trait BlockReader: Send {
     /// Fails if the frame cannot be read.
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Announces by the plan `_wanted` the frames that will be read from now on, and how many of them the reader may
-    /// keep in memory. Readers that keep no frames ignore the plan.
+    /// Announces the frames that will be read from now on. The plan `_wanted` lists them and limits how many of them
+    /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later
