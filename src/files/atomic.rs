@@ -35,10 +35,14 @@ use workspace::{SCRATCH, Workspace, user_path};
 /// Checks, before any work, that a run that reads `inputs` may write an output of the kind `kind` (file or folder) to
 /// `target`. Completes or removes an output with this name that a killed run left unfinished.
 ///
-/// Refuses a target without a name or in a folder that does not exist. Refuses a target that is an input, contains an
-/// input or lies inside an input, even if the path leads there only through links, and for every value of `replace`.
-/// Refuses an existing target that `replace` does not allow to replace (a folder may always replace an empty folder), a
-/// file in place of a folder or the reverse, sockets, block devices and dangling links.
+/// Refuses these targets:
+///
+/// - a target without a name, or in a folder that does not exist
+/// - a target that is an input, contains an input or lies inside an input, even if the path leads there only through
+///   links; this holds for every value of `replace`
+/// - an existing target that `replace` does not allow to replace (a folder may always replace an empty folder)
+/// - a file in place of a folder, or the reverse
+/// - sockets, block devices and dangling links
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
@@ -271,8 +275,8 @@ impl StagedFolder {
 }
 
 /// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the
-/// workspaces that killed runs with this output left behind. Fails if something exists at `target` that `replace` does
-/// not allow an output of the kind `kind` to replace, or if a system call fails.
+/// workspaces that killed runs with this output left behind. Fails if `target` exists and `replace` does not allow an
+/// output of the kind `kind` to replace it, or if a system call fails.
 fn output_workspace(target: &Path, kind: TargetKind, replace: Replace) -> Result<Workspace> {
     clean_up(target);
     check_replace(target, kind, replace)?;

@@ -32,12 +32,12 @@ use crate::limits::ReadLimit;
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Bytes of memory per file that the parsed list of files takes. In addition, it takes three times the bytes of the
-/// list as it is stored in the archive.
+/// Bytes of memory that the parsed list of files takes per file, in addition to three times the length of the list in
+/// the archive.
 const ENTRY_BYTES: u64 = 640;
-/// Maximum ratio of two numbers: the elements of the tensors in a storage, and the values stored in it. A tensor may
-/// repeat stored values (stride 0), so a small file can declare any number of elements. No trained model needs more
-/// than this.
+/// Maximum number of tensor elements per value of the storage (block of tensor values) that holds them. A tensor may
+/// repeat stored values (stride 0), so a small file can declare any number of elements. No trained model needs a larger
+/// number.
 const MAX_EXPANSION: usize = 4;
 
 /// PyTorch checkpoint that is open for reading.

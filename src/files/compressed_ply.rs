@@ -107,8 +107,9 @@ pub fn read_compressed_ply(path: &Path, memory: ReadLimit) -> Result<Gaussians> 
     Ok(gaussians)
 }
 
-/// Decodes the packed position, rotation, scale and color of every row of `vertices` into `gaussians`. `chunks` holds
-/// the ranges of 256 successive Gaussians in each row. Fails if a property is missing or a range is not finite.
+/// Decodes the packed position, rotation, scale and color of every row of `vertices` into `gaussians`. Each row of
+/// `chunks` holds the value ranges of 256 successive Gaussians. Fails if a property is missing or a range is not
+/// finite.
 fn decode_vertices(chunks: &Table, vertices: &Table, gaussians: &mut Gaussians) -> Result<()> {
     let names = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
     let mut offsets = [0; 4];
@@ -154,8 +155,8 @@ fn ranges(chunks: &Table, chunk: usize, names: [&str; 3]) -> Result<Ranges> {
     Ok(found)
 }
 
-/// Returns one value for each of three components: the value at the fraction `at` (0 to 1) of the way from the smallest
-/// to the largest value of its range in `ranges`.
+/// Returns three components, each interpolated linearly in its range in `ranges`. `at` holds a fraction for each
+/// component: 0 gives the smallest value of the range, 1 the largest.
 fn between(ranges: &Ranges, at: [f32; 3]) -> [f32; 3] {
     [0, 1, 2].map(|c| ranges[c][0] * (1.0 - at[c]) + ranges[c][1] * at[c])
 }

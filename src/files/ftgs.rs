@@ -266,7 +266,7 @@ mod tests {
     use super::*;
     use crate::model::Gaussians;
 
-    /// Returns `count` Gaussians with linear motion in time windows.
+    /// Returns `count` Gaussians with linear motion in time windows and the SH degree `sh_degree`.
     fn params(count: usize, sh_degree: usize) -> StoredParams {
         let mut made = StoredParams {
             gaussians: Gaussians::zeros(count, sh_degree),

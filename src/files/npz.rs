@@ -319,7 +319,8 @@ impl NpzArray {
     }
 }
 
-/// Values of an array as f32, in the order of the array, in a mapped file.
+/// Values of one array as f32, in the order in which the array stores them. They lie in a memory-mapped file: the
+/// archive, or a scratch file.
 #[derive(Debug, Clone)]
 pub(crate) struct Floats {
     map: Arc<FileMap>,

@@ -13,9 +13,9 @@ pub(super) fn gaussians_with_sh(count: usize, degree: usize) -> Gaussians {
     state
 }
 
-/// Asserts that multiplying the SH coefficients above degree 0 by `signs` has the effect of reversing the axes that are
-/// −1 in `axes`: each SH basis function times its sign has the same value in a direction as the unchanged function in
-/// the reversed direction.
+/// Asserts that a change of the signs of SH coefficients has the same effect as reversing axes. `signs` holds the
+/// factor of each coefficient above degree 0; in `axes`, −1 marks a reversed axis. The value of each SH basis function
+/// in a direction, times its sign, must equal its value in the reversed direction.
 pub(super) fn assert_signs_reverse_axes(signs: [f32; 15], axes: [f64; 3]) {
     let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
         [

@@ -128,7 +128,7 @@ struct Velocity {
 /// Member `playback` of `meta.json`: settings of the player.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Playback {
-    /// Duration in seconds.
+    /// Duration of the playback in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     duration: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]

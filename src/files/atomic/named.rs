@@ -41,13 +41,15 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads the list of the files that belong to the result from the summary at `path`, which may be a link.
+    /// Reads from the summary at `path`, which may be a link, which files belong to the result. Returns
+    /// [`Owner::Unknown`] if the file cannot be read or is not a summary of this program with a list of files.
     pub(super) fn read(path: &Path) -> Owner {
         // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
-    /// Reads the list of the files that belong to the result from the open summary `file`.
+    /// Reads from the open summary `file` which files belong to the result. Returns [`Owner::Unknown`] if `file` cannot
+    /// be read or is not a summary of this program with a list of files.
     pub(super) fn read_file(mut file: File) -> Owner {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;

@@ -121,8 +121,9 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// Returns, for every image of `ids`, the splits to which the image belongs: usually one, and an empty list for an
-/// image that is not used. `val` lists the test images and `train` the training images.
+/// Returns, for every image of `ids`, the list of the splits to which the image belongs: usually one split, none for an
+/// image that is not used. `val` lists the test images and `train` the training images. If `val` is empty, the index of
+/// an image decides (see the module documentation).
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);

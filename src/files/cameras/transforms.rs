@@ -102,7 +102,7 @@ fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<
     })
 }
 
-/// Builds an image from its own keys `own` and the keys `shared` by all images of the file.
+/// Builds an image of the split `split` from its own keys `own` and the keys `shared` by all images of the file.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,

@@ -202,7 +202,8 @@ impl<R: Read> CountingReader<R> {
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 
-    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames.
+    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames;
+    /// `None` if the header or the constant attributes are incomplete.
     fn ended(&self, expected: &str, frames: Option<u32>) -> Error {
         let found = match frames {
             None => "the end of the stream, before its first frame".to_owned(),

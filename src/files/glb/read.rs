@@ -195,9 +195,9 @@ fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Va
     }
 }
 
-/// Returns the factor by which x and y coordinates of the file are multiplied to get the axes of a PLY: −1 if the node
-/// of the mesh with index `mesh` has no transform, 1 if the node turns the mesh by 180° about z. Fails for other
-/// transforms.
+/// Returns the sign by which x and y coordinates of the file are multiplied to convert them to the axes of a PLY.
+/// `mesh` is the index of the mesh in the JSON text `document`. The sign is −1 if the node of this mesh has no
+/// transform, and 1 if the node turns the mesh by 180° about z. Fails for other transforms.
 fn axes_of(document: &Value, mesh: usize, path: &Path) -> Result<f64> {
     let nodes = document["nodes"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(node) = nodes.iter().find(|node| node["mesh"] == mesh) else { return Ok(-1.0) };

@@ -25,7 +25,7 @@ struct Attribute<'a> {
     /// Type of the values in glTF's terms, such as `VEC3`.
     kind: &'static str,
     component: u32,
-    /// Number of bytes per Gaussian.
+    /// Number of bytes that the attribute takes per Gaussian.
     bytes: usize,
     write: WriteValue<'a>,
 }
@@ -97,7 +97,7 @@ pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
     write().map_err(Error::io("write", path))
 }
 
-/// Returns the attributes of the primitive for the Gaussians `state`, in the order of the file.
+/// Returns the attributes of the glTF primitive for the Gaussians `state`, in the order in which they are written.
 fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     let f32s = |values: &[f32], out: &mut Vec<u8>| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
     let attribute =

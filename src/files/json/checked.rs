@@ -128,8 +128,9 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Stores `error`, which concerns the byte at index `at` of the buffer. Returns an I/O error at once if the parser
-    /// has already taken all bytes before this byte; otherwise the error follows when the parser has taken them.
+    /// Stores `error`, which concerns the byte at index `at` of the buffer. If the parser has already taken all bytes
+    /// before this byte, returns an I/O error, which stops the parser. Otherwise returns `Ok`: a later read returns the
+    /// I/O error, after the parser has taken these bytes.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
         // Otherwise pass on the bytes before it first: they may contain an earlier error that the parser reports.

@@ -105,7 +105,8 @@ pub(crate) fn write_like(
 }
 
 /// Returns the header of a NumPy array file for values of the type `descr` (NumPy's notation) in an array of the shape
-/// `shape`. The header has version 1.0 of the format: a dictionary padded to a multiple of 64 bytes.
+/// `shape`. If `is_fortran` is true, the first axis is the fastest. The header has version 1.0 of the format: a
+/// dictionary padded to a multiple of 64 bytes.
 fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
     let order = if is_fortran { "True" } else { "False" };
     let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();

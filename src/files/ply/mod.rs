@@ -337,7 +337,7 @@ impl Ply {
     }
 }
 
-/// Returns the element `vertex`, which holds the Gaussians. Fails if there is none.
+/// Returns the element `vertex` of `header`, which holds the Gaussians. Fails if there is none.
 fn vertex_element<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
     header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
 }

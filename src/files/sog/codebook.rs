@@ -59,8 +59,8 @@ impl Codebook {
         &self.entries
     }
 
-    /// Returns the index of the entry nearest to `value`, the lower one of two equally near ones. The entries must be
-    /// sorted.
+    /// Returns the index of the entry nearest to `value`. If two entries are equally near, returns the lower index. The
+    /// entries must be sorted.
     pub fn nearest(&self, value: f32) -> u8 {
         let after = self.entries.partition_point(|&entry| entry < value).min(self.entries.len() - 1);
         let distance = |at: usize| (f64::from(self.entries[at]) - f64::from(value)).abs();
@@ -74,7 +74,8 @@ impl Codebook {
     }
 }
 
-/// Number, smallest and largest of the values in one of the equal bins of the range of values.
+/// One of the bins of equal width into which the range of the values is divided: the number of values in the bin, the
+/// smallest and the largest of them.
 #[derive(Debug, Clone, Copy)]
 struct Bin {
     count: u64,

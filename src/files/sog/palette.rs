@@ -19,7 +19,7 @@ const SAMPLES_PER_GROUP: usize = 64;
 pub struct Palette {
     /// Number of components of a vector (palette entry).
     pub width: usize,
-    /// Entries one after the other, `width` numbers each.
+    /// Palette entries, one after another, `width` numbers each.
     pub centroids: Vec<f32>,
     /// Index of the palette entry of each Gaussian.
     pub labels: Vec<u32>,

@@ -112,7 +112,7 @@ mod tests {
     use super::*;
     use crate::files::splatv::write::{encode_words, write_splatv};
 
-    /// Returns a row (Gaussian) without defects.
+    /// Returns a row (Gaussian) without defects. `x` is its x coordinate.
     fn sound(x: f32) -> SplatvGaussian {
         SplatvGaussian {
             position: [x, 0.5, 2.0],

@@ -47,8 +47,8 @@ struct Arrays {
 }
 
 impl Arrays {
-    /// Returns the arrays in the order of the file, each with its name and the number of bytes per Gaussian that
-    /// follows from `header`.
+    /// Returns the arrays in the order of the file. Each array comes with its name and its number of bytes per
+    /// Gaussian, which `header` determines.
     fn list(&mut self, header: &Header) -> [(&'static str, usize, &mut Vec<u8>); 6] {
         let rotation = if header.version == 2 { 3 } else { 4 };
         let harmonics = 3 * (sh_coefficients(header.sh_degree) - 1);
