@@ -15,7 +15,8 @@ use splatsieve::model::{Attributes, Gaussians, SequenceInfo, opacity};
 use splatsieve::outputs::container::write_container;
 use splatsieve::source::{BlockReader, FrameSource, Ids};
 
-/// Model that is a row of Gaussians and swings like a pendulum: position = (x, 0, -cos(a)), a = sin(2 pi t).
+/// Model of Gaussians along a line that swings like a pendulum. At time t, the Gaussian at the distance r from the
+/// pivot has the position r·(sin a, 0, -cos a), where a = sin(2 pi t) is the angle.
 struct Pendulum {
     info: SequenceInfo,
 }
@@ -37,7 +38,7 @@ impl FrameSource for Pendulum {
     }
 }
 
-/// Reader of the Gaussians `ids`.
+/// Reader that computes the Gaussians with the indices `ids` at any frame.
 struct Reader<'a> {
     model: &'a Pendulum,
     ids: Vec<usize>,

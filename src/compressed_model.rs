@@ -35,8 +35,8 @@ pub struct Proxies {
     pub raw: Option<StoredParams>,
     /// Indices of the clusters that no proxy represents well enough, increasing. Their leaders stay unmerged.
     pub refused: Vec<usize>,
-    /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units.
-    /// `None` if a proxy follows its members exactly.
+    /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
+    /// and sampled frames, scene units. `None` if every proxy follows its members exactly.
     pub deviation: Option<f64>,
     /// Notes for the user about the proxies.
     pub notes: Vec<String>,
@@ -117,8 +117,8 @@ impl ParamDelta {
 pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
 impl TrajectoryDelta {
-    /// Returns the indices of the two of `knots` keyframes (2 or more) between which frame `frame` of `frames` lies,
-    /// each with its weight in the linear interpolation.
+    /// Returns the two keyframes between which frame `frame` of a sequence of `frames` frames lies. Each is given by
+    /// its index and its weight in the linear interpolation. `knots`: number of keyframes, at least 2.
     pub fn keyframe_weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
         let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
         let first = (along as usize).min(knots - 2);
@@ -136,7 +136,8 @@ impl TrajectoryDelta {
         self.0.first().map_or(Attributes::empty(), ParamDelta::attributes)
     }
 
-    /// Returns the delta interpolated at frame `frame` of `frames`.
+    /// Returns the delta at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
+    /// if there are no keyframes.
     pub fn at_frame(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
             return ParamDelta::default();
@@ -213,8 +214,8 @@ impl CompressedModel {
         CompressedModel { kept, ..self.clone() }
     }
 
-    /// Sets the computed `proxies`. Dissolves every refused cluster: its leader stays unchanged, its other members are
-    /// removed.
+    /// Sets the computed `proxies`. Clusters for which no proxy was good enough ([`Proxies::refused`]) are dissolved:
+    /// the leader stays unchanged, the other members are removed.
     pub fn set_proxies(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
@@ -256,7 +257,8 @@ impl CompressedModel {
         }
     }
 
-    /// Returns the sum of the constant and the trajectory delta at frame `frame` of `frames`.
+    /// Returns the sum of the constant delta and the trajectory delta at frame `frame` of a sequence of `frames`
+    /// frames.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.trajectory_delta.at_frame(frame, frames).plus(self.delta.clone())

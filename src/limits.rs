@@ -7,14 +7,15 @@ use crate::error::{Error, Result};
 /// Maximum amounts that stages keep in memory at a time. They change memory and time of a run, never its result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Maximum number of decoded frames that a reader of consecutive frames keeps in memory, at least 1. A tile of a
-    /// container holds several frames, which are decoded together.
+    /// Maximum number of decoded frames that a reader keeps in memory for later reads, at least 1. Consecutive frames
+    /// of a container are decoded together, because a tile holds several frames.
     pub max_kept_frames: usize,
     /// Maximum number of frames of which the states of all Gaussians are in memory, ready to be rendered; at least 1.
     pub frames_together: usize,
     /// Maximum number of views rendered at the same time; at least 1.
     pub views_together: usize,
-    /// Maximum number of output Gaussians whose values at all frames are in memory until they are written.
+    /// Maximum number of output Gaussians that are written together. Their values at all frames are in memory until
+    /// they are written.
     pub gaussians_together: usize,
     /// Maximum number of pairs of Gaussians whose motion is compared at the same time; at least 1.
     pub pairs_together: usize,
@@ -26,7 +27,7 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// No limits: everything stays in memory, for the fastest run.
+    /// No limits on the amounts in memory, for the fastest run.
     pub const NONE: Limits = Limits {
         max_kept_frames: usize::MAX,
         frames_together: usize::MAX,

@@ -39,8 +39,8 @@ fn described(limit: MemoryLimit) -> (u64, String) {
     (limit.bytes, origin)
 }
 
-/// Adds to `limits` the memory in bytes that a Slurm batch job requested on this node, read from the environment by
-/// `variable`. The node may enforce a lower limit, or none.
+/// Adds to `limits` the memory in bytes, if any, that a Slurm batch job requested on this node, with a description of
+/// its source. `variable` looks up an environment variable. The node may enforce a lower limit, or none.
 fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, String)>) {
     let size = |name: &str| parse_slurm_size(&variable(name)?);
     if let Some(bytes) = size("SLURM_MEM_PER_NODE") {

@@ -7,17 +7,18 @@ use std::sync::Arc;
 
 /// Receiver of the events of runs. Methods are called from any thread; default implementations ignore the event.
 pub trait EventSink: Send + Sync {
-    /// Announces the start of a run of `stages`, in order. Each stage begins with [`EventSink::task_begun`] for a task
-    /// of the stage's name.
+    /// Receives the event that a run begins, with its `stages` in order. Each stage then begins with a task of the
+    /// stage's name ([`EventSink::task_begun`]).
     fn run_begun(&self, stages: &[ExpectedStage]) {
         let _ = stages;
     }
 
-    /// Announces that the run which the last [`EventSink::run_begun`] announced has ended, with a result or an error.
+    /// Receives the event that a run has ended, with a result or an error. It is the run that the last call of
+    /// [`EventSink::run_begun`] announced.
     fn run_ended(&self) {}
 
-    /// Announces a task. Returns the sink that receives the progress of the task and is dropped when the task ends, or
-    /// `None` if progress is not wanted. A task may begin while others run.
+    /// Receives the event that a task begins. Returns the sink that receives the progress of the task and is dropped
+    /// when the task ends, or `None` if progress is not wanted. A task may begin while others run.
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {
         let _ = task;
         None

@@ -67,9 +67,9 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Returns this plan with another maximum number of frames that a reader keeps in memory after it has decoded a
-    /// tile; at least 1. A tile holds several consecutive frames. A small maximum saves memory but makes the reader
-    /// decode tiles repeatedly.
+    /// Returns a copy of this plan with the limit `frames` (at least 1): the maximum number of frames that a reader
+    /// keeps in memory after it has decoded a tile. A tile holds several consecutive frames. A small limit saves memory
+    /// but makes the reader decode tiles repeatedly.
     pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
@@ -162,18 +162,18 @@ pub trait FrameSource: Send + Sync {
     /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
 
-    /// Opens a reader for the Gaussians `ids`, which returns them in this order. Work that does not depend on time is
-    /// done here once.
+    /// Opens a reader that returns the Gaussians `ids` in this order. Work that does not depend on time is done once,
+    /// in this call.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
-    /// Opens a reader for all Gaussians at the frames `_wanted`, or returns `None` if readers of blocks take less time.
-    /// The reader may take more memory per Gaussian than readers of blocks.
+    /// Opens a reader for all Gaussians at the frames `_wanted`. The reader may take more memory per Gaussian than
+    /// readers of blocks. Returns `None` if reading block by block takes less time.
     fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
-    /// Returns the function that computes states from stored parameters. `None` for explicit trajectories, where a
-    /// change of a stored parameter changes the state at every frame by the same amount.
+    /// Returns the function that computes states from stored parameters. `None` if the state at every frame is stored
+    /// (explicit trajectories); a change of a stored parameter then changes every state by the same amount.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
@@ -201,8 +201,8 @@ pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the attributes of the stored parameters that an optimizer can change, because
-    /// [`DeformedGaussians::jacobian`] can differentiate by them.
+    /// Returns the attributes of the stored parameters that an optimizer can change: the attributes whose derivatives
+    /// [`DeformedGaussians::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
     /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. What does not depend on
@@ -238,7 +238,7 @@ pub trait FeatureDecoder: Sync {
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// Source on a disk whose bytes can be fetched before they are used, by a thread that does nothing else.
+/// Fetching of bytes from a disk before a reader needs them. A thread that does nothing else calls [`Prefetch::fetch`].
 pub trait Prefetch: Sync {
     /// Returns the number of consecutive frames that are fetched and decoded together. Such a frame block starts at a
     /// multiple of this number.
@@ -258,8 +258,8 @@ pub trait BlockReader: Send {
     /// Fails if the frame cannot be read.
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Announces by a plan the frames that will be read from now on, and how many of them the reader may keep in
-    /// memory. Readers that keep no frames ignore the plan.
+    /// Announces the frames that will be read from now on. The plan `_wanted` lists them and limits how many of them
+    /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later

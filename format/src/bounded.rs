@@ -9,9 +9,10 @@
 //!
 //! The table shows compression factors (raw bytes / stored bytes) of three trained models, with zstd level 15 and
 //! bounds of .001 for positions, .005 for rotations and .01 for log scales and SH coefficients (`cargo bench --bench
-//! filters` of the program prints the table). "All" stores prediction errors (residuals) of all tracks, "moving" those
-//! of moving tracks only, in the order "by frame" or "by track". The last column also halves the step of static tracks
-//! where the tile becomes smaller:
+//! filters` of the program prints the table). Its columns are variants of the encoding. "All" stores the prediction
+//! errors (residuals) of all tracks, "moving" only those of moving tracks. "By frame" stores the prediction errors of
+//! one frame after the other, "by track" those of one track after the other. The last column is "moving, by track" with
+//! half the step for static tracks in tiles that become smaller that way:
 //!
 //! | column | all, by frame | all, by track | moving, by frame | moving, by track | half step where smaller |
 //! |---|---|---|---|---|---|
@@ -24,16 +25,18 @@ use std::io;
 
 use crate::codec::{TileStats, order_at, predict, shuffle_into, stats, zigzag};
 
-/// Error bounds that a column may have. For all of them the quantization step is a finite number above zero.
+/// Range of the error bounds that a column may have. For each bound in it, the quantization step is a finite number
+/// above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
-/// Length in bytes of the fields before the exceptions of a tile: step, number of exceptions, and how often the step is
-/// halved for static tracks.
+/// Length in bytes of the fields at the start of a stored tile: the quantization step, the number of exceptions (values
+/// stored with their original bits), and how often the step is halved for static tracks. The exceptions follow these
+/// fields.
 const HEAD_BYTES: usize = 16;
 /// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
 /// in another encoding.
 const VALUES_PER_EXCEPTION: usize = 16;
-/// Limit of the magnitude of a multiple of the quantization step: multiples are smaller, so that their second
-/// differences fit 32 bits.
+/// Limit of the absolute value of a multiple of the quantization step. All multiples are below this limit, so that the
+/// differences of their differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
 /// zstd level of the trial that decides whether static tracks use half the step. Half the step makes more tracks
 /// static, but each of them takes a bit more space.
@@ -50,8 +53,8 @@ pub(crate) struct BoundedTile {
 /// Encodes `values`, which are frames of `plane` values each, with an error of at most `max_error`. `level` is the zstd
 /// level.
 ///
-/// Returns `None` if this encoding does not pay: too many values are exceptions, or the result takes 4 bytes per value
-/// or more.
+/// Returns `None` if this encoding does not pay: too many values have to be stored with their original bits, or the
+/// result takes 4 bytes per value or more.
 pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -> io::Result<Option<BoundedTile>> {
     let step = step(values, max_error);
     let whole = Multiples::new(values, plane, max_error, step, 0);
@@ -90,11 +93,12 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`: twice `max_error`, minus the error that rounding
-/// the largest value to f32 may add.
+/// Returns the quantization step for an error of at most `max_error`. The step is 2 (`max_error` − r), where r is the
+/// largest error that rounding a decoded value to f32 may add. It is determined from the largest absolute value in
+/// `values`.
 ///
-/// Values so large that their f32 spacing exceeds half of `max_error` do not count as the largest value. They may be
-/// stored unquantized, as exceptions.
+/// Values so large that neighboring f32 numbers are more than half of `max_error` apart do not count as the largest. If
+/// the error of such a value exceeds `max_error`, the value is stored with its original bits, as an exception.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -107,8 +111,8 @@ struct Multiples {
     plane: usize,
     step: f64,
     halvings: u32,
-    /// Multiples, in the order of the tile's values. For a static track (all values stored as one multiple), the step
-    /// is that of [`static_step`].
+    /// Multiples of the quantization step, in the order of the tile's values. For a static track (all values stored as
+    /// one multiple), the step is the one that [`static_step`] returns; for other tracks it is `step`.
     values: Vec<u32>,
     /// Whether each track (one component of one Gaussian over all frames) is moving. A track that is not moving is
     /// static: all of its values are stored as one multiple.
@@ -118,9 +122,10 @@ struct Multiples {
 }
 
 impl Multiples {
-    /// Quantizes `values`: frames of `plane` values each, with an error of at most `max_error`. A track (one component
-    /// of one Gaussian over all frames) is static if one multiple of `step`, halved `halvings` times (0 or 1), is
-    /// within the error bound of all its values.
+    /// Quantizes `values`, which are frames of `plane` values each, with an error of at most `max_error`. A track (one
+    /// component of one Gaussian over all frames) is static if one multiple of its step is within the error bound of
+    /// all its values. The step of static tracks is `step`, halved `halvings` times (0 or 1); the step of all other
+    /// tracks is `step`.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);
         // Returns the multiple of `step` nearest to `x`, if it is within the error bound of all of `values`.
@@ -162,14 +167,15 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Returns the multiples and exceptions of the first frame only.
+    /// Drops the multiples and exceptions (values stored with their original bits) of all frames but the first. Returns
+    /// the rest.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
         self
     }
 
-    /// Returns the bits of all values as a decoder of the tile gets them.
+    /// Returns the f32 bits of all values as a decoder reads them from the tile.
     fn decoded(&self) -> Vec<u32> {
         let steps = [static_step(self.step, self.halvings), self.step];
         let tracks = self.moves.iter().cycle();
@@ -180,28 +186,32 @@ impl Multiples {
         values
     }
 
-    /// Returns the prediction error of track `track` at frame `frame`, zigzag-coded; `frame` must not be the first.
+    /// Returns the prediction error of track `track` (one component of one Gaussian) at frame `frame`, zigzag-coded.
+    /// `order` is the number of earlier frames that predict a value. `frame` must not be the first.
     fn residual(&self, order: u8, track: usize, frame: usize) -> u32 {
         let order = order_at(order, frame);
         let at = |back: usize| self.values[(frame - back) * self.plane + track];
         zigzag(at(0).wrapping_sub(predict(order, at(1), at(order.into()))))
     }
 
-    /// Returns the prediction errors of all moving tracks at all frames but the first, track by track.
+    /// Returns the prediction errors of all moving tracks (components of Gaussians that change in the tile) at all
+    /// frames but the first, track by track. `order` is the number of earlier frames that predict a value.
     fn residuals(&self, order: u8) -> impl Iterator<Item = u32> + '_ {
         let moving = (0..self.plane).filter(|&track| self.moves[track]);
         let frames = self.values.len() / self.plane;
         moving.flat_map(move |track| (1..frames).map(move |frame| self.residual(order, track, frame)))
     }
 
-    /// Returns the order of prediction whose prediction errors take fewer bits: 1 or 2, the number of earlier frames
-    /// that predict a value.
+    /// Returns the order of prediction (number of earlier frames that predict a value), 1 or 2, with which the
+    /// prediction errors take fewer bits.
     fn order(&self) -> u8 {
         let cost = |order| self.residuals(order).map(|residual| u64::from(32 - residual.leading_zeros())).sum::<u64>();
         if cost(2) < cost(1) { 2 } else { 1 }
     }
 
-    /// Returns the bytes that zstd compresses: the mask of moving tracks, the first frame, and the prediction errors.
+    /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving, the
+    /// multiples of the first frame, and the prediction errors. `order` is the number of earlier frames that predict a
+    /// value.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {
@@ -227,13 +237,15 @@ pub(crate) struct BoundedTracks {
     exceptions: Vec<(u32, u32)>,
     plane: usize,
     frames: usize,
-    /// Number of moving tracks, that is, tracks that are not stored as a single multiple.
+    /// Number of moving tracks: tracks whose values are not all stored as a single multiple.
     moving: usize,
 }
 
 impl BoundedTracks {
-    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame. An error says
-    /// what was found instead.
+    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame.
+    ///
+    /// # Errors
+    /// Fails if the tile is malformed; the error says what was found instead of a valid tile.
     pub(crate) fn read_head<'a>(
         &mut self,
         stored: &'a [u8],
@@ -271,8 +283,8 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks by the mask at the start of the decompressed `bytes`, and checks the length of `bytes`.
-    /// An error says what was found.
+    /// Counts the moving tracks in the mask (one bit per track) at the start of `bytes`, the decompressed bytes of the
+    /// tile, and checks the length of `bytes`. An error says what was found instead of a valid tile.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -285,13 +297,15 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns the multiples of the quantization step of all tracks in the first frame, zigzag-coded.
+    /// Returns for each track its multiple of the quantization step in the first frame, zigzag-coded. `bytes` are the
+    /// decompressed bytes of the tile.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
     }
 
-    /// Returns for frame `frame`, which must not be the first, each moving track with its prediction error.
+    /// Returns for each moving track its index and its prediction error at frame `frame`, which must not be the first.
+    /// `bytes` are the decompressed bytes of the tile.
     pub(crate) fn residuals<'a>(&self, bytes: &'a [u8], frame: usize) -> impl Iterator<Item = (usize, u32)> + 'a {
         let from = self.mask_bytes() + 4 * self.plane;
         let (after_first, values) = (self.frames - 1, self.moving * (self.frames - 1));
@@ -299,9 +313,9 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile.
-    /// `multiples` holds the quantized value of each track in this frame, in quantization steps; `bytes` are the
-    /// decompressed bytes of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per track (component of a Gaussian). `multiples`
+    /// holds the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes
+    /// of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);
@@ -319,13 +333,13 @@ impl BoundedTracks {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask that tells which tracks move (one bit per track).
+    /// Returns the length in bytes of the mask that tells which tracks are moving (one bit per track).
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }
 }
 
-/// Returns whether the track `track` moves, according to the mask at the start of `bytes`.
+/// Returns whether the track `track` is moving, according to the mask (one bit per track) at the start of `bytes`.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }

@@ -76,7 +76,7 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Statistics of the stored values of a tile; of a constant tile (all frames equal), those of its one stored frame.
+/// Statistics of the stored values of a tile. A constant tile (all frames equal) stores one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileStats {
     /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
@@ -191,17 +191,17 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
 
 /// Decoder of one tile that is not raw (lossless or lossy encoding), frame by frame.
 ///
-/// Memory: a lossless tile takes its decompressed bytes, as many as its values, and two frames. A lossy tile takes in
-/// addition 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th
-/// value is one). A raw tile takes nothing.
+/// Memory: for a lossless tile, 4 bytes per value of the tile, and two decoded frames. For a lossy tile, in addition
+/// 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th value is
+/// one). A decoder that has loaded no tile takes no memory.
 #[derive(Debug, Default)]
 pub(crate) struct TileDecoder {
     order: u8,
     /// Decompressed bytes of the tile: in the lossless encoding the lowest bytes of all values, then the next bytes,
     /// and so on; in the lossy encoding as SPEC.md describes under "Bounded".
     shuffled: Vec<u8>,
-    /// The frame before `next`, and the frame before that: as [`ordered`] integers in the lossless encoding, as
-    /// multiples of the step in the lossy one.
+    /// Values of the last decoded frame (the frame before `next`), and of the frame before that: as [`ordered`]
+    /// integers in the lossless encoding, as multiples of the step in the lossy one.
     recent: [Vec<u32>; 2],
     next: usize,
     bounded: bool,
@@ -255,9 +255,9 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes frame `frame` into `out`, which has one element for each value of a frame. For a later frame than the
-    /// last one decoded, the frames in between are decoded too; for any other frame, decoding starts again at the
-    /// first.
+    /// Decodes frame `frame` into `out`, which has one element for each value of a frame. A frame that is predicted
+    /// from earlier frames needs all of them: decoding goes on after the last decoded frame if `frame` is a later one,
+    /// and otherwise starts again at the first. With prediction order 0 only `frame` itself is decoded.
     pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
         if self.order == 0 || frame < self.next {
             self.next = if self.order == 0 { frame } else { 0 };
@@ -379,16 +379,16 @@ pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     }
 }
 
-/// Returns how many earlier frames predict frame `frame`: `order`, or fewer for the first frames.
+/// Returns the number of earlier frames that predict frame `frame`: `order`, or fewer for the first frames.
 pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
-/// Returns the order of prediction (number of earlier frames that predict a value) whose differences take fewer bits: 1
-/// or 2, or 0 if there is only one frame.
+/// Returns the order of prediction (number of earlier frames that predict a value) with which the differences from the
+/// prediction take fewer bits: 1 or 2. Returns 1 for two frames, and 0 for a single frame.
 ///
-/// Compares every fourth value only: comparing all would take as long as the filter itself, and where the results are
-/// close, either order is good.
+/// Compares only every fourth value: comparing all would take as long as the filter itself. If the results are close,
+/// either order is good.
 fn best_order(bits: &[u32], plane: usize) -> u8 {
     let frames = bits.len() / plane;
     if frames < 3 {
@@ -409,8 +409,9 @@ fn best_order(bits: &[u32], plane: usize) -> u8 {
     if cost(1) < cost(2) { 1 } else { 2 }
 }
 
-/// Applies the lossless filter to values given as bits, in frames of `plane` values. Returns the differences from the
-/// prediction as bytes in shuffled order: the lowest bytes of all first, their highest bytes last.
+/// Applies the lossless filter to values given as bits, in frames of `plane` values. `order` is the number of earlier
+/// frames that predict a value. Returns the differences from the prediction as bytes in shuffled order: the lowest
+/// bytes of all differences first, their highest bytes last.
 fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     let mut out = vec![0; 4 * bits.len()];
     let (low, high) = out.split_at_mut(2 * bits.len());
@@ -438,8 +439,8 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     out
 }
 
-/// Computes the [`TileStats`] of values given as bits. Minimum and maximum are those of [`ordered`] integers, so the
-/// compiler can vectorize them and the order of the values does not matter.
+/// Computes the [`TileStats`] of values given as bits. Minimum and maximum are found by comparing [`ordered`] integers
+/// instead of floats, so the compiler can vectorize the loop and the order of the values does not matter.
 pub(crate) fn stats(bits: &[u32]) -> TileStats {
     const EXPONENT: u32 = 0x7f80_0000;
     let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);

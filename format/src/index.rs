@@ -137,7 +137,8 @@ impl Index {
     }
 }
 
-/// Checks that `needed` bytes of memory, for the index at `offset` in the file, are at most `memory`.
+/// Checks that opening, checking or recovering a container needs at most `memory` bytes of memory. `needed` is the
+/// number of bytes that it needs, `offset` the place in the file that the error names.
 pub(crate) fn check_memory(offset: u64, needed: u64, memory: u64) -> std::result::Result<(), Fault> {
     if needed <= memory {
         return Ok(());

@@ -10,8 +10,8 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::bounded::BOUNDS;
 use crate::error::{Error, Fault, Result, quoted};
 
-/// First bytes of every container. A byte above 127, a line ending and a control byte are among them, so that a
-/// transfer that changes text files damages them visibly.
+/// First bytes of every container. They contain a byte above 127, a line ending and a control byte. A transfer that
+/// treats the file as text would change some of these bytes, so the damage is noticed.
 pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
 /// Format versions that this crate writes: 1 if no column has an error bound, 2 if one has.
 pub(crate) const VERSIONS: [u32; 2] = [1, 2];
@@ -327,7 +327,8 @@ fn is_column_name(name: &str) -> bool {
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_')
 }
 
-/// Reads the little-endian fields of a header one after the other. The first byte of the slice is byte 0 of the file.
+/// Reader of the little-endian fields of a header, one after the other. The first byte of the slice is byte 0 of the
+/// file.
 struct Fields<'a> {
     bytes: &'a [u8],
     at: usize,

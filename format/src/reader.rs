@@ -19,7 +19,8 @@ mod tile_frames;
 
 pub use tile_frames::{TileFrames, TouchedPages};
 
-/// Maximum distance, in bytes of the file, of two tiles whose pages are prefetched or released in one call.
+/// Maximum gap, in bytes of the file, between two tiles whose pages are prefetched or released in one call of the
+/// system.
 const MERGE_GAP_BYTES: u64 = 1 << 12;
 
 /// Open container, from which tiles are read.
@@ -136,7 +137,7 @@ impl<'a> Tile<'a> {
 impl Reader {
     /// Opens a container and checks its header, footer and index (table of tiles): every length and offset is within
     /// its limits, and no two tiles overlap. The tiles themselves are checked when they are read, or by
-    /// [`Reader::verify`].
+    /// [`Reader::verify`]. Fails if a check fails or the file cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
         Self::open_within(path, u64::MAX)
     }
@@ -248,8 +249,8 @@ impl Reader {
         self.times.len().div_ceil(self.layout.frame_block as usize) as u32
     }
 
-    /// Returns whether the values of a column differ between frames. Decided by the index alone: they do not differ if
-    /// all tiles of the column are constant and share their stored bytes.
+    /// Returns whether the values of a column differ between frames. This follows from the index alone: they do not
+    /// differ if all tiles of the column are constant and share their stored bytes.
     ///
     /// # Panics
     /// Panics if there is no such column.
@@ -362,8 +363,8 @@ impl Reader {
         self.read_bytes.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Checks the checksum of a raw tile in the memory map, unless this was done before. Returns whether it was checked
-    /// now.
+    /// Checks the checksum of a raw tile (plain f32) in the memory map, unless an earlier call has checked it. Returns
+    /// whether this call checked it.
     fn verify_in_place(&self, index: usize, tile: &TileRecord, bytes: &[u8]) -> Result<bool> {
         // Relaxed ordering suffices: the flag only saves repeated work.
         if self.verified[index].load(Ordering::Relaxed) {

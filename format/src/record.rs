@@ -1,5 +1,6 @@
-//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes with a checksum of its
-//! own. A payload (the stored bytes of the record) with another checksum may follow.
+//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes, which contains a
+//! checksum of itself. The header may be followed by a payload (the stored bytes of the record), which has another
+//! checksum.
 
 use std::fmt;
 
@@ -29,8 +30,8 @@ pub(crate) struct TileRecord {
     pub(crate) frames: u32,
     pub(crate) encoding: Encoding,
     pub(crate) constant: bool,
-    /// Offset in the file of the tile's stored bytes. A constant tile (all frames equal) may share those of an earlier
-    /// one.
+    /// Offset in the file of the tile's stored bytes. A constant tile (all frames equal) may use the stored bytes of an
+    /// earlier tile.
     pub(crate) offset: u64,
     pub(crate) stored_bytes: u32,
     pub(crate) checksum: u64,
@@ -73,7 +74,8 @@ impl fmt::Display for Record {
 }
 
 impl FooterRecord {
-    /// Returns the length in bytes of the footer's payload (8 per frame and 64 per tile), or `None` if it overflows.
+    /// Returns the length in bytes of the footer's payload (8 per frame and 64 per tile), or `None` if this number
+    /// overflows.
     pub(crate) fn payload_bytes(&self) -> Option<u64> {
         self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD_BYTES)?)
     }
@@ -272,12 +274,12 @@ impl Digest {
         Digest(hash)
     }
 
-    /// Adds the next tile to the hash; tiles come in the order of the index.
+    /// Adds the record of the next tile to the hash. Tiles must be added in the order of the index.
     pub(crate) fn tile(&mut self, tile: &TileRecord) {
         self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
     }
 
-    /// Returns the hash of all that was added so far.
+    /// Returns the hash of the header, the time stamps and the tiles added so far.
     pub(crate) fn value(&self) -> u64 {
         self.0.digest()
     }

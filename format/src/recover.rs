@@ -81,7 +81,8 @@ pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64)
     Ok(report)
 }
 
-/// Returns a tile that is stored in a file as an encoded tile for the writer, without encoding it again.
+/// Creates an encoded tile for the writer from the record `tile` of a damaged file and the tile's stored bytes, without
+/// encoding its values again.
 fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     let column = &layout.columns[tile.id.column as usize];
     EncodedTile {
@@ -101,7 +102,8 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
 struct FoundRecords {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
-    /// Constant tiles (all frames equal) with stored bytes of their own, by the offset of these bytes.
+    /// Constant tiles (all frames equal) that do not share the stored bytes of an earlier tile, by the offset of these
+    /// bytes.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
     /// Number of bytes of all time stamps found (8 per frame).
@@ -110,7 +112,7 @@ struct FoundRecords {
 
 /// Finds the intact records of `file` from offset `start` on, one after the other. After a damaged record, it tries
 /// every multiple of 64 bytes. A record contains its own offset, so bytes inside a payload are not mistaken for a
-/// record.
+/// record. Fails if a read fails, or if the records found need more than `memory` bytes of memory.
 fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<FoundRecords> {
     let mut found = FoundRecords {
         times: HashMap::new(),

@@ -23,10 +23,12 @@ pub struct VerifyReport {
 }
 
 impl Reader {
-    /// Reads the whole file and checks all that opening did not: every record equals its entry in the index, the
-    /// stored bytes of every tile have the recorded checksum and decode to values with the recorded statistics, and all
-    /// bytes in between are zero. In a file that passes, no byte could be changed unnoticed. Memory: one
-    /// [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
+    /// Reads the whole file and checks all bytes that opening it did not check: every record equals its entry in the
+    /// index, the stored bytes of every tile have the recorded checksum and decode to values with the recorded
+    /// statistics, and all bytes in between are zero. Fails at the first difference. A change of any byte of the file
+    /// is found by opening or by this check.
+    ///
+    /// Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant tile (all frames equal).
     pub fn verify(&self) -> Result<VerifyReport> {
         self.verify_within(u64::MAX)
     }

@@ -14,8 +14,8 @@ use crate::layout::{ColumnSpec, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD_BYTES, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
 use crate::text::ShowPath;
 
-/// Writes a container: the time stamps of a frame block, then its tiles, and so on for each frame block, then
-/// [`Writer::finish`].
+/// Writer of a container. For each frame block, append its time stamps ([`Writer::append_times`]) and write its tiles
+/// ([`Writer::write_tile`]); then call [`Writer::finish`].
 ///
 /// Tiles may be written in any order once the time stamps of their frame block have been appended. If all tiles of a
 /// frame block are written before the next one begins, [`crate::recover`] saves the most after a crash. The bytes of
@@ -338,7 +338,7 @@ impl Drop for Writer {
 }
 
 /// Checks that `times` are finite, strictly increasing and greater than `before`. The error holds the index of the
-/// first time that is not, and a description of it.
+/// first time that violates this, and a description of that time.
 pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
     let mut last = before;
     for (frame, &time) in times.iter().enumerate() {

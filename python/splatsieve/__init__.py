@@ -40,7 +40,7 @@ __all__ = [
 
 
 def read_gseq(path: str) -> Gseq:
-    """Opens a container (`.gseq`). Its tiles are read on access; checksums are not verified.
+    """Opens the container (`.gseq`) at `path`. Values are read when they are needed; checksums are not verified.
 
     Raises ValueError if the file is not a complete container.
     """
@@ -63,11 +63,11 @@ def stream(
 
     `count` is the number of Gaussians, `sh_degree` the degree of their spherical harmonics. If `count` is None, frames
     may have any number of Gaussians, every frame has all columns, and the program links the Gaussians of consecutive
-    frames. `constant` gives, by name, the columns that hold for every frame; the other columns come with every frame:
-    position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs; opacity_logit [N] or [N, 1]; sh [N, (d+1)^2,
-    3]. At the end of the block the program finishes its work, and `summary` holds the summary of `compress`. If the
-    block raises, the program learns that the stream is incomplete and writes nothing. `command` may be "convert". Options are
-    those of `compress`.
+    frames. `constant` gives, by name, the columns (attributes) that are the same in all frames; the other columns come
+    with every frame: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs; opacity_logit [N] or
+    [N, 1]; sh [N, (d+1)^2, 3]. At the end of the `with` block the program finishes its work, and `summary` holds the
+    summary of `compress`. If the block raises an exception, the program learns that the stream is incomplete and writes
+    nothing. `command` is "compress" or "convert". Options are those of `splatsieve compress --help`.
 
     Raises Error with the program's message, also from `frame` after the program has ended.
     """

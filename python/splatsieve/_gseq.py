@@ -47,7 +47,7 @@ class Gseq:
         self.kept: dict[str, tuple[int, list[Array]]] = {}
 
     def column(self, name: str, frame: int) -> Array:
-        """Returns a column at a frame, shape [N, width]."""
+        """Returns the values of the column `name` at frame number `frame`, shape [N, width]."""
         block = frame // self.frame_block
         if self.kept.get(name, (None,))[0] != block:
             self.kept[name] = (block, [self.tile(name, i, block) for i in range(self.blocks)])
@@ -55,7 +55,10 @@ class Gseq:
         return np.concatenate(parts, 1).T if parts else np.empty((0, self.widths[name]), "<f4")
 
     def tile(self, name: str, gaussian_block: int, frame_block: int) -> Array:
-        """Returns the values of a tile, shape [stored frames, width, Gaussians]; a constant tile stores one frame."""
+        """Returns the values of the column `name` for a block of Gaussians and a block of frames (a tile).
+
+        The shape is [stored frames, width, Gaussians]. A constant tile (all frames equal) stores one frame.
+        """
         place = (frame_block * self.blocks + gaussian_block) * len(self.widths) + list(self.widths).index(name)
         record = self.index + RECORD * place
         encoding, order, constant = struct.unpack_from("<BBB", self.bytes, record + 16)
@@ -74,7 +77,10 @@ class Gseq:
 
 
 def unpredict(residuals: Array, order: int) -> Array:
-    """Converts filter residuals back to floats; all arithmetic is modulo 2^32."""
+    """Converts the prediction residuals of a lossless tile, shape [frames, width, Gaussians], back to floats.
+
+    `order` is the number of earlier frames that predict a value. All arithmetic is modulo 2^32.
+    """
     ranks = np.empty_like(residuals)
     for t, residual in enumerate(residuals):
         k = min(order, t)
@@ -88,7 +94,11 @@ def unpredict(residuals: Array, order: int) -> Array:
 
 
 def within_bound(stored: bytes, shape: tuple[int, int, int], order: int) -> Array:
-    """Decodes a bounded tile: multiples of a step, with residuals over time for the tracks that move."""
+    """Returns the values, of shape `shape`, of a lossy tile (with an error bound) from its bytes `stored`.
+
+    They are stored as multiples of a step, with prediction residuals over time for components of Gaussians that move.
+    `order` is the number of earlier frames that predict a value.
+    """
     step, exceptions, halvings = struct.unpack_from("<dII", stored)
     frames, tracks = shape[0], shape[1] * shape[2]
     most = -(-tracks // 8) + 4 * frames * tracks
@@ -112,7 +122,7 @@ def within_bound(stored: bytes, shape: tuple[int, int, int], order: int) -> Arra
 
 
 def unshuffle(planes: Array) -> Array:
-    """Returns the numbers whose bytes are stored grouped by weight, lowest first."""
+    """Returns 32-bit numbers from bytes in shuffled order: the lowest bytes of all numbers first, the highest last."""
     return np.ascontiguousarray(planes.reshape(4, -1).T).view("<u4").reshape(-1)
 
 

@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Union
 
-# Value of an option. None leaves it out, a list or tuple is joined by commas, one of tuples repeats the option.
+# Value of an option. None omits the option. A list is joined by commas. A list of lists repeats the option for each
+# inner list. Tuples count as lists.
 Option = Union[None, bool, int, float, str, "os.PathLike[str]", Sequence[Any], Mapping[str, Any]]
 # Function that is called with every progress line of the program.
 Log = Callable[[str], object]
@@ -50,8 +51,8 @@ def program() -> str:
 
 
 def flags(options: Mapping[str, Option]) -> list[str]:
-    """Returns options in command-line form: `dry_run=True` is `--dry-run`, `keep_box=(0, 1)` is `--keep-box=0,1`,
-    `set={"mu": 2}` is `--set=mu=2`.
+    """Converts options to command-line arguments: `dry_run=True` to `--dry-run`, `keep_box=(0, 1)` to
+    `--keep-box=0,1`, `set={"mu": 2}` to `--set=mu=2`.
     """
     words = []
     for key, value in options.items():
@@ -132,7 +133,11 @@ class RunningProgram:
 
 
 def message(said: str) -> str:
-    """Returns the program's own message (the last one, after its name), or the argument parser's after `error:`."""
+    """Returns the error message in `said`, the standard error of the program.
+
+    This is the text after the last line start `splatsieve: `, else after the last `error: ` of the argument parser,
+    else all of `said`.
+    """
     for name in ("splatsieve: ", "error: "):
         at = said.rfind("\n" + name)
         if at >= 0 or said.startswith(name):
@@ -141,18 +146,18 @@ def message(said: str) -> str:
 
 
 def run(verb: str, *arguments: str | os.PathLike[str], log: Log | None = None, **options: Option) -> str:
-    """Runs a command of the program with any of its options. Returns its standard output.
+    """Runs the command `verb` of the program with any of its options. Returns its standard output.
 
         splatsieve.run("convert", "frames/", "scene.gseq", max_error={"position": 1e-3})
 
-    `log` is called with every progress line. Raises Error.
+    `log` is called with every progress line. Raises Error if the program fails.
     """
     words = [verb, *flags(options), "--", *(os.fspath(path) for path in arguments)]
     return RunningProgram(words, log).finish()
 
 
 def parsed(printed: str) -> dict[str, Any]:
-    """Returns the JSON object in `printed`. Raises Error if it is something else."""
+    """Returns the JSON object in the text `printed`. Raises Error if the text is not JSON."""
     try:
         found = json.loads(printed)
     except ValueError:
@@ -164,12 +169,13 @@ def parsed(printed: str) -> dict[str, Any]:
 def compress(
     input: str | os.PathLike[str], output: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Writes a smaller model of `input` to `output`. Returns its summary (format/SUMMARY.md),
-    which is also written beside the output as JSON, with the list of its files.
+    """Writes a smaller model of `input` to `output`. Returns the summary of the run (format/SUMMARY.md).
+
+    The summary is also written beside the output as JSON, with the list of the output files.
 
         splatsieve.compress("model", "small", cameras="data", ratio=0.3, preset="default")
 
-    Options are those of `splatsieve compress --help`. Raises Error.
+    Options are those of `splatsieve compress --help`. Raises Error if the program fails.
     """
     return parsed(run("compress", input, output=output, json=True, log=log, **options))
 
@@ -177,12 +183,15 @@ def compress(
 def evaluate(
     original: str | os.PathLike[str], compressed: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Compares the renders of two models. Returns the JSON of `splatsieve evaluate --json`. Raises Error."""
+    """Compares the renders of two models. Returns the JSON of `splatsieve evaluate --json`.
+
+    Raises Error if the program fails.
+    """
     return parsed(run("evaluate", original, compressed, json=True, log=log, **options))
 
 
 def info(
     input: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Returns the description of an input, the JSON of `splatsieve info --json`. Raises Error."""
+    """Returns the description of an input, the JSON of `splatsieve info --json`. Raises Error if the program fails."""
     return parsed(run("info", input, json=True, log=log, **options))

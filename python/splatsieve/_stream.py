@@ -1,9 +1,8 @@
 """Writes frame streams (format/STREAM.md) to a file or to the program.
 
 Columns are arrays [N, ...] in stored encoding: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs;
-opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Columns that hold for every frame are given once, the others with every
-frame. Frames without Gaussian ids, which may have any number of Gaussians, have no `count` and all columns. Needs
-numpy.
+opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Columns that are the same in all frames are given once, the others with
+every frame. If frames may have any number of Gaussians, `count` is None and every frame has all columns. Needs numpy.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ COLUMNS = ["position", "rotation", "log_scale", "opacity_logit", "sh"]
 
 
 class StreamWriter:
-    """Writes a stream to `out`, a binary file.
+    """Writer of a frame stream to `out`, a binary file.
 
     with StreamWriter(sys.stdout.buffer, count, sh_degree, {"sh": features, ...}) as stream:
         for time, position, rotation in frames:
@@ -46,7 +45,7 @@ class StreamWriter:
         out.writelines(planes(constant[name]) for name in COLUMNS if name in constant)
 
     def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
-        """Writes the varying columns at `time`, which must be later than the time of the previous frame."""
+        """Writes one frame: the varying columns at `time`, which must be later than the time of the previous frame."""
         payload = b"".join(planes(columns[name]) for name in self.varying)
         self.out.write(struct.pack("<4sIdQ", b"FRAM", self.frames, time, len(payload)) + payload)
         self.frames += 1
@@ -67,14 +66,14 @@ class StreamWriter:
 
 
 def planes(column: ArrayLike) -> bytes:
-    """Returns the column as planes, one per component."""
+    """Returns the values of a column as bytes of f32, component by component."""
     return np.ascontiguousarray(np.moveaxis(np.asarray(column), 0, -1), "<f4").tobytes()
 
 
 class Stream:
     """Result of `splatsieve.stream`: the running program with a frame stream as its input."""
 
-    # Summary of `compress`; None before the block has ended, and for other commands.
+    # Summary of `compress`; None before the `with` block has ended, and for other commands.
     summary: dict[str, Any] | None = None
 
     def __init__(
@@ -105,7 +104,7 @@ class Stream:
         return self
 
     def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
-        """Sends the varying columns at `time`, which must be later than the time of the previous frame."""
+        """Sends one frame: the varying columns at `time`, which must be later than the time of the previous frame."""
         try:
             self.writer.frame(time, columns)
         except BrokenPipeError:

@@ -26,7 +26,8 @@ pub(super) struct CacheDir {
 }
 
 impl CacheDir {
-    /// Opens the work folder `folder`; creates it if it does not exist.
+    /// Opens the work folder `folder`; creates it if it does not exist. `about` describes the input for people; it is
+    /// stored in every new entry. Fails if the path is not a folder or cannot be created.
     pub(super) fn open_or_create(folder: &Path, about: String) -> Result<CacheDir> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
@@ -40,7 +41,8 @@ impl CacheDir {
         }
     }
 
-    /// Makes all keys used from now on depend on `context` as well.
+    /// Makes all cache keys that are created from now on depend on `context`, in addition to the values they already
+    /// depend on.
     pub(super) fn depend_on(&mut self, context: CacheKey) {
         self.context = self.context.extended_by(&context);
     }
@@ -64,7 +66,8 @@ impl CacheDir {
         Ok(found)
     }
 
-    /// Returns descriptions of the inputs to which stored shards of `stage` with a key other than `key` belong.
+    /// Finds the stored shards of `stage` whose key is not `key`. Returns the descriptions of the inputs to which they
+    /// belong.
     pub(super) fn foreign_inputs(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
         let is_foreign = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
@@ -129,7 +132,8 @@ impl CacheDir {
         Ok(())
     }
 
-    /// Begins a cache entry `name` and returns the writer of its content.
+    /// Begins a cache entry `name` and returns the writer of its content. Fails if the work folder no longer exists or
+    /// cannot be written.
     pub(super) fn begin_entry(&self, name: &EntryName) -> Result<SpillWriter> {
         self.check_exists()?;
         let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();

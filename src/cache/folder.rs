@@ -63,7 +63,7 @@ pub fn list_results(folder: &Path) -> Result<Vec<StoredResult>> {
     Ok(found)
 }
 
-/// Formats the listing of a work folder for display.
+/// Formats `listed`, the stored results of a work folder, for display.
 pub fn format_list(listed: &[StoredResult]) -> String {
     let mut out = String::new();
     for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
@@ -88,7 +88,7 @@ pub fn format_list(listed: &[StoredResult]) -> String {
 }
 
 /// Removes all cache entries from the work folder `folder`, and the folder itself if it is empty then. Returns the
-/// number of removed files and of their bytes.
+/// number of removed files, and the number of their bytes.
 ///
 /// # Errors
 /// Fails if the folder cannot be read or a file cannot be removed.

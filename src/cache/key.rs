@@ -13,7 +13,7 @@ impl CacheKey {
     /// Key of every result in a run without a work folder, in which no results are stored or looked up.
     pub const NONE: CacheKey = CacheKey(None);
 
-    /// Returns the digest of the bits of `value`.
+    /// Creates the key that is the digest of the bits of `value`.
     pub fn new(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
         // Every hashed value can be serialized.

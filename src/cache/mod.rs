@@ -35,13 +35,14 @@ pub use folder::{StoredResult, format_list, list_results, remove_entries};
 pub use key::CacheKey;
 pub use spill::{Spill, SpillWriter};
 
-/// Work folder that the user asks for, and the shard (part of a divided stage) to compute.
+/// Work folder that the user asks for, and the shard (part of a divided stage) that the run is to compute, if it is
+/// limited to one.
 #[derive(Debug, Clone)]
 pub struct CacheRequest {
     /// Path of the work folder.
     pub folder: PathBuf,
-    /// Shard to compute of the next stage that can be divided; the run ends after it. `None`: the run computes
-    /// everything.
+    /// Shard (part of a divided stage) to which the run is limited. The run computes this shard of the next stage that
+    /// can be divided, then ends. `None`: the run computes everything.
     pub part: Option<Shard>,
 }
 
@@ -71,7 +72,8 @@ impl Cache {
         Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
-    /// Makes all keys used from now on depend on `context` as well.
+    /// Makes all cache keys that are created from now on depend on `context`, in addition to the values they already
+    /// depend on.
     pub fn depend_on(&mut self, context: CacheKey) {
         if let Some(dir) = &mut self.dir {
             dir.depend_on(context);
@@ -83,8 +85,8 @@ impl Cache {
         self.dir.is_some()
     }
 
-    /// Makes all keys used from now on depend on the ids of the Gaussians that are excluded from the input, if there
-    /// are any.
+    /// Makes all cache keys that are created from now on depend on the ids of the Gaussians that are excluded from the
+    /// input, if there are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
@@ -110,7 +112,7 @@ impl Cache {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
 
-    /// Returns the stored result of `stage` for `key`, if there is one.
+    /// Returns the stored result of `stage` for `key`; `None` if there is none.
     ///
     /// # Errors
     /// Fails if the folder cannot be read. A damaged entry counts as missing and causes a note.
@@ -126,8 +128,9 @@ impl Cache {
         self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
-    /// Returns the stored result of `stage` for `key`, or computes and stores it. A run that computes only one shard
-    /// also computes this result, unless `compute` ends the run with [`Cache::end_shard_before`].
+    /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it. A
+    /// run that is limited to one shard of a divided stage does the same, because `stage` is not divided. To end such a
+    /// run instead, `compute` calls [`Cache::end_shard_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -145,11 +148,11 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends a run that computes only one shard before `stage`, which cannot be divided into shards. Otherwise does
-    /// nothing.
+    /// Ends the run by an error if it is limited to one shard of a divided stage. To be called before `stage`, which
+    /// cannot be divided. In all other runs does nothing.
     ///
     /// # Errors
-    /// Fails with [`Error::ShardDone`] if the run computes only one shard.
+    /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
     pub fn end_shard_before(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
@@ -159,12 +162,12 @@ impl Cache {
         }
     }
 
-    /// Returns the result of `stage`, which is computed in shards (ranges of its `units` units of work). Other runs may
-    /// have computed some of the shards. `compute` returns the result of a range; `join` combines the results of all
-    /// ranges in order. The combined result must not depend on how the units are divided.
+    /// Returns the result of `stage` for `key`, which is computed in shards (ranges of its `units` units of work).
+    /// Other runs may have computed some of the shards. `compute` returns the result of a range; `join` combines the
+    /// results of all ranges in order. The combined result must not depend on how the units are divided.
     ///
     /// # Errors
-    /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
+    /// Fails if `compute` or `join` fails or the folder cannot be used. A run that is limited to one shard ends with
     /// [`Error::ShardDone`] once this shard is stored.
     pub fn compute_in_shards<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
@@ -192,9 +195,10 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the
-    /// result of a range of units. Without a work folder the results go to a scratch file in the folder `scratch`.
-    /// Returns the units of every shard with the file content that holds their result.
+    /// Returns the result of `stage` for `key`, which is computed in shards like [`Cache::compute_in_shards`] but stays
+    /// on disk. `write` writes the result of a range of units of work. Without a work folder, the results go to a
+    /// scratch file in the folder `scratch`. For each shard, returns the range of its units, and the file content that
+    /// holds their result.
     ///
     /// # Errors
     /// Fails where [`Cache::compute_in_shards`] fails.
@@ -227,8 +231,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. In a run that computes only shard 1 of 1, fails with
-    /// [`Error::ShardDone`] instead.
+    /// Returns `whole`, the full result of `stage`. If the run is limited to shard 1 of 1, which is the whole stage,
+    /// fails with [`Error::ShardDone`] instead.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -238,12 +242,17 @@ impl Cache {
         }
     }
 
-    /// Decides how the caller obtains the result of `stage`, whose full result is not stored, and returns the number n
-    /// of shards to join. The caller computes those of the n shards that are not stored. n = 1 is the whole stage.
+    /// Returns the number n of shards (parts) into which `stage` is divided; 1 if it is not divided. To be called if
+    /// the full result of `stage` is not stored. The caller then computes those of the n shards that are not stored,
+    /// and joins all n.
     ///
-    /// If the run is limited to one of several shards, this function returns n only if all n shards are stored, or 1 if
-    /// there is no work folder. Otherwise it computes and stores the requested shard with `make`, unless `find` finds
-    /// it stored, and fails with [`Error::ShardDone`].
+    /// - Without a work folder, n is 1.
+    /// - If all shards of one division are stored, n is their number.
+    /// - Otherwise, if the run is not limited to a shard, n is the number of shards of the stored division that is most
+    ///   complete, or 1 if no shard is stored.
+    /// - Otherwise, if the run is limited to shard 1 of 1, n is 1.
+    /// - Otherwise, this function computes and stores the requested shard with `make`, unless `find` finds it stored,
+    ///   and fails with [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,
@@ -293,7 +302,8 @@ impl Cache {
         Err(Error::ShardDone(report))
     }
 
-    /// Adds a note for the user if shards of `stage` are stored that belong to another input or recipe.
+    /// Adds a note for the user if the folder `dir` holds shards of `stage` that have another key than `key`, because
+    /// they belong to another input or recipe.
     fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in dir.foreign_inputs(stage, key)? {
             self.add_note(format!(

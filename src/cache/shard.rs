@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 /// Maximum number of shards (parts) of a stage. Each shard is a file, and all files of a stage may be open at once.
 pub(super) const MAX_SHARDS: usize = 900;
 
-/// Outcome of a run, which may have computed only one shard (part of a divided stage).
+/// Outcome of a run, which may be limited to one shard (part of a divided stage).
 #[derive(Debug)]
 #[must_use]
 pub enum Completion<T> {
@@ -20,7 +20,8 @@ pub enum Completion<T> {
 }
 
 impl<T> Completion<T> {
-    /// Converts the result of a run: [`Error::ShardDone`], with which a run of only one shard ends, becomes a success.
+    /// Converts the result of a run: success becomes [`Completion::Whole`], and the error [`Error::ShardDone`], with
+    /// which a run that is limited to one shard ends, becomes [`Completion::Shard`].
     ///
     /// # Errors
     /// Fails if `result` is any other error.

@@ -15,7 +15,7 @@ use crate::files::atomic::{Replace, StagedFile};
 /// Number of bytes that this process has read back from all [`Spill`]s so far.
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
-/// Data on disk that is written once and then read in pieces, in any order.
+/// Data on disk that is written once. Any part of it can then be read, in any order.
 #[derive(Debug)]
 pub struct Spill {
     file: File,
@@ -68,7 +68,7 @@ impl Spill {
 }
 
 impl SpillWriter {
-    /// Creates an unnamed file in `folder`. The system removes it when the process ends.
+    /// Creates the writer of an unnamed file in `folder`. The system removes the file when the process ends.
     ///
     /// # Errors
     /// Fails if the folder does not exist or the system refuses.
@@ -78,8 +78,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
-    /// Creates a cache entry that gets the path `target` when it is complete. `key` is its cache key, `about` the
-    /// description of its input.
+    /// Creates the writer of a cache entry that gets the path `target` when it is complete. `key` is its cache key,
+    /// `about` the description of its input.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
@@ -88,8 +88,8 @@ impl SpillWriter {
         Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
-    /// Returns the words that precede the path in error messages. The path is that of the cache entry being written or,
-    /// for a scratch file, which has no name, that of its folder.
+    /// Returns the words that precede the path in error messages. For a cache entry, this path is the path of the
+    /// entry; for a scratch file, which has no name, it is the path of its folder.
     fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }

@@ -149,8 +149,8 @@ pub(super) fn command() -> Command {
     command.help_template(TOP_TEMPLATE).after_help(groups.join("\n") + "\nOptions:")
 }
 
-/// Writes one manual page for the program and one for each command to `folder`, all or none. Returns the number of
-/// pages. Replaces earlier pages and keeps other files in the folder.
+/// Writes the manual pages, one for the program and one for each command, to `folder`. If a page cannot be written,
+/// writes none. Returns the number of pages. Replaces earlier pages and keeps other files in the folder.
 ///
 /// # Errors
 /// Fails if the folder cannot be created or written, or if a file with the name of a page is not a page of this
@@ -200,8 +200,8 @@ fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     staged.commit()
 }
 
-/// Writes the manual pages `pages` (file name and text) to the existing folder `folder`, beside its other files.
-/// Replaces earlier manual pages of this program; fails if another file has the name of a page.
+/// Writes the manual pages `pages` (file name and text) to the existing folder `folder` and keeps its other files.
+/// Replaces earlier manual pages of this program. Fails if a page has the name of any other file in the folder.
 fn write_beside(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     let mut staged = Vec::new();
     for (name, text) in pages {

@@ -61,7 +61,7 @@ fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap
 }
 
 /// Prints the error that ended a run and returns its exit code. Returns success without a message if the run ended
-/// because the reader of standard output did.
+/// because the program that reads its standard output has ended.
 fn ended_by(error: Error) -> ExitCode {
     if output::has_no_reader(&error) {
         return ExitCode::SUCCESS;

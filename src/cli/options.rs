@@ -34,12 +34,12 @@ use splatsieve::progress::Events;
 use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
-/// Returns the request of `compress`. Options that the command line does not give are taken from the recipe file, if it
-/// records the options of an earlier run.
+/// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
+/// the recipe file, if this file records the options of an earlier run.
 ///
 /// # Errors
-/// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal
-/// is invalid.
+/// Fails if the recipe or the goal (a quality or a size on disk) is invalid, or if the recipe file records cameras,
+/// times or photographs that do not exist.
 pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
     let kind = requested_kind(&args.format, &args.output)?;
@@ -176,7 +176,8 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
     }
 }
 
-/// Returns the library's options for comparing two models, without a file for the scores.
+/// Returns the library's options for comparing the renders of two models. The options request no CSV file of the
+/// scores; the caller can add one.
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
@@ -216,7 +217,8 @@ pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
     }
 }
 
-/// Returns the options of the page that shows the result of `request` beside its input (`compress --view`).
+/// Returns the options of the page that shows the result of `request` beside its input (`compress --view`). `output` is
+/// the path of the page; `None` chooses a path beside the result.
 ///
 /// # Errors
 /// Fails if the input is a stream, or if the page cannot be written. Both are checked before the run.
@@ -319,7 +321,7 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
     })
 }
 
-/// Returns how precisely and with which compression `convert` stores the values of a container.
+/// Returns the compression and the error bounds with which `convert` stores the values of a container.
 pub(super) fn storing(args: &Convert) -> StoragePrecision {
     match (args.raw, args.max_error.clone()) {
         (true, _) => StoragePrecision::Exact(Compression::Raw),
@@ -341,7 +343,7 @@ pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Opt
     Ok(if version == 4 { Some(OutputKind::Spz4) } else { kind })
 }
 
-/// Returns the library's name of the output format `kind`.
+/// Converts the output format `kind` from the type of the argument parser to the type of the library.
 fn output_kind(kind: OutputKindArg) -> OutputKind {
     match kind {
         OutputKindArg::Model => OutputKind::Model,
@@ -361,7 +363,8 @@ fn output_kind(kind: OutputKindArg) -> OutputKind {
     }
 }
 
-/// Returns the library's name of the split `named`; `None` for all views.
+/// Converts the split `named` from the type of the argument parser to the type of the library. Returns `None` for the
+/// views of all splits.
 fn split(named: SplitArg) -> Option<Split> {
     match named {
         SplitArg::Train => Some(Split::Train),
@@ -381,8 +384,8 @@ pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }
 
-/// Returns the memory limit, and whether the memory plan is printed. If a limit is given, the process returns freed
-/// memory to the system from this call on.
+/// Returns the library's memory settings: the memory limit, and whether the memory plan is printed. If a limit is
+/// given, the process returns freed memory to the system from this call on.
 fn memory_budget(memory: Memory) -> Budget {
     if memory.memory.is_some() {
         return_freed_memory();
@@ -390,7 +393,8 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the facts about the training of the model that the command line states.
+/// Returns the training conventions (facts about the training that model files do not record) that the command line
+/// states in `trained`.
 fn conventions(trained: &Trained) -> TrainingConventions {
     let zero_rotation = trained.zero_rotation.map(|handling| match handling {
         ZeroRotationArg::Drop => ZeroRotation::Drop,
@@ -400,8 +404,8 @@ fn conventions(trained: &Trained) -> TrainingConventions {
     TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
-/// Returns the library's options for opening an input. Temporary files go to `--scratch-dir`, otherwise beside
-/// `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
+/// Returns the library's options for opening an input. Temporary files go to the folder that `--scratch-dir` names.
+/// Without this option, they go beside `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
 pub(super) fn input_options(
     input: Input,
     cameras: Option<Cameras>,

@@ -24,8 +24,8 @@ pub(super) fn print(text: &str) -> Result<()> {
     write(printable(text).as_bytes())
 }
 
-/// Prints a result as JSON if `is_json`, else as text. The functions `json` and `text` return the result; only one of
-/// them is called. In JSON, control characters are written as escapes.
+/// Prints a result as JSON if `is_json`, else as text. `json` and `text` return the result in these two forms; only one
+/// of them is called. In JSON, control characters are written as escapes.
 ///
 /// # Errors
 /// Fails as [`print`].
@@ -74,8 +74,8 @@ pub(super) fn is_terminal() -> bool {
     stdout().is_terminal()
 }
 
-/// Escapes every character of a JSON text that [`printable`] replaces. Such characters occur only inside the strings of
-/// the JSON text.
+/// Returns the JSON text `text` with every character that [`printable`] replaces written as an escape `\uXXXX`. Such
+/// characters occur only inside the strings of the JSON text, so the values that it encodes stay the same.
 fn json_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -29,8 +29,8 @@ const MIN_BAR_COLUMNS: usize = 8;
 
 /// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
-    /// Whether to hide progress and the messages about discarded results. Plans are always shown, because the user
-    /// requests them.
+    /// Whether to hide progress and the messages about results that a stage computed but the run does not use. Plans
+    /// are always shown, because the user requests them. Warnings are always shown too.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -55,7 +55,7 @@ impl Shared {
 }
 
 impl Display {
-    /// Returns a display; `is_quiet` hides progress.
+    /// Creates a display of the library's events; `is_quiet` hides progress.
     pub(super) fn new(is_quiet: bool) -> Self {
         let bars = MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10));
         Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
@@ -161,8 +161,8 @@ struct RunPosition {
 }
 
 impl RunPosition {
-    /// Notes that the task `name` begins. If it is a stage of the run, marks it as running and returns its label `[k/n]
-    /// name`. Otherwise returns `name` unchanged.
+    /// Notes that the task `name` begins at the time `now`. If it is a stage of the run, marks it as running and
+    /// returns its label `[k/n] name`. Otherwise returns `name` unchanged.
     fn enter(&mut self, name: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
         if self.current.is_none_or(|(stage, _)| stage != place) {
@@ -171,9 +171,12 @@ impl RunPosition {
         format!("[{}/{}] {name}", place + 1, self.stages.len())
     }
 
-    /// Returns the estimated time until the end of the run, seconds. `step` is the estimated time until the end of the
-    /// current task, seconds. The expected times of the current and later stages are scaled by the ratio of actual to
-    /// expected time of the earlier stages.
+    /// Returns the estimated time from `now` until the end of the run, seconds. `step`: estimated time, in seconds,
+    /// until the end of the current task.
+    /// - Before the first stage, returns `step`.
+    /// - Otherwise, returns the time left of the current stage, but at least `step`, plus the expected times of the
+    ///   later stages. Expected times are multiplied by the ratio of actual to expected time of the earlier stages,
+    ///   limited to 0.1 to 10. The factor is 1 if less than half a second was expected for the earlier stages.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -202,7 +205,8 @@ struct BarSnapshot<'a> {
 }
 
 impl<'a> BarSnapshot<'a> {
-    /// Returns the data of a bar whose progress is `state`. `run` is given if the task is a stage of a run.
+    /// Returns the data that the bar of the task `name` shows. `state`: progress of the task, counted in `unit`. `run`:
+    /// progress of the run, if the task is one of its stages.
     fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // The rate is unknown before the first unit is done.
@@ -273,7 +277,7 @@ struct Log {
 }
 
 impl Log {
-    /// Begins a log of `task` now. Its lines start with `name`.
+    /// Begins the log of `task`, whose time runs from now. The log lines start with `name`.
     fn new(name: String, task: Task<'_>, shared: Arc<Shared>) -> Log {
         let (done, next) = (AtomicU64::new(0), AtomicU64::new(LOG_INTERVAL_SECONDS));
         let is_nested = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;
@@ -281,7 +285,7 @@ impl Log {
         Log { name, unit, total, start: Instant::now(), done, next, is_nested, shared }
     }
 
-    /// Prints the final line of the task, unless it is nested.
+    /// Prints the final log line of the task. Prints nothing for a nested task, or if no unit of work was done.
     fn print_summary(&self) {
         // A task that failed before its first unit prints nothing.
         if self.done.load(Ordering::Relaxed) > 0 && !self.is_nested {
@@ -289,8 +293,8 @@ impl Log {
         }
     }
 
-    /// Returns the log line of the task at the time `elapsed` after its start: count, rate, and the time left. If the
-    /// task has ended (`ended`), the line shows the elapsed time instead of the time left.
+    /// Returns the log line of the task at the time `elapsed` after its start: count, rate, and time left. Shows the
+    /// elapsed time instead of the time left if the task has ended (`ended`), or if the time left is unknown.
     fn line(&self, elapsed: Duration, ended: bool) -> String {
         let done = self.done.load(Ordering::Relaxed);
         let per_second = done as f64 / elapsed.as_secs_f64().max(1e-9);
@@ -333,7 +337,8 @@ impl Drop for Log {
     }
 }
 
-/// Formats a rate with two or three digits. Below 0.5 units per second, the text is the time per unit.
+/// Formats the rate `per_second` (units per second) with two or three digits. Below 0.5 units per second, the text is
+/// the time per unit.
 fn rate(per_second: f64, unit: &str) -> String {
     if per_second > 0.0 && per_second < 0.5 {
         return format!("{} each", format_duration(1.0 / per_second));

@@ -13,18 +13,19 @@ use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 /// Heading of the recipe options in the help.
 const HEADING: &str = "Recipe";
 
-/// Maximum size of a recipe file that is read, bytes. A recipe that splatsieve writes has about 4,000 bytes.
+/// Maximum size of a recipe file in bytes; a larger file is not read. A recipe that splatsieve writes has about 4,000
+/// bytes.
 const MAX_RECIPE_BYTES: u64 = 1 << 20;
 
 /// Key of the list of merge passes, the only parameter whose value is not a single number or word.
 const PASSES: &str = "passes";
 
-/// Value of one `--set KEY=VALUE`.
+/// Change of the recipe that one option `--set KEY=VALUE` requests.
 #[derive(Debug, Clone, PartialEq)]
 enum RecipeSetting {
-    /// Parameter of the recipe with its section, key and value.
+    /// New value, as text, of the parameter `key` in the section `section` of the recipe.
     Parameter { section: String, key: String, value: String },
-    /// Merge pass. If the command line has merge passes, they replace all merge passes of the recipe.
+    /// Merge pass from `--set passes=…`. The merge passes on the command line replace all merge passes of the recipe.
     Pass(MergePass),
 }
 
@@ -40,8 +41,8 @@ pub(super) struct RecipeFlags {
 }
 
 impl RecipeFlags {
-    /// Returns the record in the recipe file of the run that wrote the file: program, input and options. The record is
-    /// empty if no recipe file is given.
+    /// Returns the run record in the recipe file of the command line: program, input and options of the run that wrote
+    /// the file. Returns an empty record if the command line names no recipe file.
     ///
     /// # Errors
     /// Fails if the file cannot be read or its record is invalid.
@@ -52,7 +53,8 @@ impl RecipeFlags {
         RecipeRecord::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
     }
 
-    /// Checks that `path`, the value of `option` that the recipe file records, exists.
+    /// Checks that the file or folder `path` exists. The recipe file records this path as the value of the option
+    /// `option`.
     ///
     /// # Errors
     /// Fails if the path does not exist; the message names the recipe file and the option.
@@ -69,7 +71,7 @@ impl RecipeFlags {
         )))
     }
 
-    /// Returns the recipe that results from all recipe options.
+    /// Returns the recipe that results from all recipe options of the command line.
     ///
     /// # Errors
     /// Fails if the file cannot be read, or if a parameter is unknown or out of range.
@@ -158,7 +160,7 @@ impl FromArgMatches for RecipeFlags {
     }
 }
 
-/// Argument parser of `KEY=VALUE`. It also lists the keys, for completion in shells.
+/// Parser of the argument `KEY=VALUE` of `--set`. Also lists the keys, for completion in shells.
 #[derive(Clone)]
 struct SettingParser;
 
@@ -181,7 +183,8 @@ impl TypedValueParser for SettingParser {
     }
 }
 
-/// Parses a recipe setting, `key=value` or `section.key=value`.
+/// Parses the recipe setting `text`, of the form `key=value` or `section.key=value`. Fails with a message for other
+/// texts and unknown keys.
 fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     let (name, value) =
         text.split_once('=').ok_or_else(|| format!("expected KEY=VALUE such as mu=2, found {}", quoted(text)))?;
@@ -209,7 +212,7 @@ fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     }
 }
 
-/// Parses a merge pass, `EPSILON,D0,RHO,TAU_M`.
+/// Parses the text of a merge pass: its four thresholds `EPSILON,D0,RHO,TAU_M`. Fails with a message for other texts.
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
@@ -218,7 +221,7 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     }
 }
 
-/// Parses numbers that are separated by commas.
+/// Parses the numbers in `text`, which are separated by commas. Fails with a message for other texts.
 pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<Vec<T>, String> {
     text.split(',').map(|part| part.trim().parse().map_err(|_| format!("{} is not a number", quoted(part)))).collect()
 }

@@ -89,8 +89,8 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     printed
 }
 
-/// Runs the command `score`, which writes a table of statistics and scores. Prints its notes and the number of
-/// Gaussians that the recipe keeps.
+/// Runs the command `score`, which writes a table of the statistics and scores of all Gaussians. Prints notes, and the
+/// number of Gaussians that a compression with the recipe would keep before merging.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
@@ -178,7 +178,8 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     print(&format!("{verdicts}{}\n", page.shown()))
 }
 
-/// Writes the HTML page that plays a model. Returns a line of text with its path, its number of frames and its size.
+/// Writes the HTML page that plays a model. Returns a line of text with the path of the page, its number of frames and
+/// its size.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     tell_notes(&found.notes);
@@ -313,7 +314,8 @@ fn run_man(args: &Man) -> Result<()> {
     print(&format!("{}: {pages} pages\n", args.folder.shown()))
 }
 
-/// Returns the result of a complete run. If the run computed only one shard, prints the shard and returns `None`.
+/// Returns the result of a complete run. If the run computed only one shard (part of a divided stage), prints a report
+/// about the shard and returns `None`.
 fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
     match completion {
         Completion::Whole(found) => Ok(Some(found)),

@@ -4,8 +4,10 @@ use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps}
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::remove_unfinished;
 
-/// Installs handlers for two events. A signal that ends the process first removes unfinished outputs. Truncation of a
-/// mapped input file ends the process with a message that names the file.
+/// Installs handlers for two events:
+/// - A signal ends the process: the handler first removes unfinished outputs.
+/// - Another program truncates a memory-mapped input file: the handler ends the process with a message that names the
+///   file, if its path is known.
 pub(super) fn install() {
     end_on_signals(remove_unfinished, |signal| ErrorKind::Interrupted { signal }.exit_code());
     report_cut_short_maps(TruncatedMapMessage {

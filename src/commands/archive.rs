@@ -1,4 +1,5 @@
-//! Unpacking of an archive into files that the renderer of the model opens. Part of the command `convert`.
+//! Unpacking of an archive into files of the original model format, which the renderer of the model opens. Part of the
+//! command `convert`.
 
 use std::fs;
 use std::io::Read;
@@ -16,7 +17,7 @@ use crate::model::Attributes;
 use crate::models::archive::{is_folder, read_archive, unpack};
 use crate::outputs::kind::{OutputKind, check_folder_name};
 
-/// Returns whether the file at `path` begins with the magic bytes of an archive.
+/// Returns whether the file at `path` begins with the magic bytes of an archive; false for a folder.
 ///
 /// # Errors
 /// Fails if the file cannot be read.
@@ -30,8 +31,8 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY file if the archive was made from
-/// one.
+/// Unpacks the archive at `path` and writes its model to `output`: a model folder, or a PLY file if the archive was
+/// made from a PLY file.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.

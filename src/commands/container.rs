@@ -46,13 +46,14 @@ const PACK_STAGE: &str = "pack";
 pub enum StoragePrecision {
     /// All values exact to the bit, with the given compression.
     Exact(Compression),
-    /// Errors of the named attributes within bounds, others exact; compressed by zstd at the given level.
+    /// Values of the listed attributes with at most the listed errors, all other values exact to the bit. The second
+    /// field is the level of zstd compression.
     Within(Vec<MaxError>, i32),
 }
 
 impl StoragePrecision {
-    /// Returns how the values of a scene are stored in a container. Calls `extent` (length of the scene, scene units)
-    /// only if an error bound is relative to it.
+    /// Returns the packing (compression and error bounds) that this precision requests. Calls `extent`, which returns
+    /// the extent of the scene in scene units, only if an error bound is relative to it.
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
             StoragePrecision::Exact(compression) => Ok((*compression).into()),
@@ -78,8 +79,8 @@ pub fn pack(
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
-/// Runs [`pack`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`Error::ShardDone`].
+/// Packs any input into a container, as [`pack`] does, and returns the report. If the run computes only one shard (part
+/// of a divided stage), it ends with the error [`Error::ShardDone`].
 fn pack_whole(
     input: &InputOptions,
     output: &Path,
@@ -133,7 +134,8 @@ fn pack_whole(
     Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
-/// Packs a frame stream while it arrives. Its Gaussians keep their ids from frame to frame.
+/// Packs a frame stream into the container `output` while its frames arrive. In the stream, each Gaussian must keep its
+/// id from frame to frame.
 fn pack_arriving(
     stream: FrameStream<Stdin>,
     input: &InputOptions,
@@ -156,7 +158,8 @@ fn pack_arriving(
     Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
-/// Returns the result of packing a container.
+/// Returns the report on the packed container with the path `output`. `bytes`: size of the container. `larger`: reason
+/// why the container is larger than the input, if it is.
 fn packed(
     output: &Path,
     gaussians: usize,
@@ -206,7 +209,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     Ok(opened)
 }
 
-/// Checks that a file is a container, possibly damaged: by its extension or its first bytes.
+/// Checks that the file at `path` is a container, possibly damaged: its extension is `.gseq`, or it begins like a
+/// container.
 fn check_is_container(path: &Path) -> Result<()> {
     let mut head = Vec::new();
     open_file(path)?.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
@@ -219,14 +223,15 @@ fn check_is_container(path: &Path) -> Result<()> {
         .hint(format!("`splatsieve info {}` reads it and says what it holds", path.shown())))
 }
 
-/// Reads and checks every byte of a container, within the default memory limit.
+/// Reads and checks every byte of the container at `path`, within the default memory limit.
 pub fn verify(path: &Path) -> Result<VerifyReport> {
     check_is_container(path)?;
     let memory = Budget::default().read_limit().bytes();
     Ok(Reader::open_within(path, memory)?.verify_within(memory)?)
 }
 
-/// Copies the complete frames of a truncated or damaged container to a new container.
+/// Copies the complete frames of the truncated or damaged container `input` to the new container `output`. Fails if no
+/// frame is complete.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_container_name(output, "info --repair")?;
     check_is_container(input)?;
@@ -248,9 +253,10 @@ pub struct InputInfo {
     /// Summary of the input.
     #[serde(flatten)]
     pub input: InputSummary,
-    /// Time stamps of the first and the last frame; `None` without frames, or if the cameras choose the times.
+    /// Time stamps of the first and the last frame; `None` if the input has no frames, or if the cameras determine the
+    /// times of its frames.
     pub times: Option<(f64, f64)>,
-    /// Columns of a container; empty for other inputs.
+    /// Stored attributes (columns) of a container; empty for other inputs.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub columns: Vec<ColumnInfo>,
     /// Notes for the user.
@@ -258,7 +264,7 @@ pub struct InputInfo {
     pub notes: Vec<String>,
 }
 
-/// Describes an input. Reads its bytes once for the digest, but evaluates no frame.
+/// Returns the description of an input. Reads its bytes once to compute the digest, but computes no frame.
 pub fn info(options: &InputOptions) -> Result<InputInfo> {
     let input: Box<dyn InputModel> = match options.is_stream() {
         true => open_input(options)?.input,
@@ -273,12 +279,12 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
     Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: input.notes() })
 }
 
-/// Returns the workload of reading `input` without rendering it.
+/// Returns the workload (sizes from which memory and time are estimated) of reading `input` without rendering it.
 fn workload(input: &dyn InputModel) -> Workload {
     Workload::new(input.source().info(), input.memory_profile())
 }
 
-/// Returns the resource estimate of packing all frames into a container.
+/// Returns the resource estimate (memory and time) of packing all frames into a container with the precision `storing`.
 fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEstimate> {
     let seconds = work.reading_seconds(work.gaussian_count(), work.frames as f64)
         + work.gaussian_count() * work.frames as f64 * SECONDS_TO_ENCODE;
@@ -296,7 +302,7 @@ fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEs
     vec![ResourceEstimate { stage: PACK_STAGE, reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
-/// Returns the resource estimate of writing all frames as a stream.
+/// Returns the resource estimate (memory and time) of writing all frames as a stream.
 fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     let states = ("states", work.state_bytes(Attributes::all()));
     let per_gaussian =

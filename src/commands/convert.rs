@@ -23,19 +23,23 @@ use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_input};
 
-/// Approximate bytes per Gaussian while curves are fitted to its track and encoded: a few curve segments.
+/// Approximate bytes of memory per Gaussian for the curve segments that are fitted to its track (its values at all
+/// frames), and for their encoding. Assumes a few segments per Gaussian.
 const FITTED_BYTES: u64 = 4 * 600;
 
-/// Bytes per Gaussian of a frame in the images of a `.tsog` of single frames.
+/// Bytes of memory per Gaussian and frame for the images of a `.tsog` file that stores every frame by itself instead of
+/// curves.
 const FRAME_IMAGE_BYTES: u64 = 8 * 4 + 64;
 
-/// Returns whether `convert` writes a container to `output`.
+/// Returns whether `convert` writes a container to `output`. `requested`: requested format; `None`: the format follows
+/// from the name of `output`.
 pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
     OutputKind::from_path(output, requested, OutputKind::Model) == OutputKind::Gseq
 }
 
-/// Writes `input` to `output` in the format `requested`; `None`: by the name of the output. The format of a folder is
-/// the input's own model format, or one PLY per frame for a sequence.
+/// Writes all Gaussians of `input` to `output` in the format `requested`. If `requested` is `None`, the format follows
+/// from the name of the output. For a folder, it is the input's own model format, or one PLY file per frame if the
+/// input has no model format (a container or a frame stream).
 ///
 /// # Errors
 /// Fails if the input cannot be read or cannot be written in this format, or if the output exists already.
@@ -101,7 +105,8 @@ pub fn convert(
     Ok(ConvertReport { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 
-/// Returns the resource estimate of writing all frames once as `kind`, with curve fitting where the format needs it.
+/// Returns the resource estimate (memory and time) of writing all frames once in the format `kind`, including the fit
+/// of curves for formats that store curves.
 fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let state_bytes = work.state_bytes(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs) || is_windowed(kind);

@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::error::ShowPath;
 use crate::outputs::kind::OutputKind;
 
-/// Result of `convert`.
+/// Result of the command `convert`.
 #[derive(Debug, Serialize)]
 pub struct ConvertReport {
     /// Path of the output.
@@ -16,11 +16,12 @@ pub struct ConvertReport {
     pub kind: OutputKind,
     /// Number of Gaussians N of the input.
     pub gaussians: usize,
-    /// Number of frames T of the input; `None` for a model without frames of its own.
+    /// Number of frames T of the input; `None` for an unpacked archive.
     pub frames: Option<usize>,
-    /// Bytes of all files that were written.
+    /// Size in bytes of the written files. For an unpacked archive: 4 bytes for each value of its Gaussians and
+    /// tensors, without headers and other files.
     pub bytes: u64,
-    /// Reason why the output has more bytes than the input; `None` if it has not.
+    /// Reason why the output has more bytes than the input; `None` if it does not have more.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub larger: Option<String>,
     /// Notes for the user.

@@ -26,38 +26,40 @@ use crate::source::FrameSource;
 /// Name of the rendering stage, for progress and cache entries.
 const NAME: &str = "render";
 
-/// Views to render.
+/// Selection of the views to render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderSelection {
-    /// One view at one frame, to a file whose extension gives the format.
+    /// One view at one frame, written to a file whose extension gives the image format.
     One {
-        /// Frame of the sequence.
+        /// Index of the frame in the sequence.
         frame: usize,
         /// View number of the camera, as in the list of cameras.
         view: u32,
     },
-    /// Every view of the set, to a folder, as files named `tNNN_vNN` (frame, view).
+    /// Every view of [`RenderOptions::views`], written to a folder in this image format, as files named `tNNN_vNN`
+    /// (frame, view).
     All(ImageFormat),
 }
 
-/// Options of `render`.
+/// Options of the command `render`.
 #[derive(Debug, Clone)]
 pub struct RenderOptions {
-    /// Input and cameras. The split that its options request is ignored; see `views`.
+    /// Input and cameras. The split that these options request is ignored: the field `views` selects the views.
     pub input: InputOptions,
-    /// Views to render.
+    /// Selection of the views to render from the set `views`.
     pub selection: RenderSelection,
-    /// Set of views from which `selection` selects.
+    /// Set of views from which `selection` selects, for example the test views.
     pub views: ViewSet,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: the background color of the scene (see
+    /// [`render_background`]).
     pub background: Option<[f32; 3]>,
-    /// Output file or folder.
+    /// Path of the output file or folder.
     pub output: PathBuf,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
-/// Result of `render`.
+/// Result of the command `render`.
 #[derive(Debug)]
 pub struct RenderReport {
     /// Number of rendered views.
@@ -68,7 +70,8 @@ pub struct RenderReport {
 
 /// Renders views of an input to image files.
 ///
-/// Memory: one frame state, and per thread one render with its footprints ([`crate::scene::pictures::render_estimate`]).
+/// Memory: one frame state, and for each thread one render with its projected Gaussians
+/// ([`crate::scene::pictures::render_estimate`]).
 ///
 /// # Errors
 /// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or
@@ -77,8 +80,8 @@ pub fn render(options: &RenderOptions) -> Result<Completion<RenderReport>> {
     Completion::from_result(render_whole(options))
 }
 
-/// Runs [`render`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`Error::ShardDone`].
+/// Renders views to image files, as [`render`] does, and returns the report. If the run computes only one shard (part
+/// of a divided stage), it ends with the error [`Error::ShardDone`].
 fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
     let output = options.output.as_path();
     let (kind, format) = match options.selection {
@@ -150,13 +153,13 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
     Ok(RenderReport { views: chosen.len(), notes })
 }
 
-/// Returns the resource estimate of rendering. `keeps_files`: the encoded files of a batch stay in memory until they
-/// are written.
+/// Returns the resource estimate (memory and time) of rendering. `keeps_files`: whether the encoded image files of a
+/// batch of views stay in memory until they are written.
 fn estimates(work: &Workload, limits: &Limits, keeps_files: bool) -> Vec<ResourceEstimate> {
     vec![pictures::render_estimate(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
 }
 
-/// Returns the image format that the extension of `output` gives.
+/// Returns the image format that the extension of `output` gives; fails for extensions other than `.png` and `.npy`.
 fn format_of(output: &Path) -> Result<ImageFormat> {
     ImageFormat::from_path(output).ok_or_else(|| {
         Error::usage(format!(
@@ -166,7 +169,7 @@ fn format_of(output: &Path) -> Result<ImageFormat> {
     })
 }
 
-/// Renderer of views to image files.
+/// Renderer of views to image files, with the settings that all views share.
 struct RenderJob<'a> {
     source: &'a dyn FrameSource,
     cameras: &'a [Camera],
@@ -177,12 +180,13 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
-    /// Renders `pictures` and writes each to the file `path` returns for it.
+    /// Renders the views `pictures` and writes each render to the file whose path `path` returns for the view.
     fn write(&self, pictures: &[FrameView], path: impl Fn(&FrameView) -> PathBuf + Sync) -> Result<()> {
         self.for_each_view(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
     }
 
-    /// Renders `pictures` and writes their encoded files to `to`, one record each, in order.
+    /// Renders the views `pictures`, encodes each render as an image file, and writes the bytes of these files to the
+    /// temporary data `to`, one record per view, in order.
     fn spill(&self, pictures: &[FrameView], to: &mut SpillWriter) -> Result<()> {
         let encode = |picture: FrameView, image: &Image| {
             let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
@@ -191,7 +195,8 @@ impl RenderJob<'_> {
         self.for_each_view(pictures, encode, |bytes| to.write_record(&bytes))
     }
 
-    /// Renders `pictures`. Calls `render_one` with each render, from any thread, and `take` with its results, in order.
+    /// Renders the views `pictures`. Calls `render_one` with each view and its finished render, from any thread. Passes
+    /// the values that `render_one` returns to `take`, in the order of the views.
     fn for_each_view<T: Send>(
         &self,
         pictures: &[FrameView],
@@ -217,7 +222,8 @@ impl RenderJob<'_> {
     }
 }
 
-/// Writes the files that [`RenderJob::spill`] encoded for `pictures`, one by one.
+/// Copies the image files of the views `pictures` from `spill`, to which [`RenderJob::spill`] wrote them, to the paths
+/// that `path` returns for the views.
 fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {

@@ -55,14 +55,14 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     })
 }
 
-/// Result of `score`.
+/// Result of the command `score`.
 #[derive(Debug)]
 pub struct ScoreReport {
     /// Path of the written file.
     pub output: PathBuf,
-    /// Number of rows, one per Gaussian.
+    /// Number of rows of the written file, one per Gaussian.
     pub gaussians: usize,
-    /// Number of Gaussians that the recipe keeps before merging.
+    /// Number of Gaussians that a compression with the recipe would keep before merging.
     pub kept: usize,
     /// Notes for the user.
     pub notes: Vec<String>,

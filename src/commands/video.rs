@@ -23,37 +23,40 @@ use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
 /// Name of the rendering stage, for progress.
 const NAME: &str = "render";
-/// Number of video frames between two cameras of a path through a still (a model without motion).
+/// Number of video frames from one camera of a path to the next, for a still (a model without motion).
 const VIEWS_BETWEEN_STOPS: usize = 24;
 
-/// Camera of a video.
+/// Camera or camera path from which a video is rendered.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum VideoCamera {
-    /// Camera of one view, which may move over time; `None`: the view with the lowest number.
+    /// Camera of the view with this number, which may move over time; `None`: the view with the lowest number.
     View(Option<u32>),
-    /// Path through the cameras of these views, in order; empty: through all views by number.
+    /// Path through the cameras of the views with these numbers, in this order. If the list is empty: path through the
+    /// cameras of all views, by increasing view number.
     Path(Vec<u32>),
 }
 
-/// Options of a video.
+/// Options of the command `render --video`.
 #[derive(Debug, Clone)]
 pub struct VideoOptions {
-    /// Input and cameras. The split that its options request is ignored; see `views`. The frames can differ from the
-    /// times of the cameras.
+    /// Input and cameras. The split that these options request is ignored: the field `views` selects the views. The
+    /// options may request frames at other times than those of the cameras.
     pub input: InputOptions,
-    /// Other model with the same frames, shown to the right.
+    /// Path of another model with the same frames, which is shown to the right of the input; `None`: the video shows
+    /// the input alone.
     pub beside: Option<PathBuf>,
-    /// Camera of the video.
+    /// Camera or camera path of the video.
     pub path: VideoCamera,
-    /// Set of views from which `path` selects.
+    /// Set of views from which `path` selects, for example the test views.
     pub views: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: the background color of the scene (see
+    /// [`render_background`]).
     pub background: Option<[f32; 3]>,
-    /// Output file; its extension gives the format.
+    /// Path of the output file; its extension gives the video format.
     pub output: PathBuf,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
@@ -62,14 +65,15 @@ pub struct VideoOptions {
 pub struct VideoReport {
     /// Number of video frames.
     pub frames: usize,
-    /// Width and height, pixels.
+    /// Width and height of the video, pixels.
     pub size: (u32, u32),
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Renders a video of an input, one image per frame in order. Along a path through a still (a model without motion),
-/// the camera moves from image to image.
+/// Renders a video of an input, with one image per frame of the model, in order. Exception: if a camera path leads
+/// through a still (a model without motion), the video has a fixed number of images from each camera of the path to the
+/// next.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
@@ -119,9 +123,10 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     Ok(VideoReport { frames: views.len(), size, notes: scene.notes })
 }
 
-/// Returns a copy of the shots (views of the scene) of `opened` with their times, and removes the times in `opened`, so
-/// that every camera can show every frame. Does nothing and returns `None` if there are no cameras or if the frames are
-/// the times of the cameras (`has_other_frames` is false).
+/// Removes the times from the shots (views of the scene) of `opened`, so that every camera can show every frame.
+/// Returns a copy of the shots from before, with their times. Does nothing and returns `None` in two cases:
+/// - There are no cameras.
+/// - `has_other_frames` is false: the frames are at the times of the cameras.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
@@ -129,8 +134,8 @@ fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<
     Some(own)
 }
 
-/// Returns the shots (views of the scene) in the set `views`, sorted by view number, then time; shots without a time
-/// come first.
+/// Returns those shots (views of the scene) in `all` that belong to the set `views`, sorted by view number, then time;
+/// shots without a time come first. Fails if there are none.
 fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     let split = views.split(rig);
     let mut found: Vec<Shot> =
@@ -145,7 +150,8 @@ fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
     }
 }
 
-/// Returns the cameras of the video and the view of each video frame, in order.
+/// Returns the cameras of the video, and for each video frame, in order, the frame of the model and the camera to
+/// render.
 fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match path {
         VideoCamera::View(view) => {
@@ -180,8 +186,8 @@ fn plan_views(path: &VideoCamera, shots: &[Shot], rig: &Rig, times: &[f64]) -> R
     }
 }
 
-/// Returns the shots (views of the scene) with view number `view`. `flag` names the option in the error if there are
-/// none.
+/// Returns the shots (views of the scene) with the view number `view`. `shots` must be sorted by view number. Fails if
+/// there is no such shot; the message names the command line option `flag`.
 fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
     views.find(|shots| shots[0].view == view).ok_or_else(|| {
@@ -191,7 +197,7 @@ fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Res
     })
 }
 
-/// Returns the common image size of `cameras`.
+/// Returns the image size that all `cameras` share: width and height, pixels. Fails if two sizes differ.
 fn common_size(cameras: &[Camera]) -> Result<(u32, u32)> {
     let size = |camera: &Camera| (camera.width, camera.height);
     let first = cameras.first().map_or((0, 0), size);
@@ -215,7 +221,8 @@ struct FilmSource<'a> {
 }
 
 impl FilmSource<'_> {
-    /// Renders all views of the `subjects` side by side and adds them to `film`.
+    /// Renders each view with every model in `subjects`, joins the renders of a view from left to right, and adds the
+    /// joined images to `film` in order.
     fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = self.events.task(NAME, "frames", self.views.len() as u64);
         for_each_view_batch(subjects, self.cameras, self.views, BatchLimits::one_frame(self.limits), |views| {
@@ -248,7 +255,7 @@ fn side_by_side(mut images: Vec<Image>) -> Image {
     Image { width: width * images.len() as u32, height, data }
 }
 
-/// Returns a line that says which model is left and which is right.
+/// Returns a line of text that says which of two models a video shows on the left and which on the right.
 pub fn side_by_side_text(left: &Path, right: &Path) -> String {
     format!("left: {}; right: {}", left.shown(), right.shown())
 }

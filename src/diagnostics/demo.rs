@@ -1,5 +1,5 @@
-//! `splatsieve demo`: generates a scene, compresses it to a tenth and a twentieth, and writes pages and a film to look
-//! at.
+//! `splatsieve demo`: generates a dynamic scene, compresses it to a tenth and to a twentieth of its Gaussians, and
+//! writes a player page, a report page and a film of the results.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -42,18 +42,20 @@ pub const PRUNED_10X_FILE: &str = "pruned_10x.gseq";
 pub const PLAYER_FILE: &str = "player.html";
 /// Name of the folder with the report.
 pub const REPORT_FOLDER: &str = "report";
-/// File name of the film: the scene, [`PRUNED_10X_FILE`] and [`COMPRESSED_10X_FILE`] side by side.
+/// File name of the film (an animated GIF) that shows the scene, [`PRUNED_10X_FILE`] and [`COMPRESSED_10X_FILE`] side
+/// by side.
 pub const FILM_FILE: &str = "comparison.gif";
 
-/// Size of one render in the film, pixels: three of them, side by side, fit a page of text.
+/// Width and height of one render in the film, pixels. Three renders of this size, side by side, fit the width of a
+/// page of text.
 const FILM_RENDER: (u32, u32) = (280, 210);
-/// Width of the white line between two renders of the film, pixels.
+/// Width of the white line between neighboring renders in the film, pixels.
 const FILM_GAP: u32 = 6;
-/// Number of frames of the film at most.
+/// Maximum number of frames of the film.
 const FILM_FRAMES: usize = 24;
-/// Frames of the film per second.
+/// Speed at which the film plays, frames per second.
 const FILM_RATE: u32 = 8;
-/// Number of the view that the film shows: a test view in the middle of the cameras.
+/// View number of the camera from which the film is rendered. This test view is near the middle of the arc of cameras.
 const FILM_VIEW: u32 = 5;
 
 /// Options of the command `demo`.
@@ -63,19 +65,19 @@ pub struct DemoOptions {
     pub gaussians: usize,
     /// Number of frames of the scene.
     pub frames: usize,
-    /// Number of optimization steps of each refinement; `None`: those of the default recipe at [`Effort::Fast`].
+    /// Number of optimization steps of each refinement; `None`: the number in the default recipe at [`Effort::Fast`].
     pub steps: Option<u32>,
-    /// Folder to write.
+    /// Path of the output folder.
     pub output: PathBuf,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
-    /// Memory limit.
+    /// Limit on the memory of the run.
     pub memory: Budget,
-    /// Receiver of the events of the run.
+    /// Receiver of the progress and the messages of the run.
     pub events: Events,
 }
 
-/// One model of the demo.
+/// Size and quality of one model that the demo writes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DemoModel {
     /// File name of the model.
@@ -84,24 +86,28 @@ pub struct DemoModel {
     pub gaussians: usize,
     /// Size of the model's file in bytes.
     pub bytes: u64,
-    /// Mean PSNR against the scene over the test views, dB; `None` for the scene itself.
+    /// Mean PSNR over the test views, dB, of renders of this model against renders of the uncompressed scene; `None`
+    /// for the scene itself.
     pub psnr: Option<f64>,
-    /// Mean SSIM against the scene over the test views; `None` for the scene itself.
+    /// Mean SSIM over the test views of renders of this model against renders of the uncompressed scene; `None` for the
+    /// scene itself.
     pub ssim: Option<f64>,
 }
 
 /// Result of the command `demo`.
 #[derive(Debug)]
 pub struct DemoReport {
-    /// The scene, then its compressed models.
+    /// Written models: the uncompressed scene first, then its compressed versions.
     pub models: Vec<DemoModel>,
-    /// Number of test renders that were compared.
+    /// Number of renders (test views at all frames) over which PSNR and SSIM are averaged.
     pub renders: usize,
-    /// Files and folders with their descriptions, in the order in which a reader may open them.
+    /// Written files, each as a pair of its path in the output folder and a description, in the order in which a person
+    /// may want to open them.
     pub written: Vec<(&'static str, &'static str)>,
 }
 
-/// Generates the scene, compresses it and writes everything into one folder.
+/// Generates the demo scene and compresses it. Writes the scene, its cameras, the compressed models, the player page,
+/// the report and the film to the output folder.
 ///
 /// # Errors
 /// Fails if the output exists and may not be replaced, if the compression fails, or if a file cannot be written.
@@ -177,8 +183,9 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     Ok(DemoReport::new(&found))
 }
 
-/// Compresses the scene in `folder` into the file `name` there. Returns the limits (such as the block sizes) with which
-/// the run fits into the memory limit.
+/// Compresses the scene file in `folder` by `recipe` to the number or fraction of Gaussians `target`, and writes the
+/// result to the file `name` in the same folder. Returns the limits (maximum numbers of frames, views and Gaussians in
+/// memory at a time) with which the run fits into the memory limit.
 fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options: &DemoOptions) -> Result<Limits> {
     let input = Box::new(Container::open(&folder.join(SCENE_FILE))?);
     let rig = Playground::new(options.gaussians, options.frames).rig();
@@ -191,7 +198,8 @@ fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options:
     Ok(scene.limits)
 }
 
-/// Returns a JSON text with the cameras of `rig`, each at every frame, and the split of each view.
+/// Returns a JSON text with the cameras of `rig` and the split (training or test) of each view. The text gives no
+/// times: every camera sees every frame.
 fn cameras_json(rig: &Rig) -> String {
     let frame = |shot: &crate::model::Shot| {
         let camera = &rig.cameras[shot.camera as usize];
@@ -218,7 +226,8 @@ fn cameras_json(rig: &Rig) -> String {
     format!("{:#}\n", serde_json::json!({ "background": rig.background, "frames": frames }))
 }
 
-/// Writes the film, an animated image: the scene, the pruned and the refined model side by side.
+/// Writes the film, an animated GIF of one test view, to `folder`. Each image shows the scene, the pruned model and the
+/// refined model side by side. `limits` bound the number of views and frames in memory.
 fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()> {
     let models = [SCENE_FILE, PRUNED_10X_FILE, COMPRESSED_10X_FILE].map(|name| Container::open(&folder.join(name)));
     let [scene, pruned, refined] = models;
@@ -247,7 +256,8 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     film.finish()
 }
 
-/// Returns `camera` scaled to renders of the size [`FILM_RENDER`].
+/// Returns a copy of `camera` whose images have the size [`FILM_RENDER`] and the same horizontal field of view, with
+/// the principal point at the image center.
 fn smaller(camera: &Camera) -> Camera {
     let (width, height) = FILM_RENDER;
     let scale = f64::from(width) / f64::from(camera.width);
@@ -262,7 +272,7 @@ fn smaller(camera: &Camera) -> Camera {
     }
 }
 
-/// Joins three renders of one size from left to right, with a white line between two.
+/// Joins three renders of equal size from left to right, with a white line between neighboring renders.
 fn beside(images: [Image; 3]) -> Image {
     let (width, height) = (images[0].width, images[0].height);
     let line = vec![1.0; 3 * FILM_GAP as usize];
@@ -315,7 +325,8 @@ impl DemoReport {
         }
     }
 
-    /// Returns the table of models, the list of files in `folder`, and the command that opens the player, for a person.
+    /// Returns the report as text for the terminal: a table of the models, a list of the files in `folder`, and the
+    /// command that opens the player page.
     pub fn text(&self, folder: &Path) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
@@ -344,7 +355,7 @@ impl DemoReport {
     }
 }
 
-/// Returns the usual command of this system that opens a file in its program.
+/// Returns the shell command of this operating system that opens a file in its default application.
 fn opener() -> &'static str {
     match std::env::consts::OS {
         "macos" => "open",

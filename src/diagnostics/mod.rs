@@ -1,5 +1,6 @@
-//! Checks and experiments of the program itself: the demo, generated scenes, the self-check against f64 oracles, sweeps
-//! over sizes, and precision diagrams.
+//! Checks of the program and experiments with it: the demo, generated scenes, the self-check (comparison of computed
+//! numbers with slow f64 references), sweeps (quality at several compressed sizes), and precision diagrams (error
+//! against run time for several settings).
 
 pub mod demo;
 pub mod demo_scene;

@@ -1,10 +1,10 @@
-//! Trade-off curves of size against quality. Compresses with every method at every kept fraction, and with the preset
-//! `default` at one fraction and several numbers of refinement steps. Compares each result with the original on
-//! held-out (test) views.
+//! Trade-off curves of size against quality. The sweep compresses the input with every method at every fraction of kept
+//! Gaussians, and with the preset `default` at one fraction and several numbers of refinement steps. It compares each
+//! result with the original on held-out (test) views.
 //!
 //! Every point of a curve is a complete run as a user would start it, from opening the input to a result on disk, so
-//! that its time and memory are those of that run alone. The result is deleted once it is measured. Memory: that of
-//! `compress`, then that of `evaluate`.
+//! that the measured time and memory are those of this run alone. The result is deleted once it has been measured.
+//! Memory: that of `compress`, then that of `evaluate`.
 
 use std::fs;
 use std::path::PathBuf;
@@ -22,34 +22,36 @@ use crate::pipeline::Target;
 use crate::report::trade_off::{PAGE_FILE, page};
 use crate::scene::{InputOptions, open_scene};
 
-/// Options of a sweep, which measures trade-off curves of size against quality.
+/// Options of the command `sweep`, which measures trade-off curves of size against quality.
 #[derive(Debug, Clone)]
 pub struct SweepOptions {
-    /// Input and cameras. The requested split into training and test views is ignored.
+    /// Input and cameras. The split that these options request is ignored: Gaussians are scored by the training views.
     pub input: InputOptions,
     /// Compression methods to compare, in the order of the result.
     pub methods: Vec<Method>,
-    /// Fractions of the Gaussians to keep, in (0, 1].
+    /// Fractions of the Gaussians at which each method is run, in (0, 1].
     pub fractions: Vec<f64>,
-    /// Numbers of refinement steps with which the preset `default` is run; 0: no refinement.
+    /// Numbers of optimization steps of refinement with which the preset `default` is run at the fraction `steps_at`;
+    /// 0: no refinement.
     pub steps: Vec<u32>,
-    /// Fraction of the Gaussians kept by the runs in `steps`, in (0, 1].
+    /// Fraction of the Gaussians that the runs listed in `steps` keep, in (0, 1].
     pub steps_at: f64,
-    /// Number of runs of every point, at least 1. The median time is reported.
+    /// Number of runs for each point of the trade-off curves, at least 1. The median time of these runs is reported.
     pub runs: usize,
-    /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
+    /// Maximum number of frames at which results are compared with the original, evenly spaced; `None`: all frames.
     pub max_frames: Option<usize>,
-    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
+    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of the command `evaluate`.
     pub background: Option<[f32; 3]>,
-    /// Folder that gets `sweep.json`, `sweep.csv`, `knobs.csv` and the page with the curves.
+    /// Path of the output folder, for `sweep.json`, `sweep.csv`, `knobs.csv` and the page with the trade-off curves.
     pub output: PathBuf,
-    /// Policy if the output folder already exists.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
-/// Runs every method at every fraction, and methods that choose a size by themselves at that size too. Then runs the
-/// preset `default` with every number of refinement steps. Gaussians are scored by the training views; results are
-/// compared on the held-out views.
+/// Measures the trade-off curves and writes them to the output folder. Runs every method at every fraction; a method
+/// that chooses the number of Gaussians itself is also run once without a given fraction. Then runs the preset
+/// `default` with every number of refinement steps. Gaussians are scored by the training views; results are compared
+/// with the original on the held-out views.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the fractions or the output are invalid, or if a run fails. No files remain in this
@@ -130,7 +132,8 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     Ok(found)
 }
 
-/// Returns the result without points yet, and the file name that makes outputs of the same kind as the input.
+/// Opens the input. Returns the result of the sweep, which has no measured points yet, and the file name for outputs of
+/// the same kind as the input.
 fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&with_training_views(&options.input))?;
     let name = result_name(&scene)?;
@@ -151,20 +154,23 @@ fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-/// Returns the number of Gaussians that merging without pruning leaves; `None` until that point is measured.
+/// Returns the number of Gaussians that remain after merging without pruning, according to the points in `found`.
+/// Returns `None` if merging without pruning has not been measured yet.
 fn merge_only_count(found: &TradeOff) -> Option<usize> {
     let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether `method` merges without pruning and leaves more Gaussians than `fraction` allows.
+/// Returns whether `method` is merging without pruning and merging alone leaves more Gaussians than `fraction` allows,
+/// according to the points in `found`.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
     let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// Measures one point of the curves: runs `method` at the fraction `fraction`; `None`: at the size that the method
-/// chooses.
+/// Measures and returns one point of the trade-off curves by running `method`, whose recipe or baseline is `means`.
+/// `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their number. Also sets the number of
+/// compared views in `found`.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,

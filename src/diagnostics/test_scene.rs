@@ -1,4 +1,5 @@
-//! `splatsieve test-scene`: generates the test scene, compresses it and counts what happened to each kind of Gaussian.
+//! `splatsieve test-scene`: generates the test scene, compresses it, and counts for each body (object of the scene) how
+//! many of its Gaussians were kept, merged and pruned.
 //!
 //! Tests and `scripts/digests.py` make their inputs with it.
 
@@ -25,21 +26,22 @@ use crate::scene::{InputOptions, Scene};
 /// Options of the command `test-scene`.
 #[derive(Debug)]
 pub struct TestSceneOptions {
-    /// Number of Gaussians of the scene.
+    /// Number of Gaussians of the generated scene.
     pub gaussians: usize,
-    /// Number of frames of the scene.
+    /// Number of frames of the generated scene.
     pub frames: usize,
-    /// Number or fraction of the Gaussians that remain after the compression.
+    /// Number or fraction of the Gaussians that the compression keeps.
     pub kept: Target,
     /// Recipe of the compression.
     pub recipe: Recipe,
-    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary one, which is removed.
+    /// Path of the folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary folder, which is
+    /// deleted.
     pub output: Option<PathBuf>,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
-    /// Memory limit.
+    /// Limit on the memory of the run.
     pub memory: Budget,
-    /// Receiver of the events of the run.
+    /// Receiver of the progress and the messages of the run.
     pub events: Events,
 }
 
@@ -48,15 +50,17 @@ pub struct TestSceneOptions {
 pub struct TestSceneReport {
     /// Summary of the compression.
     pub summary: Summary,
-    /// For every body (object of the test scene): its number of Gaussians, of those that remain (unmerged or as leaders
-    /// of a merged cluster), and of those that were merged into others.
+    /// One entry per body (object of the test scene): the body, its number of Gaussians, the number of those that were
+    /// kept (unmerged, or as the first member of a merged group), and the number of those that were merged into others.
+    /// The rest was pruned.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
-/// Generates the scene, packs it and compresses it.
+/// Generates the test scene, writes it to a container and compresses this container.
 ///
 /// # Errors
-/// Fails if the requested number of Gaussians is impossible, if the compression fails, or if a file cannot be written.
+/// Fails if `kept` is not a valid fraction or number of the Gaussians of the scene, if the compression fails, or if a
+/// file cannot be written.
 pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     options.kept.resolve_count(options.gaussians)?;
     let Some(output) = &options.output else {
@@ -111,7 +115,8 @@ fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> 
 }
 
 impl TestSceneReport {
-    /// Returns the summary and a table of the bodies, for a person.
+    /// Returns the report as text for the terminal: the summary, and a table with the numbers of kept, merged and
+    /// pruned Gaussians of each body.
     pub fn text(&self) -> String {
         let mut out = self.summary.text(SummaryDetail::Most);
         // Writing to a String cannot fail.

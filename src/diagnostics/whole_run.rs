@@ -1,4 +1,5 @@
-//! A complete run as a user starts it, from opening the input to a result on disk, and the quality of its result.
+//! Complete run of the program as a user starts it, from opening the input to a result on disk, with measurement of its
+//! cost and of the quality of its result.
 
 use std::fs;
 use std::path::Path;
@@ -18,23 +19,25 @@ use crate::scene::{InputOptions, Scene};
 /// Settings shared by all complete runs that are compared with one another.
 #[derive(Debug, Clone)]
 pub(crate) struct WholeRun<'a> {
-    /// Input and cameras. Gaussians are scored by the training views.
+    /// Input and cameras. The split that these options request is ignored: Gaussians are scored by the training views.
     pub(crate) input: &'a InputOptions,
-    /// Path of a folder that does not exist yet. Results are in it while they are measured.
+    /// Path of a folder that does not exist yet. It is created to hold the result of a run, and deleted once this
+    /// result has been measured.
     pub(crate) scratch: &'a Path,
-    /// File name of the result, which determines the kind of output.
+    /// File name of the result, which determines the output format.
     pub(crate) name: &'a str,
-    /// Limits on the repetition of each run for measuring its time.
+    /// Limits on how often a run is repeated to measure its time.
     pub(crate) repeats: RepeatLimits,
-    /// Maximum number of frames at which results are compared, evenly spaced; `None`: all frames.
+    /// Maximum number of frames at which the result is compared with the original, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,
-    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
+    /// Background color of the renders: red, green, blue in [0, 1]; `None`: the default of the command `evaluate`.
     pub(crate) background: Option<[f32; 3]>,
 }
 
 impl WholeRun<'_> {
-    /// Compresses the input by the method `means`, measures time and memory, and calls `look` with the path of the
-    /// result, which is then deleted. Returns the value of `look` and the cost of the compression.
+    /// Compresses the input to `target` Gaussians by the recipe or baseline `means`, as often as `repeats` allows, and
+    /// measures time and memory. Then calls `look` with the path of the last result, and deletes this result. Returns
+    /// the value of `look` and the cost of the compression.
     ///
     /// # Errors
     /// Returns the errors of `compress` and of `look`.
@@ -62,7 +65,7 @@ impl WholeRun<'_> {
         Ok((seen, cost))
     }
 
-    /// Compares the result at the path `result` with the original on held-out (test) views.
+    /// Compares the compressed model at the path `result` with the original on held-out (test) views.
     ///
     /// # Errors
     /// Returns the errors of `evaluate`.
@@ -85,7 +88,8 @@ impl WholeRun<'_> {
     }
 }
 
-/// Returns the file name that makes the output of the same kind as the input of `scene`.
+/// Returns the file name for a result of the same kind as the input of `scene`: `result.gseq` for a container, `result`
+/// for any other input.
 ///
 /// # Errors
 /// Fails if the index of a container cannot be read.
@@ -93,7 +97,7 @@ pub(crate) fn result_name(scene: &Scene) -> Result<&'static str> {
     Ok(if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" })
 }
 
-/// Returns `input` with the training views as the views by which Gaussians are scored.
+/// Returns a copy of `input` that requests the training views as the views by which Gaussians are scored.
 pub(crate) fn with_training_views(input: &InputOptions) -> InputOptions {
     InputOptions { split: Some(Split::Train), ..input.clone() }
 }

@@ -1,5 +1,5 @@
-//! Static baselines of the literature: pruning by one property of one frame state, without regard to time or visibility
-//! (the paper's "opacity/scale thresholds"), and pruning at random.
+//! Static baselines of the literature: pruning by one property of the Gaussians at one frame, without regard to time or
+//! visibility (the paper's "opacity/scale thresholds"), and pruning at random.
 
 use std::path::Path;
 
@@ -15,20 +15,21 @@ use crate::pipeline::stages::write::write_without_companions;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
 
-/// Property by which a baseline ranks Gaussians, largest first; ties are ordered by hashed id.
+/// Property by which a baseline ranks the Gaussians. It keeps the Gaussians with the largest values; ties are ordered
+/// by a hash of the id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
-    /// By opacity, largest first.
+    /// Ranking by opacity, largest first.
     Opacity,
-    /// By the largest of the three scales, in descending order.
+    /// Ranking by the largest of the three scales of a Gaussian, largest first.
     Scale,
-    /// In random order: by a hash of the id of the Gaussian.
+    /// Ranking in random order: by a hash of the id of the Gaussian.
     Random,
 }
 
-/// Prunes an input to `target` Gaussians by `baseline`, writes the result to `output` and returns its bytes. `None`
-/// keeps all Gaussians. Ranks the canonical Gaussians of a model with a deformation field, otherwise the state of the
-/// first frame.
+/// Prunes an input to `target` Gaussians by `baseline`, writes the result to `output` and returns its size in bytes. If
+/// `target` is `None`, all Gaussians are kept. The canonical Gaussians are ranked if the model has a deformation field,
+/// otherwise the Gaussians at the first frame.
 ///
 /// # Errors
 /// Fails if the input cannot be opened or read, if it cannot be written in the format of `output`, or if writing fails.
@@ -50,7 +51,8 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// Returns the `target_count` ids with the largest property, in increasing order.
+/// Returns the `target_count` ids in `ids` with the largest values of the property by which `baseline` ranks, sorted by
+/// id. `state`: attributes of the Gaussians, in the row of their id.
 fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;

@@ -1,4 +1,4 @@
-//! Cost of a piece of work: time and memory of repeated runs.
+//! Measurement of the time and memory of work that is repeated.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,19 +11,19 @@ use crate::machine::{peak_memory_bytes, reset_peak_memory};
 pub struct Cost {
     /// Number of runs.
     pub runs: usize,
-    /// Wall-clock seconds of a run.
+    /// Wall-clock seconds of one run.
     pub seconds: MedianAndRange,
-    /// CPU seconds of a run, over all threads; `None` if the system does not report them.
+    /// CPU seconds of one run, summed over all threads; `None` if the system does not report them.
     pub processor_seconds: Option<MedianAndRange>,
-    /// Maximum resident memory of the process over all runs, including memory that the work does not use; `None` if the
-    /// system does not report it.
+    /// Maximum resident memory of the process in bytes over all runs, including memory that the work does not use;
+    /// `None` if the system does not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
 /// Median and range of the values of repeated runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MedianAndRange {
-    /// Median; the mean of both middle values if their number is even.
+    /// Median; the mean of the two middle values if the number of values is even.
     pub median: f64,
     /// Smallest value.
     pub least: f64,
@@ -32,7 +32,7 @@ pub struct MedianAndRange {
 }
 
 impl MedianAndRange {
-    /// Computes the spread of `values`.
+    /// Computes the median, smallest and largest of `values`.
     ///
     /// # Panics
     /// Panics if `values` is empty.
@@ -47,23 +47,23 @@ impl MedianAndRange {
     }
 }
 
-/// Limits on the repetition of work.
+/// Limits on how often a piece of work is repeated to measure it.
 #[derive(Debug, Clone, Copy)]
 pub struct RepeatLimits {
     /// Maximum number of runs; the work always runs at least once.
     pub most: usize,
-    /// Total seconds after which no further run starts.
+    /// Total seconds of all runs after which no further run starts.
     pub enough: f64,
 }
 
 impl RepeatLimits {
-    /// Returns `most` runs without a time limit.
+    /// Returns limits that allow exactly `most` runs (at least one), without a time limit.
     pub fn exactly(most: usize) -> RepeatLimits {
         RepeatLimits { most, enough: f64::INFINITY }
     }
 
-    /// Runs `work` repeatedly and returns the value of the last run with the cost of all runs. Calls `clear` between
-    /// two runs, outside the measurement.
+    /// Runs `work` repeatedly within these limits. Returns the value of the last run, and the cost of the runs. Calls
+    /// `clear` between two runs; its time is not measured.
     ///
     /// # Errors
     /// Fails if `work` or `clear` fails.

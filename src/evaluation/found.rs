@@ -1,7 +1,8 @@
 //! Result of an evaluation as JSON, text and CSV: scores of every view and their means.
 //!
-//! Input: scores of every (frame, view), by frame, then view. Output: means over all views, per view and per frame, as
-//! JSON and text, and the scores themselves as CSV. Means are arithmetic and summed in the order of the views.
+//! Input: scores of every (frame, view) pair, sorted by frame, then view. Output: means over all views, per view and
+//! per frame, as JSON and text, and the scores themselves as CSV. Means are arithmetic and summed in the order of the
+//! views.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -17,7 +18,7 @@ use crate::models::ModelSize;
 use crate::models::size::format_ratio;
 use crate::pipeline::summary::CameraSummary;
 
-/// Pair of values, for the original and the compressed model.
+/// Pair of values: one for the original model and one for the compressed model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ByModel<T> {
     /// Value of the original model.
@@ -26,27 +27,28 @@ pub struct ByModel<T> {
     pub compressed: T,
 }
 
-/// Scores of one image against another.
+/// Scores of one image compared with another image.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ImageScore {
     /// PSNR, dB ([`crate::metrics::psnr`]).
     pub psnr: f64,
     /// SSIM ([`crate::metrics::ssim`]).
     pub ssim: f64,
-    /// Temporal error since the previous image of the view ([`crate::metrics::temporal_error`]); `None` for its first.
+    /// Temporal error (flicker) since the previous image of the same view ([`crate::metrics::temporal_error`]); `None`
+    /// for the first image of a view.
     pub temporal: Option<f64>,
     /// FLIP ([`crate::metrics::flip`]); `None` if it was not requested.
     pub flip: Option<f64>,
 }
 
-/// Scores of one (frame, view).
+/// Scores of one view at one frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ViewScores {
-    /// Frame of the sequence.
+    /// Index of the frame in the sequence.
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// View number.
+    /// Number of the view in the data set.
     pub view: u32,
     /// Scores of the compressed model against the original.
     pub loss: ImageScore,
@@ -58,7 +60,7 @@ pub struct ViewScores {
 /// Mean scores over a set of views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct QualityMeans {
-    /// Number of (frame, view) pairs.
+    /// Number of (frame, view) pairs over which scores are averaged.
     pub pairs: usize,
     /// Mean PSNR, dB.
     pub psnr: f64,
@@ -74,9 +76,9 @@ pub struct QualityMeans {
 /// Mean scores over all frames of one view.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ViewMeans {
-    /// View number.
+    /// Number of the view in the data set.
     pub view: u32,
-    /// Means over the frames of this view.
+    /// Means of the scores over the frames of this view.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
@@ -84,93 +86,95 @@ pub struct ViewMeans {
 /// Mean scores over all views of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameMeans {
-    /// Frame of the sequence.
+    /// Index of the frame in the sequence.
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// Means over the views of this frame; the temporal error refers to the previous evaluated frame.
+    /// Means of the scores over the views of this frame. Temporal errors are those since the previous evaluated frame.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
 
-/// Mean scores of one set of images against another.
+/// Mean scores of one set of images compared with another, such as renders with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Means over all views.
+    /// Mean scores over all views.
     #[serde(flatten)]
     pub overall: QualityMeans,
-    /// Means per view, by view number.
+    /// Means over the frames of each view, by increasing view number.
     pub per_view: Vec<ViewMeans>,
-    /// Means per frame, in order.
+    /// Means over the views of each frame, by increasing frame.
     pub per_frame: Vec<FrameMeans>,
 }
 
 /// Comparison of both models with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TruthComparison {
-    /// Folder of the photographs.
+    /// Path of the folder of the photographs.
     pub folder: String,
-    /// Number of views on which the models are compared; `pairs` of them have a photograph.
+    /// Number of views on which the models are compared. Only [`QualityMeans::pairs`] of them have a photograph.
     pub of: usize,
-    /// Scores of the compressed model.
+    /// Mean scores of the compressed model against the photographs.
     #[serde(flatten)]
     pub compressed: Comparison,
-    /// Scores of the original model against the photographs, as the reference for the loss.
+    /// Mean scores of the original model against the photographs, the reference for the scores of the compressed model.
     pub original: Comparison,
 }
 
-/// Mean scores of the compressed model against the original, separately for views inside the rig of the training
-/// cameras and outside it ([`RigCone`](crate::scene::outside::RigCone)).
+/// Mean scores of the compressed model against the original, separately for views whose cameras are inside and outside
+/// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::outside::RigCone)).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct RigSides {
-    /// Means over the views at the training cameras and between them; `None` if there are no such views.
+    /// Means over the views inside the rig: in the directions of the training cameras and between them. `None` if there
+    /// are no such views.
     pub inside: Option<QualityMeans>,
-    /// Means over the views outside.
+    /// Means over the views outside the rig.
     pub outside: QualityMeans,
 }
 
-/// Result of an evaluation.
+/// Result of the evaluation of a compressed model.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
     /// Name and version of the program.
     pub tool: String,
-    /// Paths of the models, as given.
+    /// Paths of both models, as given.
     pub path: ByModel<String>,
-    /// Numbers of Gaussians.
+    /// Numbers of Gaussians of both models.
     pub count: ByModel<usize>,
-    /// Bytes of each model, divided by purpose ([`ModelSize`]).
+    /// Total size of each model in bytes.
     pub bytes: ByModel<u64>,
-    /// Bytes of the models by part.
+    /// Size of each model in bytes, divided into parts, such as canonical Gaussians and deformation field.
     pub size: ByModel<ModelSize>,
-    /// Cameras of the evaluation.
+    /// Origin and number of the cameras, and number of the views on which the models are compared.
     pub cameras: CameraSummary,
     /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
-    /// Scores of the compressed model against the original.
+    /// Mean scores of the compressed model against the original.
     #[serde(flatten)]
     pub loss: Comparison,
-    /// Mean scores of the views from directions between the training cameras, and of the views outside; `None` if no
-    /// view is outside, or if the cameras have no training views.
+    /// Mean scores of the views inside the rig of the training cameras (in their directions and between them), and of
+    /// the views outside it; `None` if no view is outside, or if the cameras have no training views.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rig_sides: Option<RigSides>,
-    /// Scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
+    /// Mean scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
-    /// Render time of both models; `None` if it was not measured.
+    /// Time of rendering one view with each model, milliseconds; `None` if it was not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_ms: Option<RenderTime>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Notes about the cache folder, which are not part of the result.
+    /// Notes for the user about the cache folder, which are not part of the result.
     #[serde(skip)]
     pub work_notes: Vec<String>,
-    /// Scores of every view, for the CSV.
+    /// Scores of every view, for the CSV file.
     #[serde(skip)]
     pub views: Vec<ViewScores>,
 }
 
 impl QualityMeans {
-    /// Computes the means of `scores`. Without scores, `pairs` is 0 and the means are NaN, which JSON writes as null.
+    /// Computes the means of `scores`. Without scores, `pairs` is 0, and PSNR and SSIM are NaN, which JSON writes as
+    /// null.
     fn from_scores(scores: &[ImageScore]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let all = |value: fn(&ImageScore) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
@@ -189,10 +193,9 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages the score that `score` selects from each view, over the views that have it. Returns `None` if none has
-    /// it.
-    ///
-    /// `pictures` is sorted by frame.
+    /// Averages scores over all `pictures`, over the frames of each view, and over the views of each frame. `pictures`
+    /// must be sorted by frame. `score` returns the score to average, or `None` to leave out this view at this frame.
+    /// Returns `None` if no score is left.
     pub fn from_views(
         pictures: &[ViewScores],
         score: impl Fn(&ViewScores) -> Option<ImageScore>,
@@ -229,8 +232,8 @@ impl Comparison {
 }
 
 impl RigSides {
-    /// Averages the scores `views` on each side of the rig. `is_outside` states for each view whether it is outside.
-    /// Returns `None` if no view is outside.
+    /// Averages the scores of the compressed model against the original, separately for views inside and outside the
+    /// rig. `is_outside` states for each of `views` whether it is outside. Returns `None` if no view is outside.
     pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<RigSides> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);
@@ -242,7 +245,7 @@ impl RigSides {
 }
 
 impl Evaluation {
-    /// Returns the evaluation with only the last component of every path, for writing to a file.
+    /// Returns the evaluation with every path reduced to its last component, for writing to a file.
     pub fn without_folders(mut self) -> Evaluation {
         let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
         for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
@@ -251,7 +254,8 @@ impl Evaluation {
         self
     }
 
-    /// Returns a text for the terminal: models, table of mean scores, worst view and worst frame, notes.
+    /// Returns the evaluation as text for the terminal: both models, a table of mean scores, the worst view and the
+    /// worst frame, and the notes.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let ByModel { original, compressed } = self.count;
@@ -319,7 +323,7 @@ impl Evaluation {
         out
     }
 
-    /// Returns a CSV table with one row per view; a missing value is an empty field.
+    /// Returns the scores as a CSV table with one row per (frame, view) pair. A missing value is an empty field.
     pub fn csv(&self) -> String {
         let with_flip = self.loss.overall.flip.is_some();
         let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };

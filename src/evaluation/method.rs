@@ -1,37 +1,38 @@
-//! Compression methods that `sweep` compares: presets, parts of presets, and pruning by one property.
+//! Compression methods that the command `sweep` compares: presets, presets without some of their stages, and pruning by
+//! one property.
 
 use super::baseline::Baseline;
 use crate::error::{Error, Result};
 use crate::pipeline::PruneOrMerge;
 use crate::recipe::{Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticScoreTerm};
 
-/// Compression method.
+/// Compression method that `sweep` can compare with others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Method {
     /// Preset `default`.
     Default,
     /// Preset `default` without refinement.
     NoRefine,
-    /// Preset `paper`: prunes and merges.
+    /// Preset `paper`, which prunes and merges.
     Paper,
     /// Preset `paper` without merging.
     PaperPrune,
     /// Preset `paper` without pruning.
     PaperMerge,
-    /// Pruning by visible contribution C.
+    /// Pruning by the visible contribution C (Σ alpha · transmittance).
     Visible,
-    /// Pruning by projected coverage C.
+    /// Pruning by the projected coverage C (opacity times projected area, occlusion ignored).
     Projected,
     /// Pruning by opacity.
     Opacity,
-    /// Pruning by the largest scale.
+    /// Pruning by the largest of the three scales.
     Scale,
-    /// Pruning at random.
+    /// Pruning in random order.
     Random,
 }
 
 impl Method {
-    /// Every method, those of this project first.
+    /// List of all methods, the presets of this project first.
     pub const ALL: [Method; 10] = [
         Method::Default,
         Method::NoRefine,
@@ -45,7 +46,7 @@ impl Method {
         Method::Random,
     ];
 
-    /// Returns the name on the command line and in results.
+    /// Returns the name of this method on the command line and in results.
     pub fn name(self) -> &'static str {
         match self {
             Method::Default => "default",
@@ -61,12 +62,14 @@ impl Method {
         }
     }
 
-    /// Returns the same method with refinement; `None` unless this method is [`Method::NoRefine`].
+    /// Returns the same method with refinement: [`Method::Default`] for [`Method::NoRefine`], `None` for any other
+    /// method.
     pub fn with_refinement(self) -> Option<Method> {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
-    /// Returns how the method compresses: a recipe with its stages, or a baseline.
+    /// Returns the recipe by which this method compresses, with the stages that run (pruning, merging or both), or the
+    /// baseline by which it prunes.
     ///
     /// # Errors
     /// Fails only if a built-in preset does not parse.
@@ -101,22 +104,24 @@ impl Method {
         }
     }
 
-    /// Returns whether the method chooses the number of Gaussians itself, by thresholds.
+    /// Returns whether this method can choose the number of Gaussians itself, by thresholds.
     pub(crate) fn chooses_size(self) -> bool {
         matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
     }
 }
 
-/// Recipe or baseline by which a method compresses.
+/// Recipe or baseline by which a method compresses. The second field of a recipe states which stages run: pruning,
+/// merging or both.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),
 }
 
-/// Name of the recipe parameter that `--steps` varies.
+/// Name of the recipe parameter that the option `--steps` varies.
 pub(crate) const STEPS: &str = "refine_steps";
 
-/// Returns [`Method::Default`] with `steps` refinement steps; the steps before prune steps change in proportion.
+/// Returns the preset `default` with `steps` optimization steps of refinement, as a method. The number of steps before
+/// each prune step changes in proportion to `steps`.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
     Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.with_refinement_steps(steps)), PruneOrMerge::Both))
 }

@@ -1,8 +1,10 @@
 //! Evaluation: compares renders of the original and the compressed model with each other and with photographs.
 //!
 //! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. For the
-//! temporal error, the last images of every view that occurs again are kept: 12 bytes per pixel for two images per
-//! view, or three with photographs. A shard first renders the last images of its views again.
+//! temporal error (flicker between two frames of a view), the last images of every view that occurs again are kept: 12
+//! bytes per pixel and image, with two images per view (renders of both models), or three with photographs. A run that
+//! computes only a shard (a range of the (frame, view) pairs) first renders again, for each view in its range, the last
+//! image before the range.
 
 pub mod baseline;
 pub mod cost;
@@ -40,35 +42,36 @@ use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
-/// Name of the stage, for progress and cache entries.
+/// Name of the evaluation stage, for progress and cache entries.
 const NAME: &str = "evaluate";
 
-/// Options of an evaluation.
+/// Options of an evaluation of a compressed model.
 #[derive(Debug, Clone)]
 pub struct EvaluateOptions {
-    /// Original model and its cameras. The split that these options request is ignored; see `views`.
+    /// Original model and its cameras. The split in these options is ignored: `views` selects the views.
     pub original: InputOptions,
     /// Path of the compressed model, in any format.
     pub compressed: PathBuf,
-    /// Folder of photographs; `None`: compare with the original only.
+    /// Folder of photographs with which both models are compared; `None`: the models are compared only with each other.
     pub ground_truth: Option<PathBuf>,
-    /// Views to compare.
+    /// Views on which the models are compared.
     pub views: ViewSet,
-    /// Maximum number of frames, spread evenly; `None`: all.
+    /// Maximum number of frames, spread evenly over the sequence; `None`: all frames.
     pub max_frames: Option<usize>,
-    /// Maximum number of views, spread over frames and cameras; `None`: all.
+    /// Maximum number of views, spread over frames and cameras; `None`: all views.
     pub max_views: Option<usize>,
     /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
     pub background: Option<[f32; 3]>,
     /// Whether to compute FLIP, which takes longer than all other scores.
     pub flip: bool,
-    /// CSV file for the scores of every view.
+    /// Path of the CSV file for the scores of every view; `None`: no such file is written.
     pub csv: Option<PathBuf>,
-    /// Policy for an existing CSV file.
+    /// Policy for a CSV file that already exists.
     pub overwrite: Replace,
 }
 
-/// Renders both models from the selected views and compares them.
+/// Opens the original and the compressed model, renders both from the selected views and compares the renders. Returns
+/// the evaluation, or a report if the run computes only one shard.
 ///
 /// # Errors
 /// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
@@ -77,8 +80,8 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
 
-/// Runs [`evaluate`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
-/// error [`Error::ShardDone`].
+/// Does the work of [`evaluate`]. A run that computes only one shard (part of a divided stage) ends with the error
+/// [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, TargetKind::File, &options.input_paths(), options.overwrite)?;
@@ -95,7 +98,8 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     Ok(evaluation)
 }
 
-/// Returns the resource estimate of rendering and comparing two models. `work` holds the larger number of Gaussians.
+/// Returns the estimate of the memory and time for rendering and comparing two models. The number of Gaussians in
+/// `work` must be that of the larger model.
 pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = pictures::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
@@ -106,7 +110,7 @@ pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstim
 }
 
 impl EvaluateOptions {
-    /// Returns all paths that are read, so that none of them is overwritten.
+    /// Returns the paths of all files and folders that an evaluation reads, which must not be overwritten.
     pub fn input_paths(&self) -> Vec<&Path> {
         let mut inputs = vec![self.original.path.as_path(), &self.compressed];
         inputs.extend(self.original.cameras.as_deref());
@@ -115,7 +119,7 @@ impl EvaluateOptions {
     }
 }
 
-/// Original and compressed model, opened, with the views on which they are compared.
+/// Original and compressed model, both open, with the views on which they are compared.
 pub struct ModelPair {
     /// Original model with the cameras of all splits.
     pub scene: Scene,
@@ -130,7 +134,7 @@ pub struct ModelPair {
 }
 
 impl ModelPair {
-    /// Opens both models and selects the views. Ignores the CSV file of `options`.
+    /// Opens both models and selects the views. The CSV file in `options` is ignored.
     ///
     /// # Errors
     /// Fails if inputs, cameras or the folder of photographs cannot be read, or if the models have different frames.
@@ -166,7 +170,8 @@ impl ModelPair {
         })
     }
 
-    /// Plans the memory of the comparison; `needs` returns the estimates of its stages.
+    /// Plans the memory of the comparison within `budget`. Sets the limits of the scene (such as the numbers of frames
+    /// and views in memory at a time) by this plan. `needs` returns the resource estimates of the stages that will run.
     ///
     /// # Errors
     /// Fails if the stages cannot run within `budget`.
@@ -189,8 +194,10 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and
-    /// ends.
+    /// Compares all views and returns the evaluation. With a cache folder, several runs can share the work in shards
+    /// (ranges of the views):
+    /// - A run that is limited to one shard stores the scores of its views and ends with [`Error::ShardDone`].
+    /// - A run without such a limit computes the missing shards and joins the scores of all shards.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -200,8 +207,9 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// Compares all views as the first stage of a longer run: like [`ModelPair::evaluate`], but a run of one shard goes
-    /// on to the next stage if the results of all shards are in the cache.
+    /// Compares all views, as [`ModelPair::evaluate`] does, but as the first stage of a longer run. The difference: a
+    /// run that is limited to one shard returns the evaluation if the scores of all shards are in the cache, so that it
+    /// can go on to the next stage.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -210,8 +218,9 @@ impl ModelPair {
         self.evaluation(self.compute_sharded(NAME, compute)?)
     }
 
-    /// Compares all views in one process and calls `observe` with the images of every view and the frame state of the
-    /// original, from any thread. Returns the values of `observe` in the order of [`Evaluation::views`].
+    /// Compares all views in one process, and also calls `observe` for every view, from any thread. Arguments of
+    /// `observe`: the frame state of the original, the camera, and the images of the view. Returns the evaluation, and
+    /// the values of `observe` in the order of [`Evaluation::views`].
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -223,8 +232,9 @@ impl ModelPair {
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// Returns the values of `observe` for every view, like [`ModelPair::observe`], without scores. Runs as the stage
-    /// `name`, which shards can divide.
+    /// Renders every view and returns the values of `observe` for all views, in order. `observe` gets the same
+    /// arguments as in [`ModelPair::observe`], but no scores are computed. The work is done as the stage `name`, which
+    /// can be divided into shards.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -249,8 +259,8 @@ impl ModelPair {
         })
     }
 
-    /// Computes one value per view with `compute`, as the stage `name`, which shards can divide. Returns the values in
-    /// order.
+    /// Computes one value per view, as the stage `name`, which can be divided into shards (ranges of views). `compute`
+    /// returns the values of a range of views. Returns the values of all views in order.
     fn compute_sharded<T: Serialize + DeserializeOwned>(
         &self,
         name: &str,
@@ -267,7 +277,7 @@ impl ModelPair {
         })
     }
 
-    /// Builds the evaluation from the scores of all views.
+    /// Builds the evaluation from `scores`, the scores of all views in order.
     fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
         let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| ViewScores {
@@ -315,14 +325,16 @@ impl ModelPair {
         })
     }
 
-    /// Returns for every view whether it is outside the rig of the training cameras; `false` for all if there are none.
+    /// Returns, for every view, whether its camera is outside the rig of the training cameras, that is, outside the
+    /// cone that their directions span. Returns `false` for all views if there are no training cameras.
     fn outside_views(&self) -> Vec<bool> {
         let rig = &self.scene.rig;
         let cone = RigCone::new(&training_cameras(rig));
         self.views.iter().map(|view| cone.is_outside(&rig.cameras[view.camera as usize])).collect()
     }
 
-    /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.
+    /// Returns the cache key of the scores. It contains the compressed model, the photographs, the views, the
+    /// background, and whether FLIP is computed. The cache adds the original and its cameras to the key.
     fn key(&self) -> Result<CacheKey> {
         if !self.scene.work.is_enabled() {
             return Ok(CacheKey::NONE);
@@ -332,8 +344,11 @@ impl ModelPair {
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders the views with the indices `places` in [`Evaluation::views`] again and passes them to `see`, each
-    /// with the frame state of the original. Keeping all renders would take memory that grows with frames and views.
+    /// Renders some views again and returns the values of `see` for them, sorted by the index of the view. `places`:
+    /// indices of these views in [`Evaluation::views`], in any order. Arguments of `see`: the index, the frame state of
+    /// the original, the camera, and the images of the view.
+    ///
+    /// Renders are not kept from the comparison, because they would take memory that grows with frames and views.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -361,8 +376,9 @@ impl ModelPair {
         self.views[place]
     }
 
-    /// Renders `pictures` with both models and returns the values of `see`, in order. The first image is of the
-    /// original. The views may be any views of the cameras of the scene.
+    /// Renders `pictures` with both models and returns the values of `see` for them, in order. `see` gets the render of
+    /// the original, then that of the compressed model. `pictures` may be any views of the cameras of the scene, and
+    /// must be sorted by frame.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
@@ -383,7 +399,8 @@ impl ModelPair {
         Ok(found)
     }
 
-    /// Returns the time of rendering a view of either model; the values differ between runs.
+    /// Measures and returns the median time of rendering one view with each model, milliseconds. The times differ
+    /// between runs. Returns `None` if there are no views, or if a thread cannot be started.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -396,7 +413,8 @@ impl ModelPair {
         self.compressed.source().info().count
     }
 
-    /// Calls `visit` with batches of views, each with the frame states of the original and the compressed model.
+    /// Calls `visit` with batches of the views `pictures`, in order. A batch holds, for each of its views, the frame
+    /// states of the original and of the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
         for_each_view_batch(
@@ -408,8 +426,9 @@ impl ModelPair {
         )
     }
 
-    /// Computes the scores and the values of `observe` for the views in `range`. For the temporal error, first renders
-    /// the last images of these views before `range` again.
+    /// Returns, for the views in `range`, the scores and the values of `observe`. The temporal error of a view compares
+    /// it with the image of the same view at an earlier frame. So the last image before `range` of every view in
+    /// `range` is rendered again first.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -461,7 +480,7 @@ impl ModelPair {
         Ok((all, observed))
     }
 
-    /// Renders a view with both models and reads its photograph, if there is one.
+    /// Renders a view with both models, and reads its photograph if there is one.
     fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
         let &ViewStates { picture, camera, .. } = view;
         Ok(RenderedViews {
@@ -475,8 +494,9 @@ impl ModelPair {
     }
 }
 
-/// Returns, for every view that occurs in `range`, its last occurrence among the first `start` of `all`, in their
-/// order.
+/// Returns, for every view that occurs in a range of images, the last image of this view before the range. `all`:
+/// (frame, view) pairs of all images, sorted by frame. `range`: pairs of the images in the range, which begins at the
+/// index `start` of `all`. The result is in the order of `all`.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =
@@ -485,21 +505,23 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
     last
 }
 
-/// Scores of one view: of the compressed model against the original, and of both against the photograph, if any.
+/// Scores of one view: first of the compressed model against the original, then of each model against the photograph if
+/// there is one.
 type PairScores = (ImageScore, Option<ByModel<ImageScore>>);
 
-/// Images of one (frame, view), all of the same size.
+/// Images of one view at one frame, all of the same size.
 pub struct RenderedViews {
     /// Render of the original.
     pub original: Image,
     /// Render of the compressed model.
     pub compressed: Image,
-    /// Photograph; `None` if the view has none.
+    /// Photograph; `None` if there is none of this view at this frame.
     pub truth: Option<Image>,
 }
 
 impl RenderedViews {
-    /// Computes the scores; `before` holds the previous images of the same view, for the temporal error.
+    /// Computes the scores of these images. `before`: images of the same view at the previous frame, for the temporal
+    /// error. `with_flip`: whether to compute FLIP.
     fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
         let size = |rendered: &RenderedViews| (rendered.original.width, rendered.original.height);
         // The image size can change with the camera of a view; then there is no temporal error.
@@ -518,7 +540,8 @@ impl RenderedViews {
     }
 }
 
-/// Computes the scores of `a` against `b`; `before` holds the same two images at the previous frame of the view.
+/// Computes the scores of the image `a` against the image `b`. `before`: images that correspond to `a` and `b` at the
+/// previous frame of the view; if `None`, no temporal error is computed.
 fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageScore {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
     ImageScore { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }

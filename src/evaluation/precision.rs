@@ -1,4 +1,5 @@
-//! Result of `precision` as JSON, text and CSV: run time and error of every value of the settings of each stage.
+//! Result of the command `precision` as JSON, text and CSV: run time and errors at every tried value of the settings of
+//! each stage.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -8,12 +9,12 @@ use serde::{Deserialize, Serialize};
 use crate::evaluation::cost::{Cost, MedianAndRange};
 use crate::files::csv::{known, table};
 
-/// Result of `precision`: measurements of all varied settings, and their common conditions.
+/// Result of the command `precision`: measurements of all varied settings, and the conditions that they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
     /// Name and version of the program.
     pub tool: String,
-    /// Path of the input, as given.
+    /// Name of the input: the last component of its path.
     pub path: String,
     /// Hash of the bytes of the input.
     pub digest: String,
@@ -21,45 +22,46 @@ pub struct PrecisionDiagram {
     pub gaussians: usize,
     /// Number of frames of the input.
     pub frames: usize,
-    /// Maximum number of frames for scoring and ranking, spread evenly from first to last.
+    /// Number of frames that are used for scoring and ranking, spread evenly from first to last.
     #[serde(rename = "frames_looked_at")]
     pub frames_scored: usize,
-    /// Number of views of the frames that are used for scoring and ranking.
+    /// Number of views, at these frames, that are used for scoring and ranking.
     pub pictures: usize,
-    /// Number of views on which rankings are judged: test views if there are any.
+    /// Number of views on which the settings are judged: there, renders of their results are compared with renders of
+    /// the whole model. Test views are used if there are any.
     pub judged: usize,
     /// File of the cameras, or description of the virtual rig.
     pub cameras: String,
-    /// Number of Gaussians that every setting keeps.
+    /// Number of Gaussians that are kept with every setting.
     pub kept: usize,
-    /// Number of threads, except where the number of threads is varied.
+    /// Number of threads of all measurements except those that vary the number of threads.
     pub threads: usize,
-    /// Maximum number of runs of each setting; fewer where the runs so far took
-    /// [`PrecisionDiagram::max_setting_seconds`] seconds in all.
+    /// Maximum number of runs of each setting. There are fewer if the total time of its runs reaches
+    /// [`PrecisionDiagram::max_setting_seconds`].
     pub runs: usize,
-    /// Total time of the runs of one setting after which it is not run again, seconds.
+    /// Total time in seconds of the runs of one setting after which this setting is not run again.
     #[serde(rename = "enough")]
     pub max_setting_seconds: f64,
-    /// Knobs (settings, or groups of settings) that were varied.
+    /// Results of the varied knobs (parameters, or groups of parameters).
     pub knobs: Vec<PrecisionKnob>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Source of an error.
+/// Origin of an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ErrorSource {
-    /// Sampling, or a finite step.
+    /// Sampling, such as leaving out views, or a finite step size.
     Discretization,
-    /// Finite number of digits.
+    /// Rounding to a finite number of digits.
     Rounding,
     /// Replacement of a model by a smaller one.
     Model,
 }
 
 impl ErrorSource {
-    /// Returns the name in tables and CSV files.
+    /// Returns the name of this error source in tables and CSV files.
     pub fn name(self) -> &'static str {
         match self {
             ErrorSource::Discretization => "discretization",
@@ -69,20 +71,20 @@ impl ErrorSource {
     }
 }
 
-/// Setting, or group of settings, that trades run time for error.
+/// Results of one knob: a parameter, or a group of parameters, that trades run time for error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionKnob {
-    /// Name, as in `--knobs`.
+    /// Name of the knob, as in the option `--knobs`.
     pub name: String,
-    /// Description of the setting and of its errors.
+    /// Description of the knob and its errors, for the user.
     pub about: String,
-    /// Source of the error that the setting changes.
+    /// Source of the errors that the knob changes.
     pub source: ErrorSource,
-    /// One curve for each parameter of the knob.
+    /// Measurements of each parameter of the knob.
     pub curves: Vec<PrecisionCurve>,
 }
 
-/// Measurements of one parameter of a knob.
+/// Measurements of one parameter of a knob at several values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionCurve {
     /// Name of the parameter; the name in the recipe if it is a recipe parameter.
@@ -90,66 +92,72 @@ pub struct PrecisionCurve {
     /// Description of the reference values from which the errors are measured.
     #[serde(rename = "against")]
     pub reference: String,
-    /// Measurements in the order in which they were made, mostly from coarse to fine.
+    /// Measurements at each value of the parameter, in the order in which they were made; mostly from coarse to fine.
     #[serde(rename = "marks")]
     pub settings: Vec<PrecisionSetting>,
-    /// For each error, its observed order: the exponent with which it depends on the step size.
+    /// Observed orders of the errors: the exponents with which the errors depend on the step size.
     pub orders: Vec<ObservedOrder>,
-    /// Value of the parameter in the recipe; `None` if it was not measured.
+    /// Value that the recipe has for the parameter; `None` if this value was not measured.
     #[serde(rename = "own")]
     pub recipe_value: Option<f64>,
-    /// Coarsest value of the parameter such that, at this and all finer values, the error added to renders stays below
-    /// a tenth of the model's own error; `None` if there is none.
+    /// Coarsest sufficient value of the parameter: at this and all finer values, the error added to renders stays below
+    /// a tenth of the error of the compressed model itself. `None` if there is no such value.
     #[serde(rename = "enough")]
     pub sufficient_value: Option<f64>,
 }
 
-/// Measurements at one value of a parameter.
+/// Measurements with one setting, that is, at one value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
-    /// Value of the parameter.
+    /// Value of the varied parameter.
     pub value: f64,
-    /// Step h: errors grow as h^order. For sums, h is the number of frames.
+    /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, whose
+    /// rounding errors grow with the number of frames, h is this number.
     pub step: f64,
-    /// Time and memory of the runs.
+    /// Time and memory of the runs with this setting.
     pub cost: Cost,
-    /// Errors by name; [`axis_label`] describes them.
+    /// Errors of the results with this setting, by the name of the error; [`axis_label`] describes the names.
     pub errors: BTreeMap<String, f64>,
-    /// Mean PSNR on the views by which settings are judged, dB; `None` if the setting yields no model.
+    /// Mean PSNR in dB, against renders of the whole model, on the views by which settings are judged; `None` if the
+    /// setting yields no model.
     pub psnr: Option<f64>,
 }
 
 /// Observed order of one error: the exponent with which the error depends on the step size, from measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObservedOrder {
-    /// Name of the error.
+    /// Name of the error, as in [`PrecisionSetting::errors`].
     #[serde(rename = "of")]
     pub error: String,
-    /// Slope of log error against log step, by least squares.
+    /// Observed order: slope of log error against log step size, fitted by least squares.
     pub observed: f64,
-    /// Order of convergence that theory predicts; `None` if it predicts none.
+    /// Order of convergence of this error that theory predicts; `None` if theory predicts none.
     pub expected: Option<f64>,
 }
 
-/// Error name: root mean square error of renders with a setting against renders of the whole model, colors in [0, 1].
+/// Error name: root mean square error of renders of the model that a setting yields, against renders of the whole
+/// model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Error name: increase of the error [`RENDER_ERROR`] over that of the finest setting. The error of the finest setting
-/// counts as the error of the compressed model itself (see [`added_error`]).
+/// Error name: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
+/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
 /// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
 /// keeps.
 pub const SELECTION_DISTANCE: &str = "kept";
-/// Error name: relative error of the number of Gaussians that a setting keeps.
+/// Error name: relative error, against the finest setting, of the number of Gaussians that the thresholds of the recipe
+/// keep.
 pub const COUNT_ERROR: &str = "staying";
-/// Error name: largest relative error of the percentiles P1 and P99.
+/// Error name: largest relative error, against exact percentiles, of the percentiles P1 and P99 by which scores are
+/// normalized.
 pub const PERCENTILE_ERROR: &str = "percentiles";
-/// Error name: 1 if the bytes of the result differ from those of the first run, else 0.
+/// Error name: 1 if the result with a setting differs in any byte from the result with the first setting, else 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
-/// Maximum of the error [`ADDED_ERROR`] at the value [`PrecisionCurve::sufficient_value`] and all finer values.
+/// Upper limit of a small error [`ADDED_ERROR`]: at [`PrecisionCurve::sufficient_value`] and at all finer values, the
+/// error is below this limit.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
-/// Returns the axis label of the error called `error`.
+/// Returns the axis label of a diagram for the error with the name `error`.
 pub fn axis_label(error: &str) -> String {
     match error {
         RENDER_ERROR => "root mean square error of renders".to_owned(),
@@ -163,8 +171,10 @@ pub fn axis_label(error: &str) -> String {
 }
 
 impl PrecisionCurve {
-    /// Returns a curve of `marks` with the observed orders of all errors; `expected` lists the orders that theory
-    /// predicts. Infinite errors are removed.
+    /// Creates the curve of the parameter `name` from its measurements `marks`, and computes the observed order of
+    /// every error. `against`: description of the reference values of the errors. `own`: value of the parameter in the
+    /// recipe. `expected`: orders of convergence that theory predicts, by the name of the error. Removes infinite
+    /// errors, which JSON cannot represent.
     pub fn new(
         name: &str,
         against: &str,
@@ -202,8 +212,8 @@ impl PrecisionCurve {
     }
 }
 
-/// Returns the least-squares slope of log error against log step over the points with a step and an error above 0.
-/// Returns `None` for fewer than three such points or if all steps are equal.
+/// Returns the least-squares slope of log error against log step size, over those `points` (step, error) whose step and
+/// error are above 0. Returns `None` if these are fewer than three or all have the same step.
 fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
     let logs: Vec<(f64, f64)> = points
         .filter(|&(step, error)| step > 0.0 && error > 0.0)
@@ -217,7 +227,8 @@ fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
     (logs.len() >= 3 && variance > 0.0).then(|| covariance / variance)
 }
 
-/// Returns ‖a − b‖ / ‖b‖ over all values, or ‖a‖ if `b` is all zero.
+/// Returns the relative difference of the values `a` from the reference `b` in the L2 norm, ‖a − b‖ / ‖b‖. Returns ‖a‖
+/// if `b` is all zero.
 pub(crate) fn relative_l2(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>) -> f64 {
     let (off, all) = a.into_iter().zip(b).fold((0.0, 0.0), |(off, all), (a, b)| (off + (a - b) * (a - b), all + b * b));
     f64::sqrt(if all > 0.0 { off / all } else { off })
@@ -230,21 +241,23 @@ pub(crate) fn jaccard_distance(a: &[u32], b: &[u32]) -> f64 {
     if either == 0 { 0.0 } else { 1.0 - both as f64 / either as f64 }
 }
 
-/// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`:
-/// √(error² − finest²) / finest, as independent errors add in squares. Returns 0 if `error` is below `finest`.
+/// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`: √(`error`²
+/// − `finest`²) / `finest`. `error` is the whole error of the setting; independent errors add in squares. Returns 0 if
+/// `error` is below `finest`.
 pub(crate) fn added_error(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }
 
 impl PrecisionDiagram {
-    /// Returns the result as indented JSON.
+    /// Returns all measurements as indented JSON.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// Returns a CSV table with one row per error of every setting; a missing value is an empty field.
+    /// Returns the measurements as a CSV table with one row per error of every setting. A missing value is an empty
+    /// field.
     pub fn csv(&self) -> String {
         let names = [
             "knob",
@@ -286,12 +299,12 @@ impl PrecisionDiagram {
         table(&names, rows)
     }
 
-    /// Returns every curve with its knob.
+    /// Returns every curve together with the knob that it belongs to.
     fn curves(&self) -> impl Iterator<Item = (&PrecisionKnob, &PrecisionCurve)> {
         self.knobs.iter().flat_map(|knob| knob.curves.iter().map(move |curve| (knob, curve)))
     }
 
-    /// Returns a table for the terminal. A star marks the value in the recipe.
+    /// Returns the measurements as a table for the terminal. A star marks the value in the recipe.
     pub fn text(&self) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.

@@ -1,5 +1,5 @@
-//! Result of `sweep` as JSON, text and CSV: quality, size, time and memory of every method at every kept fraction, and
-//! of one method as one parameter varies.
+//! Result of the command `sweep` as JSON, text and CSV: quality, size, time and memory of every method at every kept
+//! fraction, and of one method at several values of one parameter.
 
 use std::fmt::Write as _;
 
@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::files::csv::{known, table};
 
-/// Result of a sweep: all points and their common conditions.
+/// Result of the command `sweep`: measurements of all methods, and the conditions that they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOff {
     /// Name and version of the program.
     pub tool: String,
-    /// Path of the input, as given.
+    /// Name of the input: the last component of its path.
     pub path: String,
     /// Hash of the bytes of the input.
     pub digest: String,
@@ -22,80 +22,83 @@ pub struct TradeOff {
     pub bytes: u64,
     /// Number of threads.
     pub threads: usize,
-    /// Number of (frame, view) pairs on which every point is compared with the original.
+    /// Number of (frame, view) pairs on which every result is compared with the original.
     pub pictures: usize,
     /// File of the cameras, or description of the virtual rig.
     pub cameras: String,
-    /// Number of runs of every point.
+    /// Number of runs of every measurement.
     pub runs: usize,
-    /// Points in the order of `--methods`, then by decreasing requested fraction.
+    /// Measurements in the order of the option `--methods`, then by decreasing requested fraction.
     pub points: Vec<TradeOffPoint>,
-    /// Curves of the parameters that were varied.
+    /// Curves of quality against time, one for each varied parameter.
     pub knobs: Vec<EffortCurve>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Measurements of one method at one kept fraction.
+/// Measurements of one method at one fraction of kept Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOffPoint {
-    /// Name of the method, as in `--methods`.
+    /// Name of the method, as in the option `--methods`.
     pub method: String,
-    /// Requested fraction of the Gaussians to keep; `None`: chosen by the method.
+    /// Requested fraction of the Gaussians to keep; `None` if the method chose the number of Gaussians.
     pub asked: Option<f64>,
-    /// Number of Gaussians of the result.
+    /// Number of Gaussians of the compressed model.
     pub count: usize,
-    /// Bytes of all files of the result.
+    /// Size of the compressed model in bytes, over all its files.
     pub bytes: u64,
-    /// Mean PSNR against renders of the original, dB.
+    /// Mean PSNR in dB of renders of the compressed model against renders of the original.
     pub psnr: f64,
-    /// Mean SSIM against renders of the original.
+    /// Mean SSIM of renders of the compressed model against renders of the original.
     pub ssim: f64,
-    /// Mean temporal error against renders of the original; `None` if no view occurs at two frames.
+    /// Mean temporal error (flicker) against renders of the original; `None` if no view occurs at two frames.
     pub temporal: Option<f64>,
     /// Wall-clock seconds of compression, from opening the input to the written result; median of all runs.
     pub seconds: f64,
-    /// Maximum resident memory during compression, over all runs; `None` if the system does not report it.
+    /// Maximum resident memory in bytes during compression, over all runs; `None` if the system does not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Measurements of one method at one kept fraction for several values of one parameter: quality against time.
+/// Curve of quality against time: measurements of one method at one fraction of kept Gaussians, for several values of
+/// one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortCurve {
     /// Name of the parameter in the recipe.
     pub parameter: String,
-    /// Measurements, one for each value of the parameter, by increasing value.
+    /// Measurements for each value of the parameter, by increasing value.
     pub settings: Vec<EffortSetting>,
 }
 
 /// Measurements at one value of the parameter of an [`EffortCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortSetting {
-    /// Value of the parameter.
+    /// Value of the varied parameter.
     pub value: u32,
-    /// Method, kept fraction and measurements.
+    /// Method, fraction of kept Gaussians, and measurements.
     #[serde(flatten)]
     pub point: TradeOffPoint,
 }
 
-/// CSV columns of a point.
+/// Columns in a CSV file that describe one point (method and kept fraction).
 const COLUMNS: [&str; 10] =
     ["method", "asked", "count", "fraction", "bytes", "psnr", "ssim", "temporal", "seconds", "peak_memory_bytes"];
 
 impl TradeOff {
-    /// Returns the sweep as indented JSON.
+    /// Returns the result of the sweep as indented JSON.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// Returns a CSV table with one row per point; a missing value is an empty field.
+    /// Returns the measurements of the methods ([`TradeOff::points`]) as a CSV table with one row per point (method and
+    /// kept fraction). A missing value is an empty field.
     pub fn csv(&self) -> String {
         table(&COLUMNS, self.points.iter().map(|point| self.row(point)))
     }
 
-    /// Returns a CSV table with one row per value of every varied parameter.
+    /// Returns the measurements of the varied parameters ([`TradeOff::knobs`]) as a CSV table with one row per value of
+    /// a parameter.
     pub fn knobs_csv(&self) -> String {
         let settings = self.knobs.iter().flat_map(|knob| knob.settings.iter().map(move |setting| (knob, setting)));
         let row = |(knob, setting): (&EffortCurve, &EffortSetting)| {
@@ -104,7 +107,7 @@ impl TradeOff {
         table(&[&["parameter", "value"], &COLUMNS[..]].concat(), settings.map(row))
     }
 
-    /// Returns the fields of [`COLUMNS`] of a point.
+    /// Returns the CSV fields of `point`, in the order of [`COLUMNS`].
     fn row(&self, point: &TradeOffPoint) -> Vec<String> {
         vec![
             point.method.clone(),
@@ -120,7 +123,7 @@ impl TradeOff {
         ]
     }
 
-    /// Returns a table for the terminal.
+    /// Returns the measurements of the methods and of the varied parameters as a table for the terminal.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let _ = writeln!(
@@ -151,7 +154,7 @@ impl TradeOff {
         out
     }
 
-    /// Returns the table row of a point.
+    /// Returns the row of `point` in the table for the terminal.
     fn line(&self, point: &TradeOffPoint) -> String {
         let temporal = point.temporal.map_or("-".to_owned(), |error| format!("{error:.5}"));
         let memory = point.peak_memory_bytes.map_or("-".to_owned(), |bytes| format!("{} MiB", bytes >> 20));
@@ -167,7 +170,7 @@ impl TradeOff {
         )
     }
 
-    /// Returns the fraction of the Gaussians that a point keeps; 1 for an empty input.
+    /// Returns the fraction of the Gaussians that the result `point` keeps; 1 for an empty input.
     pub fn kept_fraction(&self, point: &TradeOffPoint) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
     }

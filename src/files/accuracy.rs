@@ -67,7 +67,7 @@ impl RenderedAttributes {
     }
 }
 
-/// Checks that all positions are finite. `kind` names the file `path` in the message, for example "a .spz".
+/// Checks that all positions in `state` are finite. `kind` names the file `path` in the message, for example "a .spz".
 ///
 /// # Errors
 /// Returns [`Error::Usage`] with the first Gaussian whose position is not finite.
@@ -156,8 +156,8 @@ impl CodingErrors {
         self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
-    /// Compares `error` with its maximum `bound`. Keeps the error if it exceeds `bound`, and exceeds it by the largest
-    /// factor so far. `quantity` names the attribute of Gaussian `id` for messages.
+    /// Compares `error` with its maximum `bound`. Keeps the error as the worst one if it exceeds `bound`, and by a
+    /// larger factor than all errors before. `quantity` names the attribute of Gaussian `id` for messages.
     fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
         let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };
@@ -190,7 +190,7 @@ impl CodingErrors {
     }
 }
 
-/// Returns the median of the finite values among `values` (of two middle values the lower one); 0 if none is finite.
+/// Returns the median of the finite values among `values` (the lower one of two middle values); 0 if none is finite.
 fn median(mut values: Vec<f64>) -> f64 {
     values.retain(|value| value.is_finite());
     if values.is_empty() {
@@ -208,8 +208,7 @@ mod tests {
         RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Returns a record for six Gaussians on a line: five at distances of 2 from the next, and one far away. The scene
-    /// size is 2.
+    /// Returns a record for six Gaussians on a line: five with a spacing of 2, and one far away. The scene size is 2.
     fn accuracy() -> CodingErrors {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);

@@ -32,13 +32,17 @@ pub use warnings::take_warnings;
 pub use workspace::{ExitGuard, remove_unfinished};
 use workspace::{SCRATCH, Workspace, user_path};
 
-/// Checks, before any work, that a run reading `inputs` may write an output to `target`. Completes or removes an output
-/// with this name that a killed run left unfinished.
+/// Checks, before any work, that a run that reads `inputs` may write an output of the kind `kind` (file or folder) to
+/// `target`. Completes or removes an output with this name that a killed run left unfinished.
 ///
-/// Refuses a target without a name or in a folder that does not exist. Refuses a target that is an input, contains an
-/// input or lies inside one, also through links and whatever `replace` is. Refuses an existing target that `replace`
-/// does not allow to replace (a folder may always replace an empty folder), a file in place of a folder or the reverse,
-/// sockets, block devices and dangling links.
+/// Refuses these targets:
+///
+/// - a target without a name, or in a folder that does not exist
+/// - a target that is an input, contains an input or lies inside an input, even if the path leads there only through
+///   links; this holds for every value of `replace`
+/// - an existing target that `replace` does not allow to replace (a folder may always replace an empty folder)
+/// - a file in place of a folder, or the reverse
+/// - sockets, block devices and dangling links
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
@@ -90,7 +94,8 @@ fn check_writable(target: &Path, parent: &Path) -> Result<()> {
     }
 }
 
-/// Checks, as [`check_target`] does for one file, that `target` and the files `companions` beside it may be written.
+/// Checks, as [`check_target`] does for one file, that a run that reads `inputs` may write `target` and the files
+/// `companions` beside it. `replace` says which existing files may be replaced.
 ///
 /// # Errors
 /// Fails like [`check_target`], and if one of these paths is a device or FIFO, which can hold only one file.
@@ -165,7 +170,7 @@ pub struct StagedFiles {
 impl StagedFiles {
     /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
     /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
-    /// the summary (JSON file that describes the result).
+    /// the summary (JSON file that describes the result). `replace` says which existing files may be replaced.
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -248,8 +253,8 @@ impl StagedFolder {
         &self.content
     }
 
-    /// Adds the list of its files to the summary of the folder (`summary.json`), if it has a summary, syncs everything
-    /// to disk and gives the folder its final name.
+    /// If the folder has a summary (`summary.json`), adds the list of all files in the folder to it. Then syncs
+    /// everything to disk and gives the folder its final name.
     ///
     /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
     /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the
@@ -270,7 +275,8 @@ impl StagedFolder {
 }
 
 /// Creates the workspace (hidden folder) in which the output `target` is written. First repairs and removes the
-/// workspaces that killed runs with this output left behind.
+/// workspaces that killed runs with this output left behind. Fails if `target` exists and `replace` does not allow an
+/// output of the kind `kind` to replace it, or if a system call fails.
 fn output_workspace(target: &Path, kind: TargetKind, replace: Replace) -> Result<Workspace> {
     clean_up(target);
     check_replace(target, kind, replace)?;

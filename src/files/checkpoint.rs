@@ -32,11 +32,12 @@ use crate::limits::ReadLimit;
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Bytes of memory that the list of files takes per file, in addition to three times the size of the file's entry in
-/// the list of the archive.
+/// Bytes of memory that the parsed list of files takes per file, in addition to three times the length of the list in
+/// the archive.
 const ENTRY_BYTES: u64 = 640;
-/// Maximum number of values that the tensors of a storage may have per stored value. A tensor may repeat stored values
-/// (stride 0), so a small file can declare any number of values. No trained model needs more than this.
+/// Maximum number of tensor elements per value of the storage (block of tensor values) that holds them. A tensor may
+/// repeat stored values (stride 0), so a small file can declare any number of elements. No trained model needs a larger
+/// number.
 const MAX_EXPANSION: usize = 4;
 
 /// PyTorch checkpoint that is open for reading.
@@ -65,7 +66,8 @@ pub(crate) enum ValueType {
 }
 
 impl ValueType {
-    /// Returns the value type of a PyTorch storage class; `None` if it is unknown.
+    /// Returns the value type of the PyTorch storage class `global`, such as `torch.HalfStorage`; `None` if the class
+    /// is unknown.
     fn from_global(global: &str) -> Option<ValueType> {
         Some(match global {
             "torch.HalfStorage" => ValueType::F16,
@@ -286,12 +288,12 @@ impl Checkpoint {
         &self.pickle
     }
 
-    /// Builds the error for unexpected content at `place` in the file.
+    /// Builds the error that says that `found` is at `place` in the file, where `expected` should be.
     pub(crate) fn wrong(&self, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(&self.path, place, expected, found)
     }
 
-    /// Returns a description of a node of the object tree for messages.
+    /// Returns a description of node `id` of the object tree for messages.
     pub(crate) fn describe(&self, id: NodeId) -> String {
         self.tensor(id).map_or_else(|| self.pickle.describe(id), |tensor| format!("a tensor, {}", tensor.describe()))
     }
@@ -493,8 +495,8 @@ fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
 }
 
-/// Reads the bytes of file `index` of the archive, which must be uncompressed, and checks its checksum. PyTorch writes
-/// a checksum of 0 if it did not compute one.
+/// Reads the bytes of file `index` of the archive, which must be uncompressed. Fails if they do not match the file's
+/// checksum. A checksum of 0 is not compared: PyTorch writes it if it did not compute one.
 fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;

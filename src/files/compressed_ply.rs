@@ -47,7 +47,7 @@ impl<'a> Table<'a> {
         }
     }
 
-    /// Returns the four bytes of the property at `offset` in row `row`.
+    /// Returns the four bytes of the property that begins at byte `offset` of row `row`.
     fn word(&self, row: usize, offset: usize) -> [u8; 4] {
         let bytes = &self.bytes[row * self.element.stride + offset..][..4];
         [bytes[0], bytes[1], bytes[2], bytes[3]]
@@ -107,8 +107,9 @@ pub fn read_compressed_ply(path: &Path, memory: ReadLimit) -> Result<Gaussians> 
     Ok(gaussians)
 }
 
-/// Decodes the packed position, rotation, scale and color of every row of `vertices` into `gaussians`. `chunks` holds
-/// the ranges of 256 successive Gaussians in each row. Fails if a property is missing or a range is not finite.
+/// Decodes the packed position, rotation, scale and color of every row of `vertices` into `gaussians`. Each row of
+/// `chunks` holds the value ranges of 256 successive Gaussians. Fails if a property is missing or a range is not
+/// finite.
 fn decode_vertices(chunks: &Table, vertices: &Table, gaussians: &mut Gaussians) -> Result<()> {
     let names = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
     let mut offsets = [0; 4];
@@ -137,8 +138,8 @@ fn decode_vertices(chunks: &Table, vertices: &Table, gaussians: &mut Gaussians) 
     Ok(())
 }
 
-/// Returns the ranges of three components that row `chunk` of the element `chunk` holds: the properties `min_NAME` and
-/// `max_NAME` for each NAME in `names`. Fails if one of them is missing or not finite.
+/// Returns the ranges of three components that row number `chunk` of the table `chunks` holds: the properties
+/// `min_NAME` and `max_NAME` for each NAME in `names`. Fails if one of them is missing or not finite.
 fn ranges(chunks: &Table, chunk: usize, names: [&str; 3]) -> Result<Ranges> {
     let mut found = [[0.0; 2]; 3];
     for (range, name) in found.iter_mut().zip(names) {
@@ -154,8 +155,8 @@ fn ranges(chunks: &Table, chunk: usize, names: [&str; 3]) -> Result<Ranges> {
     Ok(found)
 }
 
-/// Returns, for each of three components, the value at the fraction `at` (0 to 1) of the way from the smallest to the
-/// largest value of its range.
+/// Returns three components, each interpolated linearly in its range in `ranges`. `at` holds a fraction for each
+/// component: 0 gives the smallest value of the range, 1 the largest.
 fn between(ranges: &Ranges, at: [f32; 3]) -> [f32; 3] {
     [0, 1, 2].map(|c| ranges[c][0] * (1.0 - at[c]) + ranges[c][1] * at[c])
 }
@@ -178,8 +179,8 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     q.map(|x| (x / length) as f32)
 }
 
-/// Returns the SH degree to which the number of properties `f_rest_*` of the element `sh` belongs. Fails if there is no
-/// such degree, or if the element does not have one row for each of `count` Gaussians.
+/// Returns the SH degree of the element `sh` (`table`), which follows from its number of properties `f_rest_*`. Fails
+/// if no degree has this number of coefficients, or if the element does not have one row for each of `count` Gaussians.
 fn sh_degree(table: &Table, count: usize) -> Result<usize> {
     let coefficients = table.element.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
     let degree = (1..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == coefficients);
@@ -192,8 +193,8 @@ fn sh_degree(table: &Table, count: usize) -> Result<usize> {
     })
 }
 
-/// Decodes the SH coefficients above degree 0 of the element `sh` into `gaussians`. A row holds all coefficients of
-/// red, then all of green, then all of blue.
+/// Decodes the SH coefficients above degree 0 in the element `sh` (`table`) into `gaussians`. Fails if a property is
+/// missing or is not a byte. A row holds all coefficients of red, then all of green, then all of blue.
 fn decode_sh(table: &Table, gaussians: &mut Gaussians) -> Result<()> {
     let coefficients = gaussians.sh.width() / 3 - 1;
     for rest in 0..3 * coefficients {

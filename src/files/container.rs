@@ -60,8 +60,8 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Returns the prefetcher of the file; `None` if the file is in the page cache, where a scan in stages is not
-    /// faster (times: see the module documentation).
+    /// Returns the prefetcher, with which a scan reads the file in stages. Returns `None` if the file is in the page
+    /// cache, where a scan in stages is not faster (times: see the module documentation).
     fn ahead(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,

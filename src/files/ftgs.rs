@@ -28,9 +28,10 @@ pub const VELOCITY: usize = 2;
 pub const PARAMS_PER_GAUSSIAN: usize = 5;
 
 /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the sequence.
-/// Narrower windows are shown with this one.
+/// The player raises smaller standard deviations to this value.
 pub const MIN_DEVIATION: f64 = 0.02;
-/// Minimum opacity of a Gaussian at any time.
+/// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower. Written to the
+/// header, and assumed if a header does not state it.
 const OPACITY_FLOOR: f64 = 1e-4;
 /// Names of the properties that an INRIA PLY does not have, in the order of [`StoredParams::format_specific`].
 const OWN_PROPERTIES: [&str; PARAMS_PER_GAUSSIAN] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
@@ -265,7 +266,7 @@ mod tests {
     use super::*;
     use crate::model::Gaussians;
 
-    /// Returns `count` Gaussians with linear motion in time windows.
+    /// Returns `count` Gaussians with linear motion in time windows and the SH degree `sh_degree`.
     fn params(count: usize, sh_degree: usize) -> StoredParams {
         let mut made = StoredParams {
             gaussians: Gaussians::zeros(count, sh_degree),

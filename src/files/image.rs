@@ -79,7 +79,8 @@ fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
 mod tests {
     use super::*;
 
-    /// Writes `bytes` as a PNG of 2 × 1 pixels to a temporary file.
+    /// Writes a PNG of 2 × 1 pixels to a temporary file. `bytes` are its pixels in the given color type and bit depth;
+    /// `palette` holds the colors of an indexed image.
     fn written(color: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut encoder = png::Encoder::new(file.reopen().unwrap(), 2, 1);

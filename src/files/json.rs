@@ -48,7 +48,8 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     read_from(open_file(path)?, path, stopped, seed)
 }
 
-/// Reads the JSON document in `file` as [`read`] does; error messages call the file `path`.
+/// Reads the JSON document in `file` as [`read`] does, with the same `stopped` and `seed`. Error messages call the file
+/// `path`.
 ///
 /// # Errors
 /// Fails like [`read`].

@@ -61,7 +61,8 @@ impl FileMap {
         Ok(FileMap::new(path, None, map))
     }
 
-    /// Wraps a memory map of which no page has been read yet.
+    /// Wraps `map`, a memory map of the file at `path` of which no page has been read yet. `identity` is the identity
+    /// of the file, or `None` for a scratch file.
     fn new(path: &Path, identity: Option<FileIdentity>, map: Mmap) -> FileMap {
         let (resident, last_end) = (AtomicUsize::new(0), AtomicUsize::new(0));
         FileMap { path: path.to_owned(), identity, map, resident, last_end }
@@ -94,7 +95,8 @@ impl FileMap {
         }
     }
 
-    /// Calls `each` with the bytes of `range` of the mapped file, in chunks of at most 1 MiB.
+    /// Calls `each` with the bytes of `range` of the mapped file, in chunks of at most 1 MiB. Ends with the first error
+    /// that `each` returns.
     pub(crate) fn pieces<E>(
         &self,
         range: Range<usize>,

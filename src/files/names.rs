@@ -45,7 +45,8 @@ pub fn relative_to_folder(path: &Path, folder: &Path) -> PathBuf {
     found.map_or_else(|| name_of(path).into(), PathBuf::from)
 }
 
-/// Returns `path` as an absolute path without links and `..` in its folders; `None` if it cannot be resolved.
+/// Returns `path` as an absolute path. Links and `..` in its folders are resolved; a link in the last component is
+/// kept. Returns `None` if the path cannot be resolved.
 fn real_path(path: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(path).ok()?;
     match (absolute.parent(), absolute.file_name()) {

@@ -285,7 +285,8 @@ fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File
 }
 
 impl NpzArray {
-    /// Returns whether the values, which have the type `float`, can be read directly from the mapped archive.
+    /// Returns whether the values of this array, which have the type `float`, can be read directly from the mapped
+    /// archive.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }
@@ -318,7 +319,8 @@ impl NpzArray {
     }
 }
 
-/// Values of an array as f32, in the order of the array, in a mapped file.
+/// Values of one array as f32, in the order in which the array stores them. They lie in a memory-mapped file: the
+/// archive, or a scratch file.
 #[derive(Debug, Clone)]
 pub(crate) struct Floats {
     map: Arc<FileMap>,

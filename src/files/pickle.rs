@@ -79,7 +79,7 @@ pub(crate) enum Wrong {
 }
 
 impl Wrong {
-    /// Builds the error for malformed content at byte `at` of the pickle.
+    /// Builds the error for malformed content at byte `at` of the pickle; `found` describes this content.
     fn at(at: usize, found: impl Into<String>) -> Wrong {
         Wrong::Malformed(at, found.into())
     }
@@ -133,8 +133,8 @@ impl Pickle {
         Some(self.pairs(id)?.iter().filter_map(named))
     }
 
-    /// Returns the value of the dict `id` under the string `key`. If the key was set more than once, the last value
-    /// counts, as in Python.
+    /// Returns the value of the dict `id` under the string `key`; `None` if node `id` is not a dict or has no such key.
+    /// If the key was set more than once, the last value counts, as in Python.
     pub(crate) fn item(&self, id: NodeId, key: &str) -> Option<NodeId> {
         self.items(id)?.filter(|(name, _)| *name == key).last().map(|(_, value)| value)
     }

@@ -49,7 +49,7 @@ impl PlyFrames {
         Self::from_paths(folder, FrameFiles::list(folder, is_named_like_frame)?.checked(folder, true)?, options)
     }
 
-    /// Opens one PLY file as the only frame.
+    /// Opens the PLY file at `path` as the only frame.
     ///
     /// # Errors
     /// Fails like [`Ply::open`].
@@ -202,8 +202,8 @@ impl FrameFiles {
     }
 }
 
-/// Finds the first gap in the frame numbers. Returns the expected name of the missing frame and the names before and
-/// after the gap.
+/// Finds the first gap in the frame numbers in the file names of `frames`. Returns the expected name of the missing
+/// frame and the names before and after the gap.
 ///
 /// A gap is a step between successive numbers that is larger than the smallest step. Returns `None` if there is no gap,
 /// or if the file names differ in more than their last number.
@@ -236,14 +236,14 @@ fn is_named_like_frame(path: &Path) -> bool {
         && !file_name(path).as_encoded_bytes().starts_with(b".")
 }
 
-/// Compares names in natural order (numbers in them by value), then by bytes, so that names equal in the natural
-/// comparison (`a 1`, `a1`) have a fixed order.
+/// Compares the names `a` and `b` in natural order (numbers in them by value), then by bytes, so that names equal in
+/// the natural comparison (`a 1`, `a1`) have a fixed order.
 fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }
 
-/// Checks that the frame `ply` has the same properties as the first frame. `properties` are those of the first frame,
-/// and `first` is its file. The error names the first difference.
+/// Checks that the frame `ply` has the same properties as the first frame. `properties` are the properties of the first
+/// frame, and `first` is the path of its file. The error names the first difference.
 fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<()> {
     if ply.properties() == properties {
         return Ok(());

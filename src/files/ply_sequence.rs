@@ -32,7 +32,7 @@ impl PlySequence {
         Self::new(PlyFrames::open(folder, &PlyOptions::default())?)
     }
 
-    /// Opens one PLY file as a sequence of one frame, in which no attribute varies.
+    /// Opens the PLY file at `path` as a sequence of one frame, in which no attribute varies.
     ///
     /// # Errors
     /// Fails like [`PlyFrames::open_single`].

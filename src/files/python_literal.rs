@@ -73,7 +73,8 @@ impl ParseError {
 
 type Parsed<T> = std::result::Result<T, ParseError>;
 
-/// Parses a call `name(key=value, …)` and returns its keyword arguments in order.
+/// Parses `text`, which must be the call `NAME(key=value, …)` with `name` as NAME. Returns its keyword arguments in
+/// order.
 pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
     let mut parser = Parser { text, at: 0 };
     parser.skip_space();
@@ -113,7 +114,7 @@ impl<'a> Parser<'a> {
         &self.text[self.at..]
     }
 
-    /// Builds a parse error at the current position.
+    /// Builds the parse error that says that `expected` should be at the current position.
     fn error(&self, expected: &'static str) -> ParseError {
         ParseError { byte: self.at, expected }
     }
@@ -154,8 +155,9 @@ impl<'a> Parser<'a> {
         &rest[..end]
     }
 
-    /// Parses a value up to the next separator, `depth` levels of brackets deep. If the text up to the separator is no
-    /// literal, it becomes [`Literal::Opaque`]. Fails if `depth` is more than 32 or a bracket or quote is missing.
+    /// Parses a value up to the next separator; the value lies inside `depth` open brackets. If the text up to the
+    /// separator is no literal, it becomes [`Literal::Opaque`]. Fails if `depth` is more than 32 or a bracket or quote
+    /// is missing.
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
         self.skip_space();
         let start = self.at;
@@ -183,7 +185,8 @@ impl<'a> Parser<'a> {
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 
-    /// Parses a literal, `depth` levels of brackets deep. Returns `None` if the next token does not begin a literal.
+    /// Parses a literal, which lies inside `depth` open brackets. Returns `None` if the next token does not begin a
+    /// literal.
     fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         Ok(match self.rest().chars().next() {
             Some('\'' | '"') => Some(Literal::Str(self.string()?)),

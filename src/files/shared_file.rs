@@ -41,7 +41,7 @@ impl SharedFile {
         self.len
     }
 
-    /// Reads bytes of the file from offset `at` into `out`. Returns the number of bytes read.
+    /// Reads bytes of the file from offset `at` into `out`. Returns the number of bytes read, 0 at the end of the file.
     fn read_from(&self, at: u64, out: &mut [u8]) -> IoResult<usize> {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         file.seek(SeekFrom::Start(at))?;

@@ -67,7 +67,8 @@ mod tests {
     use super::*;
     use crate::model::{color_from_sh, opacity};
 
-    /// Returns the row of a Gaussian without symmetry.
+    /// Returns the row (32 bytes) of a test Gaussian whose values differ along all axes, so that a swapped axis is
+    /// noticed.
     fn row() -> Vec<u8> {
         let numbers = [1.5f32, -2.0, 0.25, 0.5, 0.0, 2.0].into_iter().flat_map(f32::to_le_bytes);
         numbers.chain([255, 0, 51, 204, 128, 192, 64, 128]).collect()

@@ -77,7 +77,8 @@ impl SplatvGaussian {
     }
 }
 
-/// Returns the number of bytes of the texture (bytes `texture` of the file) up to the last nonzero one.
+/// Returns the number of bytes of the texture up to its last nonzero byte. `texture` is the byte range of the texture
+/// in the file `map`.
 fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     let mut end = texture.end;
     while end > texture.start {

@@ -33,7 +33,7 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 pub const MAGIC: u32 = 0x5053_474e;
 /// Number of bytes of the header of version 4.
 const HEADER_BYTES_4: usize = 32;
-/// zstd compression level of version 4, the one of the format's own library.
+/// zstd compression level of files of version 4, the same as in the format's own library.
 const ZSTD_LEVEL: i32 = 12;
 /// Largest magnitude of a stored position, in units of the last bit (24 bits, signed).
 const MAX_FIXED: f64 = 8_388_607.0;
@@ -42,7 +42,7 @@ const MAX_FRACTION_BITS: i32 = 20;
 /// Sign by which each SH coefficient above degree 0 is multiplied when the y and z axes are reversed.
 const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Version of the format that is written.
+/// Version of the `.spz` format in which a file is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SpzVersion {
     /// Version 3, gzip: read by most players.
@@ -51,8 +51,8 @@ pub enum SpzVersion {
     V4,
 }
 
-/// Writes the Gaussians `state` to an `.spz` file at `path`. Returns the largest error of a position in the file, in
-/// scene units.
+/// Writes the Gaussians `state` to an `.spz` file of the version `version` at `path`. Returns the largest error of a
+/// position in the file, in scene units.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
@@ -117,11 +117,11 @@ fn write_streams(
     file.flush()
 }
 
-/// Function that writes one array of the given Gaussians. The second argument is the unit in which positions are
-/// stored.
+/// Function that writes one array of an `.spz` file, such as the positions, for the given Gaussians. The second
+/// argument is the unit in which positions are stored.
 type WriteArray = fn(&Gaussians, f64, &mut dyn Write) -> std::io::Result<()>;
 
-/// Writers of the arrays in the order of the file.
+/// Functions that write the arrays of an `.spz` file, in the order of the file.
 const ARRAYS: [WriteArray; 6] = [
     |state, unit, out| {
         (0..state.len()).try_for_each(|row| {
@@ -182,7 +182,8 @@ fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     Ok(accuracy.position_error())
 }
 
-/// Returns the coordinate `value` as a 24-bit integer in units of `unit`.
+/// Returns the coordinate `value` in units of `unit`, as an integer that fits into 24 bits with its sign. Rounds to the
+/// nearest integer and clamps larger magnitudes.
 fn fixed(value: f64, unit: f64) -> i32 {
     (value / unit).round().clamp(-MAX_FIXED, MAX_FIXED) as i32
 }
@@ -221,7 +222,7 @@ fn smallest_three(q: [f64; 4]) -> u32 {
     })
 }
 
-/// Rounds to the nearest integer and clamps to 0–255; NaN becomes 0.
+/// Returns `value` rounded to the nearest integer and clamped to 0–255; NaN becomes 0.
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }

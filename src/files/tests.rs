@@ -4,7 +4,8 @@ use crate::diagnostics::demo_scene::DemoScene;
 use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficients};
 use crate::passes::gather_all;
 
-/// Returns `count` Gaussians without any symmetry, with SH degree `degree`.
+/// Returns `count` Gaussians with SH degree `degree`. Their values differ along all axes, so that a swapped or reversed
+/// axis is noticed.
 pub(super) fn gaussians_with_sh(count: usize, degree: usize) -> Gaussians {
     let mut state = gather_all(&DemoScene::new(count, 1), 0, Attributes::all()).unwrap();
     state.sh = AttributeValues::zeros(3 * sh_coefficients(degree), count);
@@ -12,9 +13,9 @@ pub(super) fn gaussians_with_sh(count: usize, degree: usize) -> Gaussians {
     state
 }
 
-/// Asserts that `signs` are the factors of the SH coefficients above degree 0 that reverse the axes with −1 in `axes`:
-/// each SH basis function times its sign has the same value in a direction as the unchanged function in the reversed
-/// direction.
+/// Asserts that a change of the signs of SH coefficients has the same effect as reversing axes. `signs` holds the
+/// factor of each coefficient above degree 0; in `axes`, −1 marks a reversed axis. The value of each SH basis function
+/// in a direction, times its sign, must equal its value in the reversed direction.
 pub(super) fn assert_signs_reverse_axes(signs: [f32; 15], axes: [f64; 3]) {
     let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
         [

@@ -27,10 +27,10 @@ use crate::model::StoredParams;
 pub const VERSION: u64 = 4;
 /// Name of the playback profile that players expect.
 const PROFILE: &str = "org.opsiclear.tsog-playback";
-/// Number of frames of a file that does not give a duration.
+/// Number of frames that is assumed for a file that does not give a duration.
 const DEFAULT_FRAMES: usize = 300;
 
-/// Visibility of the Gaussians of a file over time.
+/// Times at which the Gaussians of a file are visible, and whether they move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timeline {
     /// A still: every Gaussian is visible at every time and does not move.
@@ -54,12 +54,12 @@ impl Timeline {
     }
 }
 
-/// Gaussians with their visibility over time, as players show them.
+/// Gaussians of a file, with the times at which players show them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TimedGaussians {
     /// Stored parameters of the Gaussians. `timeline` determines the meaning of [`StoredParams::format_specific`].
     pub params: StoredParams,
-    /// Visibility of the Gaussians over time.
+    /// Times at which the Gaussians are visible, and whether they move.
     pub timeline: Timeline,
     /// Number and rate of the frames, and the mapping of their times to the range from 0 to 1.
     pub clip: ClipTimes,
@@ -128,7 +128,7 @@ struct Velocity {
 /// Member `playback` of `meta.json`: settings of the player.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Playback {
-    /// Duration in seconds.
+    /// Duration of the playback in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     duration: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -45,7 +45,8 @@ impl RgbaImage {
     ///
     /// # Errors
     /// Returns a description of what was found, for an error message, if `bytes` are not a still lossless WebP, if they
-    /// are damaged, or if the image has more than `max_pixels` pixels. This is checked before memory is taken.
+    /// are damaged, or if the image has more than `max_pixels` pixels. The number of pixels is checked before memory is
+    /// allocated for them.
     pub fn from_webp(bytes: &[u8], max_pixels: usize) -> Result<RgbaImage, String> {
         let described = |error: DecodingError| format!("a file that cannot be decoded ({error})");
         let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(described)?;
@@ -81,7 +82,8 @@ impl RgbaImage {
 mod tests {
     use super::*;
 
-    /// Returns an image in which every byte differs from its neighbors; a quarter of the pixels is transparent.
+    /// Returns an image of `width` × `height` pixels in which every byte differs from its neighbors; a quarter of the
+    /// pixels is transparent.
     fn numbers(width: usize, height: usize) -> RgbaImage {
         let value = |i: usize| (i.wrapping_mul(2_654_435_761) >> 13) as u8;
         let pixel = |i: usize| {

@@ -20,7 +20,8 @@ pub(crate) struct DeclaredDirectory {
     pub(crate) bytes: u64,
 }
 
-/// Reads the declared size from the records at the end of the archive, in the same way as the crate `zip`.
+/// Reads from the records at the end of the zip archive `file` how large its list of files is. Finds these records in
+/// the same way as the crate `zip`.
 ///
 /// # Errors
 /// Fails if there are no such records, or if reading fails.

@@ -13,7 +13,7 @@ pub(crate) struct ZipOutput<W> {
 }
 
 impl<W: Write + Seek> ZipOutput<W> {
-    /// Wraps the output `inner`, which must be at its start.
+    /// Wraps the output `inner`, to which nothing may have been written yet.
     pub(crate) fn new(inner: W) -> Self {
         ZipOutput { inner, failed: None, at: 0 }
     }

@@ -1,13 +1,16 @@
-//! Fit of curves that are each visible in a soft window of time: with cubic motion and linear rotation, the form that
-//! players of SpacetimeGaussians support, or with linear motion and constant rotation ([`CurveForm`]).
+//! Fit of curves to the track of a Gaussian. Each curve is visible in a soft window of time. Curves have one of two
+//! forms ([`CurveForm`]): cubic motion and linear rotation, which players of SpacetimeGaussians support, or linear
+//! motion and constant rotation.
 //!
 //! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
-//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … overlapping
-//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the
-//! visible time, and each width is three quarters of the spacing. The sum of such windows is 1 with an error of at most
-//! 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the
-//! depth of the Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive
-//! (Richardson 1972, Lucy 1974).
+//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by overlapping curves: 3,
+//! 5, 9 … with cubic motion, or 2, 3, 4, 5, 7, 9 … with linear motion, which needs more of them. The centers of the
+//! windows are evenly spaced over the visible time, and each width is three quarters of the spacing. The sum of such
+//! windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%.
+//!
+//! Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the optical depth of the
+//! Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive (Richardson 1972,
+//! Lucy 1974).
 
 use super::least_squares::polynomial;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
@@ -47,7 +50,8 @@ impl CubicTrack {
 /// Form of the curves that are fitted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveForm {
-    /// Whether positions are linear and rotations constant in time, instead of cubic and linear.
+    /// Whether positions are linear and rotations are constant in time. If not, positions are cubic and rotations are
+    /// linear.
     is_linear: bool,
     /// Minimum width of the time window, in units of time.
     min_width: f64,
@@ -65,36 +69,39 @@ impl CurveForm {
         CurveForm { is_linear: true, min_width, max_intervals: 32 }
     }
 
-    /// Returns this form with at most `max_intervals` intervals between the centers of overlapping curves, and so with
-    /// at most `max_intervals` + 1 curves.
+    /// Returns this form with at most `max_intervals` intervals between the centers of overlapping curves, that is,
+    /// with at most `max_intervals` + 1 curves.
     pub fn with_intervals(self, max_intervals: usize) -> CurveForm {
         CurveForm { max_intervals, ..self }
     }
 
-    /// Returns the numbers of intervals that are tried, in this order. An interval lies between the centers of
-    /// neighboring overlapping curves, so n intervals take n + 1 curves.
+    /// Returns the numbers of intervals to try, in this order. An interval lies between the centers of two neighboring
+    /// overlapping curves, so n intervals take n + 1 curves.
     fn intervals(self) -> &'static [usize] {
         if self.is_linear { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
     }
 }
 
-/// Ratio of the width of overlapping windows to the distance of their centers.
+/// Width of an overlapping window, divided by the distance between the centers of neighboring windows.
 const WIDTH_PER_INTERVAL: f64 = 0.75;
 /// Maximum number of iterations that distribute the optical depth among overlapping curves.
 const MAX_UPDATES: usize = 60;
-/// Largest change of an optical depth in one iteration below which the iterations end.
+/// Limit of convergence. The iterations end once no optical depth changes by a larger fraction in one iteration. Depths
+/// below this limit do not count.
 const CONVERGED: f64 = 1e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Frames at which the time window of a curve has at most this value are not used to fit the opacity of the curve.
-/// Frames at which window × opacity is at most this value times the smallest visible opacity are not used to fit its
-/// motion.
+/// Limit below which a frame has no part in the fit of a curve:
+/// - The fit of the opacities of overlapping curves leaves out frames at which the time window is at most this value.
+/// - The fit of the motion leaves out frames whose weight (window × opacity) is at most this value times
+///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns the curves of the form `form` that represent `track`: as few as meet `tolerance` at every visible frame, or,
-/// if none do, the closest ones that were tried. Adds their errors to `misfit`.
+/// Returns curves of the form `form` that represent `track`: the smallest tried number of curves that meets `tolerance`
+/// at every visible frame. If no tried number meets it, returns the curves with the smallest error. Adds their errors
+/// to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -137,7 +144,8 @@ fn depth(opacity: f64) -> f64 {
     -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
-/// Returns one curve of constant opacity, whose window is infinitely wide.
+/// Returns one curve of the form `form` for `track`, with an infinitely wide window. Its opacity is constant: the mean
+/// over the visible frames.
 fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_visible(frame));
@@ -146,10 +154,15 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// Returns one curve whose logarithm of opacity is the parabola that fits the visible frames best, weighted by squared
-/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does
-/// not open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is
-/// long.
+/// Returns one curve for `track`. The logarithm of its opacity is a parabola in time, fitted to the visible frames with
+/// the squared opacity as weight. The fit is exact if the opacity of `track` is a time window, even if only a part of
+/// the window lies within the sequence.
+///
+/// Returns `None` in these cases:
+/// - Fewer than three frames are visible.
+/// - The parabola does not open downward.
+/// - The opacity at the vertex of the parabola exceeds [`MAX_OPACITY`].
+/// - The vertex lies further outside the sequence than the sequence is long.
 fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     let (first, last) = (track.times[0], track.times[track.len() - 1]);
     let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
@@ -173,7 +186,8 @@ fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     Some(CubicTrack { opacity: peak, ..curve })
 }
 
-/// Returns one curve whose time window has the mean and the variance of the opacity over time.
+/// Returns one curve for `track`. Its time window has the same mean and the same variance over time as the opacity of
+/// the track.
 fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
@@ -194,8 +208,8 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves. Their centers are evenly spaced over the time from `start` to `end`, in
-/// which the Gaussian is visible.
+/// Returns `count` + 1 overlapping curves for `track`. Their centers are evenly spaced over the time from `start` to
+/// `end`, in which the Gaussian is visible.
 fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
@@ -239,9 +253,9 @@ fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// Returns a curve that follows the position and rotation of `track` by least squares. The weight of a frame is its
-/// opacity times `weight(frame)`. Scales and SH coefficients are weighted means. The opacity of the curve is left at 0,
-/// for the caller to set.
+/// Returns a curve of the form `form` that follows the position and rotation of `track` by least squares. Its time
+/// window has the center `center` and the width `width`. The weight of a frame is its opacity times `weight(frame)`.
+/// Scales and SH coefficients are weighted means. The opacity of the curve is left at 0, for the caller to set.
 fn fit_motion(
     track: &FittedTrack,
     form: CurveForm,
@@ -282,9 +296,11 @@ fn fit_motion(
     }
 }
 
-/// Returns the largest error of `curves` relative to `tolerance` (1 means just within it; infinite if an error is NaN),
-/// and the errors over all visible frames. Where several curves are visible, each must be close to the Gaussian, in
-/// proportion to its share of the optical depth.
+/// Compares `curves` with `track` at all frames in which the Gaussian or the curves are visible. Returns two results:
+/// - The largest error relative to `tolerance`: 1 means just within it. The error of each curve is multiplied by its
+///   share of the optical depth, so a curve that is hardly visible at a frame need not be close to the Gaussian there.
+///   Infinite if an error is NaN.
+/// - The errors over these frames, not relative to `tolerance`.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
     let (mut worst, mut misfit) = (0.0f64, FitError::default());
     for frame in 0..track.len() {

@@ -1,9 +1,9 @@
 //! Weighted least squares fit of polynomials of low degree, in f64.
 
-/// Fits polynomials Σ cₖ·uᵏ with `K` coefficients to `samples` of `C` components. A sample is (u, y, w): argument,
-/// values and weight; u should be about within ±1. Returns the coefficients c₀ … that minimize Σ w·(y − Σ cₖ·uᵏ)² plus
-/// `ridge`·Σw·cₖ² for k ≥ 1, separately for each component. The ridge keeps coefficients small that the samples do not
-/// determine; it is proportional to the total weight. Returns zeros if the system cannot be solved.
+/// Fits a polynomial Σ cₖ·uᵏ with `K` coefficients to each of the `C` components of `samples`. A sample is (u, y, w):
+/// argument, values of the components, and weight; u should be about within ±1. Returns the coefficients c₀ … that
+/// minimize Σ w·(y − Σ cₖ·uᵏ)² plus `ridge`·Σw·cₖ² for k ≥ 1. The ridge term, which is proportional to the total
+/// weight, keeps coefficients small that the samples do not determine. Returns zeros if the system cannot be solved.
 pub(crate) fn polynomial<const K: usize, const C: usize>(
     samples: impl Iterator<Item = (f64, [f64; C], f64)>,
     ridge: f64,

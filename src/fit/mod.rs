@@ -14,24 +14,24 @@ pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, fit_lines};
 pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 
-/// Maximum error of a fit at every frame in which the Gaussian is visible.
+/// Largest errors that a fit may have at any frame in which the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Maximum distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale
-    /// (of three).
+    /// Largest allowed distance between the positions of the fit and of the Gaussian, in units of the middle one of the
+    /// Gaussian's three scales.
     pub position: f64,
-    /// Maximum angle between the rotations of the fit and of the Gaussian, radians. Ignored for a nearly round
+    /// Largest allowed angle between the rotations of the fit and of the Gaussian, radians. Ignored for a nearly round
     /// Gaussian, whose log scales all differ by less than 0.1.
     pub rotation: f64,
-    /// Maximum difference between the log scales (natural logarithms) of the fit and of the Gaussian.
+    /// Largest allowed difference between the log scales (natural logarithms) of the fit and of the Gaussian.
     pub log_scale: f64,
-    /// Maximum difference between the opacities, in [0, 1], of the fit and of the Gaussian.
+    /// Largest allowed difference between the opacities of the fit and of the Gaussian. Opacities are in [0, 1].
     pub opacity: f64,
-    /// Maximum difference between the SH coefficients of the fit and of the Gaussian.
+    /// Largest allowed difference between the SH coefficients of the fit and of the Gaussian.
     pub sh: f64,
-    /// Opacity from which on all tolerances hold as given; 0 if they hold for every Gaussian. For a Gaussian of a lower
-    /// opacity α, all of them but the tolerance of opacity are larger by the factor `full_opacity`/α. Used by
-    /// [`curved`] only.
+    /// Lowest opacity of a Gaussian for which the tolerances apply as given. For a Gaussian of a lower opacity α, every
+    /// tolerance except that of the opacity is multiplied by `full_opacity`/α. If this value is 0, the tolerances apply
+    /// as given to every Gaussian. Used by [`curved`] only.
     pub full_opacity: f64,
 }
 
@@ -40,8 +40,8 @@ impl Tolerance {
     pub const COMPACT: Tolerance =
         Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
 
-    /// Returns the factor, at most 1, by which errors of a Gaussian of opacity `opacity` (except errors of the opacity)
-    /// are multiplied before they are compared with the tolerances.
+    /// Returns the factor, at most 1, by which errors of a Gaussian of opacity `opacity` are multiplied before they are
+    /// compared with the tolerances. The factor does not apply to errors of the opacity itself.
     fn weight(&self, opacity: f64) -> f64 {
         if opacity < self.full_opacity { opacity / self.full_opacity } else { 1.0 }
     }
@@ -58,7 +58,8 @@ impl Default for Tolerance {
 /// and the error of its opacity.
 const FAR: [f64; 2] = [1.0, 0.1];
 
-/// Error of fitted curves or pieces against the Gaussians, over all Gaussians and the frames in which they are visible.
+/// Errors of fits (curves or pieces) against the Gaussians, over all Gaussians and the frames in which they are
+/// visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct FitError {
     /// Number of compared states (Gaussians × visible frames).
@@ -73,16 +74,17 @@ pub struct FitError {
     visible: f64,
     /// Sum of the Gaussian's opacity over the compared states in which the fit is off by more than [`FAR`].
     far: f64,
-    /// Largest distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale.
+    /// Largest distance, over all compared states, between the positions of the fit and of the Gaussian, in units of
+    /// the Gaussian's middle scale.
     pub position: f64,
-    /// Largest difference between the opacities of the fit and of the Gaussian.
+    /// Largest difference, over all compared states, between the opacities of the fit and of the Gaussian.
     pub opacity: f64,
 }
 
 impl FitError {
-    /// Adds the errors of one Gaussian at one frame. `position` is the error of its position, in units of its middle
-    /// scale; `opacity` is the error of its opacity; `visible` is its opacity, the weight in
-    /// [`FitError::far_off_fraction`].
+    /// Adds one compared state: one Gaussian at one frame. `position`: distance between the positions of the fit and of
+    /// the Gaussian, in units of the Gaussian's middle scale. `opacity`: difference between the opacities of the fit
+    /// and of the Gaussian. `visible`: opacity of the Gaussian, its weight in [`FitError::far_off_fraction`].
     pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
         self.visible += visible;
         self.far += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
@@ -93,8 +95,8 @@ impl FitError {
         self.opacity = self.opacity.max(opacity.abs());
     }
 
-    /// Returns the error over all states of `self` and of `other`: counts and sums are added, and each largest
-    /// difference is the larger of the two.
+    /// Returns the errors over the states of both `self` and `other`: adds the counts and sums, and takes the larger
+    /// value of each largest difference.
     pub fn merged_with(self, other: FitError) -> FitError {
         FitError {
             states: self.states + other.states,
@@ -113,9 +115,9 @@ impl FitError {
         (self.squares / self.states.max(1) as f64).sqrt()
     }
 
-    /// Returns the fraction of the compared states, weighted by their opacity, in which the fit is far off: by more
-    /// than the middle scale in position, or by more than 0.1 in opacity. Unlike the other errors, this one hardly
-    /// counts Gaussians that are hardly seen.
+    /// Returns the fraction of the compared states, weighted by the opacity of the Gaussian, in which the fit is far
+    /// off. A fit is far off if its position is wrong by more than the Gaussian's middle scale, or its opacity by more
+    /// than 0.1. Because of the weight, faint Gaussians hardly count in this fraction, unlike in the other errors.
     pub fn far_off_fraction(&self) -> f64 {
         self.far / self.visible.max(f64::MIN_POSITIVE)
     }

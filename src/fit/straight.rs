@@ -26,10 +26,11 @@ pub struct LinearPiece {
     pub sh: Vec<f32>,
 }
 
-/// Returns the pieces of `track`, in order of time. Each piece covers the largest span of frames that meets `tolerance`
-/// at every frame. Spans are the sequence, its halves, their halves and so on: 2ᵏ frames from a multiple of 2ᵏ.
-/// Therefore all Gaussians together have at most twice as many different spans as there are frames. Frames in which the
-/// Gaussian is invisible have no piece. Adds the errors of the pieces to `misfit`.
+/// Returns the pieces of `track`, in order of time, and adds their errors to `misfit`. Each piece covers a span of
+/// frames: the whole sequence, one of its halves, one half of a half and so on, that is, 2ᵏ frames from a multiple of
+/// 2ᵏ. Therefore all Gaussians together have at most twice as many different spans as there are frames. Each piece
+/// covers the largest span in which it meets `tolerance` at every frame. Frames in which the Gaussian is invisible have
+/// no piece.
 pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitError) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
@@ -45,8 +46,9 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     pieces
 }
 
-/// Adds the pieces for the frames `span` to `pieces`, halving the span where one piece is not accurate enough. A span
-/// has 2ᵏ frames and may extend beyond the last frame.
+/// Adds the pieces of `track` for the frames `span` to `pieces`. Halves the span if one piece would differ from the
+/// track by more than `tolerance`, or if the Gaussian is invisible in a part of the span. A span has 2ᵏ frames and may
+/// extend beyond the last frame.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();

@@ -12,13 +12,14 @@ pub struct FittedTrack {
     pub times: Vec<f64>,
     /// Position at each frame, in scene units.
     pub position: Vec<[f64; 3]>,
-    /// Rotation at each frame: a unit quaternion (w, x, y, z), with the sign that is nearer to the previous one.
+    /// Rotation at each frame: a unit quaternion (w, x, y, z). A quaternion and its negative are the same rotation; the
+    /// one nearer to the quaternion of the previous frame is used.
     pub rotation: Vec<[f64; 4]>,
     /// Natural logarithms of the three scales (scene units) at each frame.
     pub log_scale: Vec<[f64; 3]>,
     /// Opacity at each frame, in [0, 1].
     pub opacity: Vec<f64>,
-    /// SH coefficients: one row per frame, or a single row if they are the same in all frames.
+    /// SH coefficients, one row per frame. If they are the same in all frames, there is only one row.
     pub sh: Vec<Vec<f32>>,
 }
 

@@ -19,27 +19,28 @@ use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
 
-/// Clock that measures a period of work, in wall-clock time and processor time.
+/// Clock that measures the wall-clock time and the processor time of a piece of work.
 #[derive(Debug, Clone, Copy)]
 pub struct Stopwatch {
     wall: Instant,
-    /// Processor time that the process had used at the start, seconds; `None` if the system does not report it.
+    /// Processor time that the process had used when this measurement started, seconds; `None` if the system does not
+    /// report it.
     processors: Option<f64>,
 }
 
 impl Stopwatch {
-    /// Starts a measurement now.
+    /// Starts a new measurement at this moment.
     pub fn start() -> Stopwatch {
         Stopwatch { wall: Instant::now(), processors: processor_seconds() }
     }
 
-    /// Returns the wall-clock time since the start, seconds.
+    /// Returns the wall-clock time since this measurement started, seconds.
     pub fn seconds(&self) -> f64 {
         self.wall.elapsed().as_secs_f64()
     }
 
-    /// Returns the processor time of this process since the start, summed over all processors, seconds; `None` if the
-    /// system does not report it.
+    /// Returns the processor time that this process used since this measurement started, summed over all processors,
+    /// seconds; `None` if the system does not report it.
     pub fn processor_seconds(&self) -> Option<f64> {
         processor_seconds().zip(self.processors).map(|(now, before)| now - before)
     }
@@ -55,7 +56,7 @@ fn processor_seconds() -> Option<f64> {
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
     /// Amounts that one full read takes: every frame of the input is read once. Reads of stages are reported as
-    /// multiples of it.
+    /// multiples of them.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -95,13 +96,14 @@ impl Journal {
         Ok(value)
     }
 
-    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage like
-    /// [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be divided among
-    /// processes.
+    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage `name` with
+    /// `compute` like [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be
+    /// divided among processes.
     ///
     /// # Errors
-    /// Fails if `compute` fails, or if the cache cannot be read or written. A run that computes only one shard (part of
-    /// a divided stage) ends here with an error.
+    /// Fails if `compute` fails, or if the cache cannot be read or written. If the run is limited to one shard (part of
+    /// a divided stage) and the result is not in the cache, fails with
+    /// [`Error::ShardDone`](crate::error::Error::ShardDone), which ends the run.
     pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,

@@ -86,8 +86,8 @@ impl LeftOut {
     }
 }
 
-/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. null becomes NaN in the place
-/// of the number.
+/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. The value null in place of the
+/// number becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
@@ -101,14 +101,15 @@ pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<
 /// Effect on renders of writing the deformation field of the result in half precision (2 bytes per value).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FieldSummary {
-    /// Whether the field is written in half precision.
+    /// Whether the deformation field is written in half precision.
     pub half: bool,
     /// Number of views on which renders were compared.
     pub pictures: usize,
-    /// Mean PSNR of renders with the half-precision field compared with renders with the exact field, dB.
+    /// Mean PSNR of renders with the half-precision deformation field, compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if the choice did not need it.
+    /// Mean PSNR of renders with the exact deformation field, compared with renders of the original, dB; `None` if
+    /// `rounding` alone decided that half precision is used.
     pub result: Option<f64>,
     /// Minimum value of `rounding` for which half precision is used, dB.
     #[serde(deserialize_with = "number")]
@@ -116,7 +117,8 @@ pub struct FieldSummary {
 }
 
 impl FieldSummary {
-    /// Returns a text with the measured values that explain why the field is or is not written in half precision.
+    /// Returns a text with the measured values that explain why the deformation field is or is not written in half
+    /// precision.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
@@ -253,7 +255,7 @@ pub struct Forecast {
     pub measured: bool,
     /// Expected peak memory of the process by the memory plan, bytes.
     pub memory_bytes: u64,
-    /// Expected times of all stages in order.
+    /// Expected processor time of each stage, in the order of the stages.
     pub stages: Vec<StageForecast>,
 }
 
@@ -269,8 +271,8 @@ pub struct TermSummary {
     /// 99th percentile: value that 99% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
-    /// Whether the two percentiles differ. If they are equal, the term only separates Gaussians with values above the
-    /// percentiles from all others.
+    /// Whether `p1` and `p99` differ. If they are equal, the normalized term is 1 for Gaussians above this value and 0
+    /// for all others.
     pub active: bool,
 }
 

@@ -8,7 +8,7 @@ use crate::machine::{memory_limit, peak_memory_bytes};
 /// Bytes of memory that a run takes without any Gaussian: the program (12.5 MiB without optimization), its libraries
 /// (3.6 MiB), stacks and heaps of its threads, and messages.
 pub(super) const PROGRAM_BYTES: u64 = 18 << 20;
-/// Bytes of memory that each thread takes.
+/// Bytes of memory that each thread takes in addition to [`PROGRAM_BYTES`].
 pub(super) const PER_THREAD: u64 = 2 << 20;
 
 /// Amount of information about memory and time that a run sends as events before it starts.
@@ -23,13 +23,13 @@ pub enum Verbosity {
     Plan,
 }
 
-/// Memory that a run may take, and how much the run reports about memory and time before it starts.
+/// Memory that a run may take, and amount of information about memory and time that the run reports before it starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Budget {
     /// Number of bytes that the run may take; `None`: a quarter of the memory available to this process, see
     /// [`memory_limit`].
     pub bytes: Option<u64>,
-    /// Information that the run reports before any work.
+    /// Amount of information about memory and time that the run reports before it starts.
     pub tell: Verbosity,
 }
 
@@ -39,21 +39,23 @@ impl Budget {
         self.bytes.unwrap_or_else(|| Budget::by_default().0)
     }
 
-    /// Returns how much memory opening an input may take: the budget less the memory of the program itself, and at
-    /// least 4 MiB. Small inputs can thus be opened with any budget, and the memory plan can then state what the run
-    /// needs.
+    /// Returns the limit on the memory for opening an input: the budget minus the memory of the program itself, but at
+    /// least 4 MiB. With this minimum, small inputs can be opened with any budget, and the memory plan can then state
+    /// how much the run needs.
     pub fn read_limit(self) -> ReadLimit {
         let program = PROGRAM_BYTES + PER_THREAD * rayon::current_num_threads() as u64;
         ReadLimit::new(self.limit().saturating_sub(program).max(4 << 20))
     }
 
-    /// Returns the default budget in bytes, and a text that says how it follows from the memory of this machine.
+    /// Returns the default budget in bytes, and a text for the user that says how it follows from the memory of this
+    /// machine.
     pub(super) fn by_default() -> (u64, String) {
         let (bytes, origin) = memory_limit();
         (bytes / 4, format!("a quarter of {}, {origin}", format_bytes(bytes)))
     }
 
-    /// Returns the budget as text, with a unit and where it comes from (the user or this machine).
+    /// Returns the budget as text: the amount with a unit, and whether the user asked for it or how it follows from the
+    /// memory of this machine.
     pub fn text(self) -> String {
         match self.bytes {
             Some(bytes) => format!("{}, as asked for", format_bytes(bytes)),

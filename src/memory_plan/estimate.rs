@@ -7,7 +7,8 @@ use super::workload::{MemoryPart, Workload};
 pub struct ResourceEstimate {
     /// Name of the stage.
     pub stage: &'static str,
-    /// Maximum number of times that the stage reads all frames of the input.
+    /// Maximum number of times that the stage reads the whole input (all frames), for example 0.5 if it reads half of
+    /// it.
     pub reads: f64,
     /// Estimated time of the stage on one processor core, in seconds. Computed from measured times of single
     /// operations.
@@ -23,20 +24,21 @@ impl ResourceEstimate {
         self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
     }
 
-    /// Returns the bytes of memory that the stage takes for the input that `work` describes, the open input included.
+    /// Returns the bytes of memory that the stage takes for the input that `work` describes, including the memory per
+    /// Gaussian of the open input itself.
     pub(crate) fn bytes(&self, work: &Workload) -> u64 {
         let fixed: u64 = self.fixed.iter().map(|&(_, bytes)| bytes).sum();
         work.gaussians.saturating_mul(work.input.per_gaussian + self.bytes_per_gaussian()).saturating_add(fixed)
     }
 }
 
-/// Converts `bytes` per survivor (Gaussian that has not been removed) to bytes per Gaussian of the input, of which the
-/// fraction `left` survives.
+/// Converts bytes of memory per survivor (Gaussian that has not been removed) to bytes per Gaussian of the input.
+/// `left`: fraction of the input's Gaussians that survive.
 pub fn bytes_of_survivors(left: f64, bytes: u64) -> u64 {
     (left * bytes as f64).ceil() as u64
 }
 
-/// Returns for each stage its name and its estimated time in seconds if all threads share the work.
+/// Returns the name of each stage and its estimated time in seconds, assuming that all threads share the work evenly.
 pub fn stage_seconds(work: &Workload, estimates: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
     estimates.iter().map(|estimate| (estimate.stage, estimate.seconds / work.threads as f64)).collect()
 }

@@ -12,12 +12,13 @@ use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, format_duration};
 
 /// Divisor of the memory budget: all decoded tiles of a container (values of consecutive Gaussians × frames) stay in
-/// memory if they take at most 1/16 of the budget. The file system caches the stored bytes anyway. A larger part would
-/// leave less memory to other processes and save no more than decoding time.
+/// memory if they take at most this part, 1/16, of the budget. Otherwise a tile is decoded again whenever it is needed,
+/// from stored bytes that the file system caches anyway. A larger part would thus save only decoding time, and leave
+/// less memory to other processes.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Functions that each halve one limit. Halving a limit slows a run; the functions that slow it most come first. If
-/// several free equally much memory, the last of them is chosen.
+/// Functions, each of which halves one limit. Halving a limit slows a run; the functions that slow it most come first.
+/// If several functions free equally much memory, the last of them is chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -37,9 +38,9 @@ pub struct MemoryPlan {
 }
 
 impl MemoryPlan {
-    /// Finds the fastest limits with which all stages fit into `budget`. `estimates` returns the estimates of all
-    /// stages for given limits. Sends the plan as text to `events` if the budget asks for it, even if the stages do not
-    /// fit.
+    /// Finds the fastest limits under which all stages fit into `budget`, and returns the plan with them. `estimates`
+    /// returns the estimates of all stages for given limits. Sends the plan as text to `events` if the budget asks for
+    /// it, even if the stages do not fit.
     ///
     /// # Errors
     /// Fails if the stages do not fit under any limits; the error states the smallest sufficient budget.
@@ -57,7 +58,8 @@ impl MemoryPlan {
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
-    /// Returns whether there are limits with which all stages that `estimates` describes fit into `budget`.
+    /// Returns whether there are limits under which all stages fit into `budget`. `estimates` returns the estimates of
+    /// all stages for given limits.
     pub fn fits_budget(
         work: Workload,
         budget: Budget,
@@ -66,8 +68,8 @@ impl MemoryPlan {
         Self::closest(work, budget.limit(), estimates).excess_bytes() == 0
     }
 
-    /// Returns the plan of the fastest limits with which all stages fit into `budget` (bytes). If there are none,
-    /// returns the plan that takes the least memory.
+    /// Returns the plan with the fastest limits under which all stages fit into `budget` (bytes). If no limits suffice,
+    /// returns the plan that takes the least memory. `estimates` returns the estimates of all stages for given limits.
     pub(crate) fn closest(
         work: Workload,
         budget: u64,
@@ -114,8 +116,8 @@ impl MemoryPlan {
         }
     }
 
-    /// Allows all decoded tiles of the container to stay in memory if they take a small part of the budget. No tile is
-    /// then read twice.
+    /// Returns this plan with the permission to keep all decoded tiles of the container in memory, if they fit and take
+    /// a small part of the budget ([`HELD_TILES_DIVISOR`]). No tile is then read twice.
     fn with_held_tiles(mut self) -> MemoryPlan {
         let decoded = self.work.input.decoded;
         let fits = self.excess_bytes() == 0 && self.peak_bytes().saturating_add(decoded) <= self.budget;
@@ -123,7 +125,8 @@ impl MemoryPlan {
         self
     }
 
-    /// Returns how many times all stages together read the input in full, at most.
+    /// Returns the maximum number of times that the whole input is read, summed over all stages. It is at most 1 if all
+    /// decoded tiles stay in memory.
     pub fn full_reads(&self) -> f64 {
         let sum: f64 = self.estimates.iter().map(|estimate| estimate.reads).sum();
         if self.limits.keeps_tiles { sum.min(1.0) } else { sum }
@@ -134,21 +137,22 @@ impl MemoryPlan {
         self.base() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
     }
 
-    /// Returns the bytes of memory that are taken in every stage: program, threads, index, time stamps, cameras,
-    /// decoded tiles.
+    /// Returns the bytes of memory that are taken throughout the run, whichever stage runs: program, threads, index,
+    /// time stamps, cameras, and decoded tiles that stay in memory.
     fn base(&self) -> u64 {
         let held = if self.limits.keeps_tiles { self.work.input.decoded } else { 0 };
         PROGRAM_BYTES + PER_THREAD * self.work.threads + self.work.known_bytes() + held
     }
 
-    /// Returns the number of bytes by which each stage exceeds the memory budget, summed over all stages.
+    /// Returns the number of bytes by which each stage exceeds the memory budget, summed over all stages; 0 if all
+    /// stages fit.
     fn excess_bytes(&self) -> u64 {
         let available = self.budget.saturating_sub(self.base());
         let beyond = self.estimates.iter().map(|estimate| estimate.bytes(&self.work).saturating_sub(available));
         beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
     }
 
-    /// Returns the error for a memory budget that is too small; it states the smallest sufficient one.
+    /// Returns the error for a memory budget that is too small. It states the smallest sufficient budget.
     fn too_small_error(&self, budget: Budget) -> Error {
         let largest = self
             .estimates
@@ -167,8 +171,8 @@ impl MemoryPlan {
         ))
     }
 
-    /// Returns the plan as text: the memory of each stage by its named parts, the limits, and the full reads of the
-    /// input.
+    /// Returns the plan as text: the memory of each stage by its named parts, the limits, and the number of times that
+    /// the whole input is read.
     pub fn text(&self) -> String {
         let MemoryPlan { work, limits, .. } = self;
         let mut out = String::new();
@@ -223,7 +227,7 @@ impl MemoryPlan {
         out
     }
 
-    /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan.
+    /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan ([`Verbosity::Plan`]).
     pub fn send_times(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
             let stages = stage_seconds(&self.work, &self.estimates);

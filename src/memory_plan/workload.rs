@@ -1,4 +1,4 @@
-//! Properties of an input from which memory and time are estimated, and the measured time of common operations.
+//! Sizes of an input from which memory and time of a run are estimated, and the measured time of common operations.
 
 use std::num::NonZeroU32;
 
@@ -13,20 +13,20 @@ use crate::render;
 
 /// Bytes of memory per tile of an open container: a flag that tells whether the tile's checksum has been verified.
 const PER_TILE: u64 = 1;
-/// Bytes of memory per column and block of Gaussians of a container that is open or being written: the index entry of
-/// the last tile whose values are constant in time.
+/// Bytes of memory for each column (attribute) and block of Gaussians of a container that is open or being written: the
+/// index entry of its last tile whose values are constant in time.
 const PER_SLOT: u64 = 80;
-/// Bytes of memory per frame of a container that is being written: its time stamp, in a list that grows by being copied
-/// to twice its length.
+/// Bytes of memory per frame of a container that is being written: its time stamp (8 bytes), counted twice because the
+/// list of time stamps grows by being copied to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
-/// Bytes of memory per frame of an open input: its time stamp, once in the container's index and once in the sequence,
-/// and the number of Gaussians alive in it.
+/// Bytes of memory per frame of an open input: two copies of its time stamp (one in the container's index, one in the
+/// sequence), and the number of Gaussians alive in the frame.
 const PER_FRAME: u64 = 8 + 8 + 8;
 /// Bytes of memory per view in a list of views.
 const PER_PICTURE: u64 = 24;
 
-/// Bytes of memory per Gaussian while all threads render one view together: the data of each thread, and the same data
-/// joined.
+/// Bytes of memory per Gaussian while all threads render one view together: the projected Gaussians of each thread, and
+/// the same data joined into one list.
 pub const SHARED_VIEW_BYTES_PER_GAUSSIAN: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
 /// Named part of a stage's memory, with its size in bytes.
@@ -43,26 +43,27 @@ pub struct Workload {
     pub sh_degree: usize,
     /// Attributes that vary in time.
     pub varying: Attributes,
-    /// Memory that the input and its readers take, and how the input is divided into tiles.
+    /// Memory that the input and its readers take, and numbers of frames and Gaussians per tile of the input.
     pub input: MemoryProfile,
-    /// Number of different view numbers that the cameras use.
+    /// Number of distinct view numbers among the views of all cameras.
     pub viewpoints: u64,
-    /// Number of pixels of the camera with the largest images.
+    /// Number of pixels per image of the camera with the largest images.
     pub pixels: u64,
-    /// Number of views of the frame that has most.
+    /// Number of views of the frame with the most views.
     pub views: u64,
-    /// Number of views of all frames together.
+    /// Total number of views over all frames.
     pub pictures: u64,
-    /// Bytes of memory that the cameras and the list of their shots take, see [`Rig::bytes`].
+    /// Bytes of memory that the cameras and the list of their shots (views of the scene) take, see [`Rig::bytes`].
     pub rig: u64,
     /// Number of threads that share the work.
     pub threads: u64,
-    /// Measured speed of these threads for the scene.
+    /// Speed of this machine for this input when the work is shared by `threads` threads.
     pub throughput: Throughput,
 }
 
 impl Workload {
-    /// Creates the workload of an open input without cameras.
+    /// Creates the workload of an open input without cameras. `info` describes its sequence, `input` the memory that it
+    /// takes.
     pub fn new(info: &SequenceInfo, input: MemoryProfile) -> Workload {
         Workload {
             gaussians: info.count as u64,
@@ -86,7 +87,8 @@ impl Workload {
         Workload::new(&info, MemoryProfile::for_tiles(0))
     }
 
-    /// Adds the views of the cameras of `rig`; `schedule` lists the views at each frame.
+    /// Returns this workload with the cameras of `rig` and the views in `schedule`, which lists the views at each
+    /// frame.
     pub fn with_views(self, rig: &Rig, schedule: &ViewSchedule) -> Workload {
         self.seen_by(rig, schedule.max_views_per_frame() as u64, schedule.pair_count() as u64)
     }
@@ -107,8 +109,8 @@ impl Workload {
     }
 
     /// Creates the workload of a stream of which only the header has arrived, with the cameras of `rig`. The stream
-    /// will be packed into a container with `frame_block` frames per tile. `frames` is the assumed number of frames; 0:
-    /// unknown.
+    /// will be packed into a container whose tiles hold `frame_block` frames each. `frames` is the assumed number of
+    /// frames; 0: unknown.
     pub fn from_stream_header(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
         let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
@@ -122,13 +124,14 @@ impl Workload {
         work.seen_by(rig, views, pairs)
     }
 
-    /// Returns the number of Gaussians in the largest of blocks of `block`: fewer if the input has fewer Gaussians.
+    /// Returns the number of Gaussians in the largest block if the Gaussians are divided into blocks of `block` each:
+    /// `block`, or the number of all Gaussians if this is smaller.
     pub fn largest_block(&self, block: u64) -> u64 {
         block.min(self.gaussians)
     }
 
-    /// Returns the number of frames in the largest of blocks of `block`: fewer if the input is known to have fewer
-    /// frames.
+    /// Returns the number of frames in the largest block if the frames are divided into blocks of `block` each:
+    /// `block`, or the number of all frames if this is known and smaller.
     fn frames_at_most(&self, block: u64) -> u64 {
         if self.frames == 0 { block } else { block.min(self.frames) }
     }
@@ -138,9 +141,9 @@ impl Workload {
         state_bytes(self.sh_degree, columns)
     }
 
-    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. If the
-    /// smaller of `max_kept_frames` and the frame block of the input is at most 1, it keeps none; otherwise it keeps
-    /// two more than this number.
+    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. Their
+    /// number follows from n, the smaller of [`Limits::max_kept_frames`] and the frames per tile of the input: n + 2
+    /// frames, but no frames if n is at most 1. Attributes that do not vary in time are not counted.
     pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -149,8 +152,8 @@ impl Workload {
         frames * self.state_bytes(columns & self.varying)
     }
 
-    /// Returns the memory of the blocks of Gaussians that the readers of all threads are filling, and of decoding these
-    /// blocks.
+    /// Returns the memory that the readers of all threads take while each thread fills one block of Gaussians with
+    /// values. Includes the buffers for decoding tiles.
     pub fn filling_blocks(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
@@ -169,9 +172,11 @@ impl Workload {
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
-    /// Returns the memory parts of a pass over views: those in bytes per Gaussian, and those of fixed size in bytes.
-    /// They cover the attributes `columns` of frames that are ready, frames being read, and views being rendered, each
-    /// with `sums` bytes per Gaussian for results.
+    /// Returns the memory of a pass over views as two lists of parts: parts that grow with the number of Gaussians, in
+    /// bytes per Gaussian, and parts of fixed size, in bytes. The parts are: frames that are ready to be rendered, with
+    /// their attributes `columns`; frames being read; and views being rendered, with the results of the pass. `sums` is
+    /// the number of bytes per Gaussian of these results, which are kept once for the whole pass and once more for each
+    /// view being rendered.
     pub fn view_pass_memory(
         &self,
         limits: &Limits,
@@ -195,7 +200,7 @@ impl Workload {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
-    /// Returns the memory of the buffers for writing the result, as a container or as one file per frame.
+    /// Returns the memory of the buffers for writing the compressed model, as a container or as one file per frame.
     pub fn write_buffers(&self) -> Vec<MemoryPart> {
         self.tile_write_buffers(FRAME_BLOCK)
     }
@@ -208,15 +213,16 @@ impl Workload {
         vec![("blocks", 2 * self.threads * block), self.filling_blocks(), ("index", self.written_index())]
     }
 
-    /// Returns the memory that the zstd compressors of all threads take at level `level` for tiles of `frames` frames.
+    /// Returns the memory that the zstd compressors of all threads take, at the compression level `level` and for tiles
+    /// of `frames` frames.
     pub fn compressor_memory(&self, level: i32, frames: usize) -> MemoryPart {
         let widest = Attributes::all().iter().map(|column| self.state_bytes(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns the maximum amount that is read for `frames` evenly spread frames, as a multiple (or fraction) of the
-    /// whole input. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only
-    /// some of its frames.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames; below 1
+    /// if only a part is read. Tiles are read as a whole. A tile is read several times if the memory limit lets readers
+    /// keep only some of its frames.
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -228,15 +234,16 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns [`Workload::full_reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians
-    /// of two blocks is read for each of the two.
+    /// Returns the maximum number of times that the whole input is read, like [`Workload::full_reads`], but for blocks
+    /// of Gaussians with arbitrary ids. A tile may contain Gaussians of two such blocks; it is then read for each of
+    /// them.
     pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
     }
 
-    /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians, given
-    /// the time of one view per Gaussian and per pixel.
+    /// Returns the time in seconds on one processor core for rendering `pictures` views of `gaussians` Gaussians. The
+    /// [`RenderCost`] gives the time of one view per Gaussian and per pixel.
     pub fn render_seconds(
         &self,
         pictures: f64,
@@ -246,7 +253,8 @@ impl Workload {
         pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
-    /// Returns this workload if only every `stride`-th pixel of a view in each direction is rendered.
+    /// Returns a copy of this workload with the number of pixels for renders of only every `stride`-th pixel in each
+    /// direction.
     pub fn on_grid(&self, stride: NonZeroU32) -> Workload {
         Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
     }
@@ -256,12 +264,14 @@ impl Workload {
         self.throughput.states * gaussians * frames * self.input.seconds_per_state
     }
 
-    /// Returns the number of Gaussians N as a floating-point number, since later stages process a fraction of them.
+    /// Returns the number of Gaussians N as a floating-point number, for estimates of stages that process a fraction of
+    /// them.
     pub fn gaussian_count(&self) -> f64 {
         self.gaussians as f64
     }
 
-    /// Returns the bytes of memory of what is known of the input besides its Gaussians: index, time stamps and cameras.
+    /// Returns the bytes of memory that an open input takes besides its memory per Gaussian: index, time stamps,
+    /// cameras, and [`MemoryProfile::fixed`].
     pub(super) fn known_bytes(&self) -> u64 {
         let index = match self.input.frame_block {
             0 => 0,
@@ -280,11 +290,12 @@ impl Workload {
     }
 }
 
-/// Speed of this machine for a scene: measured times divided by the times that this module assumes. 1 if nothing was
-/// measured; a larger value is slower.
+/// Speed of this machine for a scene: measured times divided by the times that this module assumes. Each ratio is 1 if
+/// nothing was measured; a ratio above 1 means that the machine is slower than assumed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Throughput {
-    /// Time for reading Gaussians at a frame and processing them, as a multiple of the assumed time.
+    /// Time for reading the states of Gaussians at a frame and processing them, as a multiple of the time that
+    /// [`MemoryProfile::seconds_per_state`] gives.
     pub states: f64,
     /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that
     /// [`CONTRIBUTION_COST`] assumes.
@@ -299,35 +310,37 @@ pub struct Throughput {
 }
 
 impl Throughput {
-    /// Speed that is assumed without a measurement.
+    /// Speed that is assumed if nothing was measured.
     pub const UNKNOWN: Throughput =
         Throughput { states: 1.0, contribution_time: 1.0, removal_time: 1.0, render_time: 1.0, processors: None };
 }
 
-/// Time that one view takes if it is rendered for a certain purpose: a part per Gaussian plus a part per pixel.
+/// Time for rendering one view for a certain purpose, such as finding contributions: a part per Gaussian plus a part
+/// per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderCost {
     /// Seconds on one processor core per Gaussian.
     gaussian: f64,
     /// Seconds on one processor core per pixel.
     pixel: f64,
+    /// Function that picks the ratio by which both times are multiplied, for example [`Throughput::render_time`].
     pace: fn(&Throughput) -> f64,
 }
 
-/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view.
-/// [`CONTRIBUTION_COST`], [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models;
-/// `scripts/estimate.py` compares estimated with measured times.
+/// Time for finding the contribution (Σ alpha · transmittance) of every Gaussian to one view. [`CONTRIBUTION_COST`],
+/// [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models; `scripts/estimate.py` compares
+/// estimated with measured times.
 pub const CONTRIBUTION_COST: RenderCost =
     RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.contribution_time };
-/// Time for finding the removal error of every Gaussian in a view: the squared error that removing it alone would
-/// cause.
+/// Time for finding the removal error of every Gaussian in one view: the squared error that removing this Gaussian
+/// alone would cause.
 pub const REMOVAL_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.removal_time };
-/// Time for rendering a view and comparing it with another render.
+/// Time for rendering one view and comparing the render with another one.
 pub const RENDER_COST: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render_time };
 
-/// Returns the bytes that zstd's tables for finding matches take at level `level`, for `bytes` bytes of input. They do
-/// not exceed the maximum of the level's group. They are two tables of 4-byte entries, each with at most twice as many
-/// entries as the input has bytes.
+/// Returns the bytes of memory that zstd takes for its tables for finding matches, at the compression level `level`,
+/// for `bytes` bytes of input. There are two tables of 4-byte entries, each with at most twice as many entries as the
+/// input has bytes. Together they do not exceed a maximum, which depends on the level.
 fn zstd_tables(level: i32, bytes: u64) -> u64 {
     let most_mebibytes = match level {
         ..=3 => 1,

@@ -29,7 +29,7 @@ pub struct AppearanceThresholds {
 }
 
 impl AppearanceThresholds {
-    /// Creates the tests from the thresholds of the pass `pass` and from those of `merge`, which all passes share.
+    /// Creates the thresholds from those of the pass `pass` and those in `merge`, which all passes share.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         AppearanceThresholds {
             d0: pass.d0,
@@ -63,7 +63,7 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// Reads the values of Gaussian `i` from `states`.
+    /// Creates the appearance of the Gaussian in row `i` of `states`.
     pub fn new(states: &Gaussians, i: usize) -> Self {
         let log_scale = states.log_scale.row::<3>(i).map(f64::from);
         let mut sorted = log_scale;

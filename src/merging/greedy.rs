@@ -13,10 +13,10 @@
 
 use rayon::prelude::*;
 
-/// Number of parallel rounds after which the remaining nodes are decided sequentially. Scenes need 5 to 8 rounds; a
-/// chain of Gaussians sorted along a line would need one round for every second one.
+/// Number of parallel rounds after which the remaining nodes are decided sequentially. Scenes need 5 to 8 rounds. A
+/// chain of Gaussians that are ranked in their order along a line would need one round for every two Gaussians.
 const MAX_ROUNDS: usize = 32;
-/// Number of undecided nodes below which deciding them sequentially is faster than another parallel round.
+/// Number of undecided nodes below which it is faster to decide them sequentially than in another parallel round.
 const FEW: usize = 64;
 
 /// Leader of every node, and statistics of how the leaders were found.
@@ -53,12 +53,12 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
 /// Value in `leader_of` of a node without a decision. A decided node has the index of its leader there.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Assigns every node to a leader. `rank`: rank of every node, a permutation of 0..N. `pairs`: pairs (leader, member)
-/// that passed all tests, in any order, in which the leader has the lower rank. The result is that of the sequential
-/// rule.
+/// Assigns every node to a leader, by the sequential greedy rule of this module. `rank`: rank of every node, a
+/// permutation of 0..N. `pairs`: pairs (leader, member) that passed all tests, in any order, in which the leader has
+/// the lower rank.
 ///
-/// With `limit`, exactly the first `limit` joins of the sequential order are made: by the leader's rank, then by the
-/// member's. The members of later joins stay single.
+/// With `limit`, only the first `limit` joins are made, in the order of the leader's rank, then of the member's. The
+/// members of all later joins stay single.
 pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Clustering {
     let predecessors = Predecessors::new(rank, pairs);
     let mut leader_of = vec![UNDECIDED; rank.len()];
@@ -120,7 +120,8 @@ impl Predecessors {
     }
 }
 
-/// Undoes all joins except the first `limit` in sequential order. Returns the number of joins that remain.
+/// Undoes all joins in `leader_of` except the first `limit` in sequential order: by the `rank` of the leader, then of
+/// the member. Without `limit`, undoes none. Returns the number of joins that remain.
 fn truncate(rank: &[u32], leader_of: &mut [u32], limit: Option<usize>) -> usize {
     let joined = |(node, &leader): (usize, &u32)| (node as u32 != leader).then_some(node as u32);
     let all = leader_of.iter().enumerate().filter_map(joined).count();

@@ -10,13 +10,14 @@ pub struct MergeGroups {
 }
 
 impl MergeGroups {
-    /// Creates one group for each of the increasing `rows`: no Gaussian is merged.
+    /// Creates one group for each row in `rows`, which increase. No Gaussian is merged.
     pub fn singletons(rows: &[u32]) -> Self {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
-    /// Returns the groups after group g has joined group `leader_of[g]`, for every g. A group with `leader_of[g]` = g
-    /// joins no other, but others may join it. The combined group has the leader of the group that was joined.
+    /// Returns the groups that result if every group g joins the group `leader_of[g]`. If `leader_of[g]` is g itself,
+    /// group g joins no other group, but others may join it. A combined group has the leader of the group that the
+    /// others joined.
     pub fn joined(&self, leader_of: &[u32]) -> Self {
         let mut new_index = vec![0; leader_of.len()];
         let mut leaders = Vec::new();

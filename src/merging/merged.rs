@@ -1,11 +1,11 @@
-//! A sequence with explicit frames in which clusters are replaced by proxies (one Gaussian per cluster) while frames
-//! are read.
+//! A sequence in which proxies (one Gaussian per cluster) replace clusters of merged Gaussians. The proxies are
+//! computed while frames are read.
 //!
 //! The state of a proxy at a frame has the weighted mean and covariance of its members (the Gaussians of its cluster)
 //! at that frame. The weights are those of the reference frame for all frames, so the trajectory is Σ w_i x_i(t). No
 //! proxy is stored; only the members being read are in memory. The members of a proxy may be anywhere in the source.
-//! Many Gaussians are best read by [`MergedSequence::open_together`], because a block of the source that is decoded for one
-//! of them then serves all.
+//! Many Gaussians are best read by [`MergedSequence::open_together`], because a block of the source that is decoded for
+//! one of them then serves all.
 
 use std::ops::Range;
 
@@ -39,9 +39,10 @@ pub struct MergedSequence<'a> {
 }
 
 impl<'a> MergedSequence<'a> {
-    /// Creates the sequence of the Gaussians `survivors` of `source`, in which proxies replace some of them. `clusters`
-    /// yields for each proxy its index in `survivors`, and the ids and weights of its members. A proxy is placed at the
-    /// mean of its members; because its trajectory is explicit, it need not be at its leader's position.
+    /// Creates the sequence of the Gaussians `survivors` of `source`, some of which are replaced by proxies. `clusters`
+    /// yields for each proxy the index in `survivors` of the Gaussian it replaces (its leader), and the ids and weights
+    /// of its members. Proxies are computed by the parameters `merge`, but always placed at the mean of their members:
+    /// their position is computed anew at every frame, so they need not move with the leader.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -69,7 +70,7 @@ impl<'a> MergedSequence<'a> {
 
 impl MergedSequence<'_> {
     /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all
-    /// proxies among them together, on all threads.
+    /// proxies among them together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
@@ -78,7 +79,8 @@ impl MergedSequence<'_> {
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
-    /// Returns how many Gaussians of the source Gaussian `place` of this sequence replaces; 1 if it is not a proxy.
+    /// Returns the number of source Gaussians that the Gaussian with index `place` of this sequence replaces: the
+    /// members of its cluster if it is a proxy, otherwise 1.
     pub fn member_count(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -108,10 +110,11 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every selected Gaussian, the index in `ids` of its own id (that of its leader if it is a proxy).
+    /// For every selected Gaussian, the index of its id in `ids`. A proxy has the id of its leader.
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// For every member of every proxy, the index of its id in `ids`, and its weight; one proxy after the other.
+    /// For every member of every proxy, the index of its id in `ids`, and its weight. The members of one proxy follow
+    /// one another.
     members: Vec<(u32, f64)>,
 }
 
@@ -144,8 +147,8 @@ impl MergedMembers {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
-    /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state` and writes them to
-    /// `out`.
+    /// Computes the attributes `want` of the selected Gaussians from the source Gaussians `state`, by the parameters
+    /// `merge` for proxies, and writes them to `out`.
     fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));

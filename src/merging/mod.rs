@@ -42,14 +42,15 @@ use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
 use tree::TreePoint;
 
-/// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. Groups take 12
-/// bytes before the pass and 12 after it, the row of the state 4, the rank 4. The last term is the largest of three
-/// that are not needed at once: neighbor index (46), coincident nodes (24), and clustering (24).
+/// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
+/// order: the groups before the pass, the groups after it, the row of the survivor's state, its rank, and the largest
+/// of three structures of which only one exists at a time. These are the neighbor index (46 bytes), the list of
+/// coincident nodes (24), and the clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
-/// its copy in the list to be measured, the known similarities of this pair and of one pair of earlier passes
-/// ([`known::SimilarityCache`]), and its motion similarity.
+/// its copy in the list of pairs to measure, two known similarities ([`known::SimilarityCache`]; one for this pair and
+/// one for a pair of an earlier pass), and the motion similarity that is returned.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
@@ -62,19 +63,19 @@ const CHUNK: usize = 1024;
 /// Survivors (Gaussians left by pruning), which are to be merged: selected rows of a table of states.
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
-    /// Attributes of all Gaussians at the reference frame. Comparisons read only the SH coefficients of degree 0;
-    /// proxies get all degrees that this table has.
+    /// Attributes of all Gaussians at the reference frame. Of the SH coefficients, comparisons use only those of degree
+    /// 0; proxies get those of all degrees.
     pub states: &'a Gaussians,
     /// Rows of the survivors in `states`, increasing.
     pub rows: &'a [u32],
-    /// Ids of all rows of `states`, whose hashes break ties; and for each id the contribution C, by which leaders are
-    /// ranked, and the visibility.
+    /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. Leaders are ranked by C;
+    /// ties are broken by the hashes of the ids.
     pub importance: Importance<'a>,
-    /// Merge class of every row of `states`. A Gaussian merges only with others of its class; with `None` it never
-    /// merges. A Gaussian with a value that is not finite never merges either.
+    /// Merge class of every row of `states`. A Gaussian merges only with others of its class. A Gaussian of class
+    /// `None`, or with a value that is not finite, never merges.
     pub classes: &'a [Option<u8>],
-    /// Extent of the scene in scene units: the unit of recipe lengths given in
-    /// [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
+    /// Extent of the scene in scene units. If the recipe gives lengths in the unit
+    /// [`LengthUnit::Extent`](recipe::LengthUnit::Extent), they are multiples of it.
     pub extent: f64,
 }
 
@@ -102,8 +103,7 @@ impl<'a> RequestedPairs<'a> {
 pub struct MergeResult {
     /// Groups of the survivors (Gaussians left by pruning). Every survivor is in exactly one group.
     pub groups: MergeGroups,
-    /// Proxies: one merged Gaussian for each group of more than one, in the order of the groups, as it is at the
-    /// reference frame.
+    /// Proxies at the reference frame: one merged Gaussian for each group of more than one, in the order of the groups.
     pub proxies: Gaussians,
     /// Statistics of each merging pass that was run. After the limit of joins is reached, no further pass is run.
     pub passes: Vec<PassCounts>,
@@ -112,8 +112,8 @@ pub struct MergeResult {
 /// Statistics of one merging pass. Its nodes are single Gaussians and the groups that earlier passes merged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Number of nodes of which only the nearest neighbors were examined, because more than the maximum lie within the
-    /// radius ε.
+    /// Number of nodes with more neighbors within the radius ε than the maximum. Of these neighbors only the nearest
+    /// were examined.
     pub truncated: usize,
     /// Number of candidate pairs: pairs that passed tests 1 (place and size) and 2 (color).
     pub candidates: usize,
@@ -131,16 +131,19 @@ pub struct PassCounts {
 /// Runs all merging passes of `recipe` over `survivors`. Every pass first merges nodes (Gaussians or merged groups)
 /// that coincide, then neighbors.
 ///
-/// `measure` provides the values for test 3 (motion): it returns the motion similarity of every requested pair, in
-/// order. A pair passes if its similarity exceeds the minimum τ_m of the pass. `measure` is called once per pass, once
-/// more before that if nodes coincide, and never without candidate pairs. If there are more than `most_pairs` pairs, it
-/// is called several times with at most `most_pairs` pairs each, in the voxel order of their leaders. The similarity
-/// depends on the pair alone, so the caller may cache it. In later passes the nodes are groups: a group has the state
-/// of the proxy of all its original Gaussians, the sum of their contributions C as its size, and the trajectory, life
-/// span and hash of its leader.
+/// `measure` provides the values for test 3 (motion): it returns the motion similarity of every requested pair, in the
+/// order of the request. A pair passes if its similarity exceeds the minimum τ_m of the pass. The similarity depends on
+/// the pair alone, so the caller may cache it.
+///
+/// Each pass calls `measure` at most twice: for the pairs of coincident nodes, then for the pairs of neighbors. A call
+/// without pairs is omitted. A call for more than `most_pairs` pairs is replaced by several calls for at most
+/// `most_pairs` pairs each; pairs of neighbors are in the voxel order of their leaders.
+///
+/// In later passes the nodes are groups. A group has the state of the proxy of all its original Gaussians, and the sum
+/// of their contributions C as its size. Trajectory, life span and hash are those of its leader.
 ///
 /// With `limit`, merging stops after exactly that many joins over all passes, or earlier if no more are possible. The
-/// joins made are the first ones in sequential order.
+/// joins made are the first ones in the order of the sequential rule ([`greedy`]).
 ///
 /// # Errors
 /// Returns the first error of `measure`; nothing else fails.
@@ -200,8 +203,8 @@ pub fn run<E>(
     Ok(MergeResult { groups, proxies, passes })
 }
 
-/// Returns the rank of every group: by the descending sum of the contributions C of its Gaussians, ties by the hash of
-/// the leader's id.
+/// Returns the rank of each of `groups`. Groups are ranked by the sum of the contributions C of their Gaussians,
+/// largest first; ties are broken by the hash of the leader's id.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -273,9 +276,9 @@ impl<'a> MergeNodes<'a> {
 /// that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call of
 /// `take` gets at most `max_batch` pairs (at least 1).
 ///
-/// This step is needed because the neighbor search returns a fixed number of nearest Gaussians. If more Gaussians than
-/// that coincide, all neighbors of each are in the same set, so the set would neither merge into one nor reach the
-/// Gaussians around it.
+/// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
+/// than that coincide, each of them finds only neighbors that coincide with it. Without this step, they would not all
+/// merge into one, and would not find the other Gaussians around them.
 ///
 /// # Errors
 /// Returns the first error of `take`.
@@ -307,13 +310,12 @@ fn each_coincident<E>(
 }
 
 /// Finds the pairs of nodes (leader, member) that pass tests 1 (place and size) and 2 (color) of `pass`, and calls
-/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit`: length of one unit
-/// of the recipe, in scene units. Pairs are ordered by leader in voxel order, then by distance. Each call of `take`
-/// gets at most `max_batch` pairs (at least 1), and a flag that says whether there are several calls. Returns the
+/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit` is the unit of the
+/// recipe's lengths, in scene units. Pairs are ordered by leader in voxel order, then by distance. Each call of `take`
+/// gets at most `max_batch` pairs (at least 1), and whether the pairs are divided among several calls. Returns the
 /// number of nodes with more neighbors within the radius ε than were examined.
 ///
-/// A node that may not merge, or is not finite, never leads or joins, and is not counted among the nearest neighbors of
-/// others.
+/// A node that may not merge, or has a value that is not finite, is in no pair and does not count as a neighbor.
 ///
 /// # Errors
 /// Returns the first error of `take`.
@@ -364,7 +366,7 @@ fn each_candidate<E>(
     Ok(truncated)
 }
 
-/// Returns whether all attribute values of the Gaussian in row `row` are finite.
+/// Returns whether all attribute values of the Gaussian in row `row` of `states` are finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
     let columns = Attributes::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))

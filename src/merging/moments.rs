@@ -38,13 +38,14 @@ pub struct Ellipsoid {
     pub scales: DVec3,
 }
 
-/// Returns the Gaussian with the mean Σ w_i μ_i and the covariance of the mixture `parts`. If `about` is given, the
+/// Returns the Gaussian that has the mean Σ w_i μ_i and the covariance of the mixture `parts`. If `about` is given, the
 /// mean is that point instead, and the second moments are taken about it.
 ///
 /// Canonical form: scales descend. The first two axes have a positive largest component, and the third makes the frame
-/// right-handed, so a reflection is resolved by flipping the smallest axis. Accuracy: every scale has a relative error
-/// of about 1e-14 if the scaled axes of `parts` have, at any anisotropy. Edge cases: without parts all scales are zero,
-/// and the mean is `about` or the origin. Scales need only be finite; their squares may overflow.
+/// right-handed, so a reflection is resolved by flipping the smallest axis. Accuracy: at any anisotropy, every scale
+/// has a relative error of about 1e-14, if the scaled axes of `parts` have errors of this size. Edge cases: without
+/// parts all scales are zero, and the mean is `about` or the origin. Scales must be finite, but may be so large that
+/// their squares overflow.
 pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     let mean = about.unwrap_or_else(|| parts.iter().map(|part| part.weight * part.position).sum());
     let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| Vec::with_capacity(4 * parts.len()));

@@ -22,8 +22,8 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 /// frames, whatever the time between them, because the noise level they are compared with is also one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; 0
-    /// counts for a step in which one of them is zero. The mean is over all frames in which both are alive
+    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; a step
+    /// in which a or b is zero counts as 0. The mean is over all frames in which both are alive
     /// (`MotionParams::Literal`), or only over the steps that also begin in such a frame (`MotionParams::Runs`).
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
@@ -42,9 +42,10 @@ pub struct PairMeasure {
 }
 
 impl PairMeasure {
-    /// Returns the alignment of the velocities a and b, A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1
-    /// for two static Gaussians, the cosine for equally fast ones, and small if one is ten times as fast as the other.
-    /// A is 1 if there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
+    /// Returns the alignment of the velocities a and b of the two Gaussians over the n steps, A = (2Σ a·b +
+    /// 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1 for two static Gaussians. It is the cosine of the angle
+    /// between the velocities for equally fast ones, and small if one is ten times as fast as the other. A is 1 if
+    /// there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
     ///
     /// `noise` is σ, the noise level of a step in scene units.
     pub fn alignment(&self, noise: f64) -> f64 {
@@ -54,7 +55,7 @@ impl PairMeasure {
     }
 
     /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
-    /// least one is. Returns 1 if neither is ever alive.
+    /// least one is alive. Returns 1 if neither is ever alive.
     pub fn one_alive_fraction(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
@@ -71,7 +72,8 @@ pub struct MotionThresholds {
 }
 
 impl MotionThresholds {
-    /// Creates the test from the thresholds of `merge`. `unit`: length of one unit of the recipe, in scene units.
+    /// Creates the thresholds from those in `merge`, converted to scene units. `unit` is the unit of the recipe's
+    /// lengths, in scene units.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
@@ -84,8 +86,8 @@ impl MotionThresholds {
     }
 
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
-    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two are never alive together, if the
-    /// fraction of frames with only one alive is too large, or if the two drift too far apart.
+    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two Gaussians are never alive together, if
+    /// the fraction of frames with only one alive is too large, or if the two Gaussians drift too far apart.
     pub fn similarity(&self, pair: &PairMeasure) -> f64 {
         let together =
             pair.common > 0 && pair.drift <= self.max_drift && pair.one_alive_fraction() <= self.max_dead_time;
@@ -131,8 +133,8 @@ pub struct PairMotion {
 
 impl PairMotion {
     /// Starts the measurement of `pairs`, each given as the indices of two nodes. `reference` yields the position of
-    /// every node at the reference frame. With the `motion` `Literal`, all steps count that end in a frame in which
-    /// both nodes are alive; with `Runs`, only those that also begin in such a frame.
+    /// every node at the reference frame. `motion` selects the steps that count: for `Literal`, all steps that end in a
+    /// frame in which both nodes are alive; for `Runs`, only those that also begin in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -181,7 +183,7 @@ impl PairMotion {
         self.frames += 1;
     }
 
-    /// Returns the measure of each pair over all frames added, in the order in which the pairs were given.
+    /// Returns the [`PairMeasure`] of each pair over all frames added, in the order in which the pairs were given.
     pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
         let measure = move |pair: NodePair| {

@@ -3,9 +3,10 @@
 //! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`crate::merging::run`] divides
 //! them into partitions of a fixed number of consecutive pairs in voxel order, so that the Gaussians of a partition are
 //! close in space. The trajectories of all survivors (Gaussians left by pruning) are then first gathered in a scratch
-//! file in that order. For a partition, the Gaussians that lead its pairs are read, and their partners; these may also
-//! be read for other partitions. Partitions are cut by counting pairs, so even a voxel with more pairs than fit in
-//! memory is split. The sums of a pair are computed entirely in one partition, so partitioning does not change a bit.
+//! file in voxel order. For each partition, the Gaussians of its pairs are read from this file; a Gaussian with pairs
+//! in several partitions is read for each of them. Partitions are cut by counting pairs, so even a voxel with more
+//! pairs than fit in memory is split. All sums of a pair are computed in one partition, so partitioning does not change
+//! a bit.
 
 use std::path::PathBuf;
 
@@ -27,9 +28,9 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
 
-/// Returns the bytes of memory for each Gaussian of the pairs that are measured together (at most two per pair): index
-/// and id, track, state at one frame, and the `frames_held` frames that a reader holds. The memory of the source's own
-/// reader is not included.
+/// Returns the bytes of memory for each Gaussian in the pairs that are measured together (at most two Gaussians per
+/// pair): its index and id, its track, its state at one frame, and its states at the `frames_held` frames that a reader
+/// holds. The memory of the source's own reader is not included.
 pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
@@ -70,16 +71,16 @@ impl PairMeter<'_> {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
-    /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order. The pairs are rows
-    /// of `ids`, which increase. `reference` `[3, M]` holds the positions of `ids` at the reference frame, where the
-    /// two Gaussians of a pair are at most about `reach` apart. `ids` and `reference` must be the same in every call.
-    /// `is_part` is true if pairs are also requested in other calls, so that gathering the trajectories in a file saves
-    /// time.
+    /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order. Pairs are given as
+    /// rows of `ids`, a list of increasing ids. `reference` `[3, M]` holds the positions of these M Gaussians at the
+    /// reference frame. The two Gaussians of a pair are at most about `reach` apart at that frame. `ids` and
+    /// `reference` must be the same in every call. `is_part` is true if pairs are also requested in other calls, so
+    /// that gathering the trajectories in a file saves time.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
-    /// With gathered trajectories also 8 bytes for each of `ids`; while gathering, 12 more and the values of the frames
-    /// held. Nothing grows with the number of frames. If neither positions nor opacities vary, only the first frame is
-    /// measured.
+    /// If trajectories are gathered, also 8 bytes for each of `ids`; while they are being gathered, 12 more and the
+    /// values of the frames held. Nothing grows with the number of frames. If neither positions nor opacities vary,
+    /// only the first frame is measured.
     ///
     /// # Errors
     /// Fails if the source cannot be read, or the scratch file cannot be read or written. The scratch file is then
@@ -125,7 +126,9 @@ impl PairMeter<'_> {
         Ok(pairs.iter().zip(measured).map(by_row).collect())
     }
 
-    /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in the order of voxels of side `reach`.
+    /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in voxel order: sorted by the voxel (of side
+    /// `reach`) in which their position in `reference` lies. Fails if the source cannot be read or the scratch file
+    /// cannot be written.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
@@ -139,8 +142,8 @@ impl PairMeter<'_> {
         Ok(GatheredTrajectories { trajectories, order, place })
     }
 
-    /// Passes every frame of the Gaussians `ids` of the source to `motion`; only the first frame if nothing varies with
-    /// time.
+    /// Passes every frame of the Gaussians `ids` of the source to `motion`. Passes only the first frame if neither
+    /// positions nor opacities vary with time.
     fn play_source(&self, ids: &[u32], motion: &mut PairMotion) -> Result<()> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
@@ -160,7 +163,7 @@ impl PairMeter<'_> {
     }
 }
 
-/// Returns all Gaussians that occur in `pairs`, increasing and without duplicates.
+/// Returns the indices of all Gaussians that occur in `pairs`, increasing and without duplicates.
 fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     let mut members = Vec::with_capacity(2 * pairs.len());
     members.extend(pairs.iter().flat_map(|&(a, b)| [a, b]));

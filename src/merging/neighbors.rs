@@ -106,7 +106,7 @@ impl PointIndex {
 
 /// Returns the hash of the voxel with Morton code `number`. The eight voxels of a 2×2×2 cube follow one another in the
 /// table, so that the 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the
-/// highest bits of hashes first, so these bits are made different within a cube too.
+/// highest bits of two hashes before it compares the entries; the hashes within a cube differ in these bits, too.
 fn hash(number: u64) -> u64 {
     let corner = number & 7;
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
@@ -124,8 +124,9 @@ pub struct NeighborSearch<'a> {
 }
 
 impl NeighborSearch<'_> {
-    /// Returns the indices of the nearest points to `at` other than `query`: at most `k` within the distance ε, nearest
-    /// first, equal distances by index. Also returns whether there were more than `k`.
+    /// Returns the indices of the points nearest to `at`, except the point with index `query`: at most `k` points,
+    /// within the distance ε, nearest first; of two at equal distance, the one with the smaller index first. Also
+    /// returns whether more than `k` points are within ε.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edge case: a point that is not finite has no
     /// neighbors.

@@ -2,8 +2,8 @@
 //!
 //! Input: attributes of all members at the reference frame, and their weights. Output: one Gaussian per cluster, in the
 //! stored encoding (log scales, opacity logits). Memory: 1 KiB per cluster for at most 4096 clusters at a time, beside
-//! the output. A large set of coincident Gaussians needs 220 bytes per member, less than the pairs that led to it may
-//! take.
+//! the output. A cluster of many coincident Gaussians takes 220 bytes per member; finding their pairs may have taken
+//! more.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -81,9 +81,9 @@ impl Importance<'_> {
     }
 }
 
-/// Returns the weights of the members of a cluster, given as rows of `states`. Weights are proportional to contribution
-/// × visibility (C·Vis) and sum to 1. If this sum is not positive and finite, they are proportional to opacity × area;
-/// if that fails too, all are equal.
+/// Returns the weights of the `members` of a cluster, which are rows of `states`. Weights are proportional to
+/// contribution × visibility (C·Vis, from `importance`) and sum to 1. If the sum of the products C·Vis is not positive
+/// and finite, weights are proportional to opacity × area; if that fails too, all are equal.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
     let weighted_contribution = |&i: &u32| importance.weighted_contribution(i);
     let opaque_area = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
@@ -102,9 +102,10 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 ///
 /// Mean and covariance are those of the weighted mixture. With [`ProxyPosition::Leader`] the proxy has the leader's
 /// position, and the second moments are taken about it. The base color is the weighted mean; coefficients of higher SH
-/// degrees are the weighted mean or those of the member with the largest weight (the first on a tie). Opacity follows
-/// [`ProxyOpacity`], with the area of an ellipsoid projected in all directions and averaged. Exact duplicates give the
-/// leader's own position, axes, scales and color. A zero quaternion counts as the identity.
+/// degrees are the weighted mean or those of the member with the largest weight (the first on a tie). The opacity
+/// follows the rule [`ProxyOpacity`]; the area in this rule is the projected area of an ellipsoid, averaged over all
+/// directions. Exact duplicates give the leader's own position, axes, scales and color. A zero quaternion counts as the
+/// identity.
 ///
 /// Colors are computed only if `want` contains them: they are slow to read, and in most sequences they are the same at
 /// every frame.
@@ -148,8 +149,8 @@ pub fn merge_state(
     }
 }
 
-/// Computes the proxy of every group of more than one Gaussian. The result has one row for each such group, in the
-/// order of the groups.
+/// Computes the proxy of every group in `groups` that has more than one Gaussian, from the Gaussians `states` and their
+/// `importance`, by the parameters `merge`. The result has one row for each such group, in the order of the groups.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,
@@ -200,10 +201,10 @@ fn nearest_sign(rotation: DQuat, reference: DQuat) -> [f64; 4] {
     [q.w, q.x, q.y, q.z]
 }
 
-/// Returns the projected area, averaged over all directions, of an ellipsoid with the half axes `scales`. It is a
-/// quarter of the surface (Cauchy), computed by Thomsen's formula, with an error of at most 1.1%. The plain mean of the
-/// three cross sections would overestimate the growth of a flat Gaussian that thickens to 0.3 of its width: 60% instead
-/// of 18%.
+/// Returns the projected area of an ellipsoid with the half axes `scales`, averaged over all directions. It is a
+/// quarter of the surface (Cauchy), computed by Thomsen's formula, with an error of at most 1.1%. The mean of the cross
+/// sections along the three axes would be less exact: if a flat Gaussian thickens to 0.3 of its width, its area grows
+/// by 18%, but this mean by 60%.
 fn mean_area(scales: DVec3) -> f64 {
     let largest = scales.max_element();
     if largest <= 0.0 {
@@ -214,7 +215,8 @@ fn mean_area(scales: DVec3) -> f64 {
     std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
 }
 
-/// Returns the opacity of the proxy of `members` by the rule `rule`, clamped so that its logit is finite.
+/// Returns the opacity of the proxy of `members` (rows of `states` with weights) by the rule `rule`, clamped so that
+/// its logit is finite.
 fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
     let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
     let opacity = match rule {

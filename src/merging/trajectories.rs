@@ -1,17 +1,18 @@
 //! Positions and opacities of selected Gaussians at all frames, in a scratch file. The order of the Gaussians in the
 //! file is chosen so that those read together are stored together.
 //!
-//! The source is read once, in blocks of Gaussians in the order of ids, and a few frames at a time. A source that
-//! stores tiles (consecutive Gaussians × frames) decodes each tile once if the tile spans no more frames than are read
-//! at a time. Files are opened once per block. The scratch file is read by the calling thread with plain reads: it has
-//! no index and leaves no mapped pages, either of which would grow with the number of frames.
+//! The source is read once, a few frames at a time, in blocks of Gaussians in the order of ids. A source that stores
+//! tiles (consecutive Gaussians × frames) decodes each tile once if the tile spans no more frames than are read at a
+//! time. A source that reads files opens them once for each block and these few frames. The scratch file is read by the
+//! calling thread with plain reads: it has no index and leaves no mapped pages, either of which would grow with the
+//! number of frames.
 //!
 //! Layout of the file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block
 //! of F frames (the last may be shorter) the values that vary with time, `[N, F, W]` with W = 4, 3 or 1, or nothing.
 //! All values are f32 in the byte order of this machine.
 //!
-//! Memory while gathering: per Gaussian 8 bytes, and for each of F frames those of its 16 bytes that vary; per thread
-//! two blocks of as many frames.
+//! Memory while gathering: 8 bytes per Gaussian, and for each of F frames the part of its 16 bytes that varies with
+//! time; per thread, two blocks of Gaussians at F frames.
 
 use std::ops::Range;
 use std::path::Path;
@@ -32,10 +33,10 @@ pub(crate) type TrajectorySample = [f32; 4];
 /// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum distance between two requested Gaussians that are read in one go together with the Gaussians between them,
-/// as a number of Gaussians in the file.
+/// Maximum distance between two requested Gaussians for which one read covers both and the Gaussians between them. It
+/// is the difference of their places in the file.
 const GAP: u32 = 32;
-/// Maximum number of Gaussians that are read in one go.
+/// Maximum number of Gaussians that one read covers.
 const RUN: u32 = 2048;
 
 /// Trajectories of Gaussians in an unnamed scratch file, which is deleted when this value is dropped.
@@ -84,8 +85,8 @@ impl Trajectories {
         Ok(Trajectories { file, count: ids.len(), frames, block, varying })
     }
 
-    /// Calls `show` once per frame with the samples of the Gaussians at `places` (increasing indices into the file);
-    /// only once if no value varies with time.
+    /// Calls `show` for every frame in order, with the samples of the Gaussians at `places` (increasing indices into
+    /// the file). If no value varies with time, calls `show` only once.
     ///
     /// Memory: for every Gaussian its sample and its varying values for the frames of a block; also a bounded buffer.
     ///
@@ -142,9 +143,8 @@ fn value_range(columns: Attributes) -> Range<usize> {
     start..if columns.contains(Attributes::OPACITY) { 4 } else { 3 }
 }
 
-/// Reads the attributes `columns`, W values in all, of N Gaussians at `frames` into `values`, laid out as `[N, frames,
-/// W]` with the Gaussians in the order of their places. `places` holds the pairs (id, place) of the Gaussians, sorted
-/// by id.
+/// Reads the attributes `columns` (together W values per Gaussian and frame) of N Gaussians at `frames` into `values`,
+/// laid out as `[N, frames, W]`. `places` holds for each Gaussian its id and its row in `values`, sorted by id.
 fn read_frames(
     source: &dyn FrameSource,
     places: &[(u32, u32)],
@@ -191,7 +191,7 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::BlockReader;
 
-    /// Test scene that declares fewer attributes as varying with time and keeps all others as they are at frame 0.
+    /// Test scene in which only some attributes vary with time; all others stay as they are at frame 0.
     struct PartlyStatic(DemoScene, SequenceInfo);
 
     impl PartlyStatic {

@@ -27,8 +27,8 @@ type NeighborCandidate = (u64, u32);
 
 /// List of the nearest points to a position found so far, up to the requested number.
 ///
-/// The list holds up to twice as many unsorted candidates before the farther half is dropped. A heap would move about
-/// log K candidates for each one found.
+/// The list collects up to twice the requested number K of candidates, unsorted, and then drops the farther half. A
+/// heap would move about log K candidates for each candidate added.
 #[derive(Debug, Default)]
 pub struct NearestPoints {
     query: u32,
@@ -62,7 +62,7 @@ impl NearestPoints {
         }
     }
 
-    /// Returns whether a point could still be among the nearest if its squared distance is `bound` or more.
+    /// Returns whether a point with a squared distance of `bound` or more could still be one of the nearest.
     pub fn could_improve_at(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
@@ -97,7 +97,7 @@ pub struct Tree {
 }
 
 impl Tree {
-    /// Builds a tree over `points` and reorders them in the order of its leaves.
+    /// Builds a tree over `points`, and sorts `points` in the order of the tree's leaves.
     pub fn new(points: &mut [TreePoint]) -> Self {
         let depth = points.len().div_ceil(MAX_LEAF_POINTS).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
@@ -142,8 +142,9 @@ impl Tree {
 }
 
 impl Node {
-    /// Returns a lower bound of (squared distance to `at`, index) for all points below this node. Each step of the sum
-    /// is monotone in f64, so rounding cannot raise the bound above the distance of a point in the node's box.
+    /// Returns a lower bound of the pair (squared distance to `at`, index) over all points below this node. Rounding to
+    /// f64 never raises the distance of the node's box above that of a point in it, because every operation of the sum
+    /// is monotone.
     fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)

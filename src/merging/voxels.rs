@@ -1,10 +1,10 @@
 //! A grid of voxels: cubes of equal size, sorted in Morton order, which keeps neighbors together (G. M. Morton, "A
 //! computer oriented geodetic data base", 1966).
 //!
-//! Gaussians in this order that are close in space are mostly close in the list. A consecutive part of the list,
-//! together with all Gaussians within one voxel side of it (its ghosts), contains all pairs led from that part. The
-//! order affects only the speed of reading, never a result.
-//! Memory while sorting: 20 bytes per Gaussian beside the output.
+//! Gaussians that are close in space are mostly close in this order, too. Take a consecutive part of the list, and all
+//! Gaussians within one voxel side of it (its ghosts): together they contain all pairs that are at most one side apart
+//! and whose leader is in the part. The order affects only the speed of reading, never a result. Memory while sorting:
+//! 20 bytes per Gaussian beside the output.
 
 use rayon::prelude::*;
 
@@ -61,20 +61,21 @@ impl VoxelGrid {
     }
 }
 
-/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their positions.
+/// Returns `rows` sorted as by [`VoxelGrid::sort_rows`], in a grid of voxels of side `side` that covers their
+/// positions. `at` returns the position of a row.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
     VoxelGrid::around(rows.iter().map(|&row| at(row)), side).sort_rows(rows, at)
 }
 
-/// Returns the number along each axis of the voxel at `place`, a result of [`VoxelGrid::grid_coordinates`]. Outside of the grid it is
-/// the nearest voxel; NaN gives the first voxel.
+/// Returns the voxel at `place` (a result of [`VoxelGrid::grid_coordinates`]) as its number along each axis, counted
+/// from 0. For a place outside of the grid it is the nearest voxel; a coordinate that is NaN gives the number 0.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
     // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
     place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))
 }
 
-/// Returns the bits of a Morton code that a voxel gets from its number `number` along `axis`; `None` if the grid has no
-/// such voxel.
+/// Returns the part of a voxel's Morton code that belongs to `axis`, for a voxel with the number `number` along this
+/// axis; `None` if the grid has no such voxel.
 pub fn morton_bits(axis: usize, number: u32) -> Option<u64> {
     (number < MAX_PER_AXIS).then(|| spread_bits(number.into()) << axis)
 }

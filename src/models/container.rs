@@ -80,7 +80,8 @@ impl InputModel for Container {
     }
 }
 
-/// Returns size and value range of every column of the container, collected from its tile index.
+/// Returns size and value range of every column of the container, collected from its tile index. Fails if the index
+/// cannot be read.
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
     let layout = reader.layout();
     let mut out = Vec::new();

@@ -73,7 +73,7 @@ pub trait InputModel: Send + Sync {
         self.bytes()
     }
 
-    /// Returns the memory that the open input takes and the time and memory that reading it takes.
+    /// Returns how much memory the open input takes, and how much time and memory reading it takes.
     fn memory_profile(&self) -> MemoryProfile;
 
     /// Tells the input that it may keep decoded values in memory, up to the bytes of [`MemoryProfile::decoded`].
@@ -92,11 +92,12 @@ pub trait InputModel: Send + Sync {
         1.0
     }
 
-    /// Returns the input with frames at `times`. Inputs whose files store frame times ([`TimeOrigin::Stamped`]) refuse.
+    /// Returns the input with frames at `times`.
     ///
     /// # Errors
     /// Fails if times are not finite or do not increase, or if the input has a fixed number of frames and `times` has
-    /// another.
+    /// another number of entries. Always fails for an input whose files store the times of frames
+    /// ([`TimeOrigin::Stamped`]).
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
 
     /// Returns notes for the user, such as repairs or guesses made while opening.
@@ -127,12 +128,13 @@ pub trait InputModel: Send + Sync {
         0
     }
 
-    /// Returns the stored parameters of the Gaussians, before any motion, if all frames are computed from them.
+    /// Returns the stored parameters of the Gaussians, before any motion, if all frames are computed from them; else
+    /// `None`.
     fn canonical(&self) -> Option<&Gaussians> {
         None
     }
 
-    /// Returns statistics of each column if the input is a container; else an empty list.
+    /// Returns statistics of each column (attribute) if the input is a container; else an empty list.
     ///
     /// # Errors
     /// Fails if the index of the container cannot be read.
@@ -265,7 +267,7 @@ pub struct MemoryProfile {
     /// Bytes of memory per Gaussian of a copy of the compressed model, from which its frames are read.
     pub reduced: u64,
     /// Bytes of memory per Gaussian of the derivative (Jacobian) of frame states with respect to stored parameters; 0
-    /// if states change by as much as stored parameters do.
+    /// if the Jacobian is the identity, because states change by as much as stored parameters do.
     pub jacobian: u64,
     /// Bytes of memory per Gaussian of the values that [`Deformation::with_params`] computes once for all frames; 0 if
     /// it computes none.
@@ -276,7 +278,8 @@ pub struct MemoryProfile {
     pub file: u64,
     /// Bytes of memory that do not depend on the number of Gaussians.
     pub fixed: u64,
-    /// Number of frames that are decoded together, which a reader may keep in memory; 0 if each frame is read alone.
+    /// Number of frames that are decoded together, all of which a reader may keep in memory; 0 if each frame is read
+    /// alone.
     pub frame_block: u64,
     /// Number of Gaussians that are decoded together, in one block.
     pub gaussian_block: u64,
@@ -361,7 +364,7 @@ pub(super) struct FoundInput<'a> {
 }
 
 impl<'a> FoundInput<'a> {
-    /// Reads the first bytes of `path` if it is a file.
+    /// Reads the first bytes of `path` if it is a file. Fails if `path` does not exist or cannot be read.
     pub(super) fn new(path: &'a Path, memory: ReadLimit) -> Result<FoundInput<'a>> {
         let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
         let mut head = Vec::new();
@@ -438,7 +441,7 @@ pub enum LinkMode {
 }
 
 impl LinkMode {
-    /// Returns whether inputs that already identify each Gaussian across frames are linked as well.
+    /// Returns whether frames are linked even if the input already identifies each Gaussian across frames.
     pub fn always_links(self) -> bool {
         matches!(self, LinkMode::Always | LinkMode::Apart)
     }
@@ -460,7 +463,8 @@ impl OpenOptions {
         PlyOptions { scratch: self.scratch(), memory: self.memory, events: self.events.clone() }
     }
 
-    /// Fails if the user gave `--iteration`: the input at `path` is not a model folder.
+    /// Fails if the user gave `--iteration`, because the input at `path` is not a model folder and so has no training
+    /// iterations.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
             Some(_) => Err(Error::usage(format!("{}: --iteration applies to model folders only", path.shown()))),

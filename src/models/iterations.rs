@@ -21,7 +21,8 @@ pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     Ok(found)
 }
 
-/// Returns K and the path of one subfolder `iteration_K` of `within`: of the iteration `asked`, or of the largest.
+/// Finds the subfolder `iteration_K` of `within` for the training iteration `asked`, or for the largest K if `asked` is
+/// `None`. Returns K and the path of the subfolder.
 ///
 /// # Errors
 /// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists the existing ones.

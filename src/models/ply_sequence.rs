@@ -52,7 +52,8 @@ pub(super) const FILE: ModelFormat = ModelFormat {
     open: |path, options| open_frames(PlyFrames::open_single(path, &options.ply())?, path, options),
 };
 
-/// Opens `frames` as they are if the same index means the same Gaussian in all of them; else links the frames.
+/// Opens the PLY frames `frames`, which were found at `path`. Links them (matches their Gaussians between frames) if
+/// `options` request this, or if the same index does not mean the same Gaussian in all frames.
 pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {

@@ -51,7 +51,7 @@ impl ModelSize {
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// Formats for messages the size in bytes of each part of this model next to that of the same part of `before`:
+    /// Formats for messages the size in bytes of each part of this model, compared with the same part of `before`:
     /// `cloud 248 of 2480 (10.0%)`. A part that only one of the two models has is compared with `none`.
     pub fn format_relative_to(&self, before: &ModelSize) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
@@ -78,7 +78,7 @@ impl ModelSize {
     }
 }
 
-/// Formats two numbers of bytes as `{after} of {before}` with a percentage.
+/// Formats two numbers of bytes as `{after} of {before}`, followed by the percentage `after` / `before`.
 pub fn format_ratio(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }

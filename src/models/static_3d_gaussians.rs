@@ -56,7 +56,8 @@ struct StaticModel {
 }
 
 impl StaticModel {
-    /// Opens the model folder `root` at the requested training iteration, or at the largest.
+    /// Opens the model folder `root` at the training iteration of `options`, or at the largest if `options` gives none.
+    /// Fails if the point cloud file is missing or damaged.
     fn open(root: &Path, options: &OpenOptions) -> Result<StaticModel> {
         let (iteration, folder) = find_iteration(&root.join(POINT_CLOUD_FOLDER), options.iteration)?;
         Ok(StaticModel {

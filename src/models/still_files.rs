@@ -45,7 +45,7 @@ struct StillFormat {
     read: fn(&Path, ReadLimit) -> Result<Gaussians>,
 }
 
-/// All formats of this module.
+/// File formats that this module reads. A file holds one frame.
 const FORMATS: [StillFormat; 5] = [
     StillFormat {
         ending: ".sog",
@@ -134,7 +134,8 @@ struct StillFiles {
 }
 
 impl StillFiles {
-    /// Decodes the file or the folder at `path` and opens the decoded frames.
+    /// Decodes the file at `path`, or the files in the folder at `path`, and opens the decoded frames. Fails if a file
+    /// cannot be decoded or if the SH degree differs between frames.
     fn open(path: &Path, format: &'static StillFormat, options: &OpenOptions) -> Result<StillFiles> {
         options.refuse_for(path)?;
         let is_sequence = path.is_dir() && !path.join("meta.json").is_file();
@@ -251,7 +252,7 @@ impl InputModel for StillFiles {
     }
 }
 
-/// Returns the files in `paths`: each folder is replaced by the files in it, sorted by name.
+/// Returns `paths` with each folder replaced by the files in it, sorted by name. Fails if a folder cannot be listed.
 fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for path in paths {

@@ -107,8 +107,9 @@ impl InputModel for ReceivedStream {
     }
 }
 
-/// Receives a stream, writes its frames to the container `path` and returns the number of bytes received. Calls `take`
-/// with the frames of each block of consecutive frames, in order.
+/// Receives a stream, writes its frames to the container `path` with the settings `packing`, and returns the number of
+/// bytes received. Calls `take` with the frames of each block of consecutive frames, in order. Fails if the stream is
+/// damaged or a write fails.
 pub fn pack_stream(
     mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,

@@ -58,7 +58,8 @@ pub(super) fn reduced_trajectories<'a>(
     Box::new(SourceWithDeltas::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
-/// Checks that a sequence of `frames` frames can be written as the kind of output `kind` to `path`.
+/// Fails if a sequence of `frames` frames cannot be written as the kind of output `kind` to `path`. The message says
+/// which kinds of output work.
 pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
     match kind {
         OutputKind::Model => Err(Error::usage(
@@ -74,7 +75,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
 }
 
 /// Writes the compressed model `reduction` of `source` as the kind of output `kind` to `path`; returns notes for the
-/// user.
+/// user. Fails if frames cannot be read or a write fails.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
     reduction: &CompressedModel,

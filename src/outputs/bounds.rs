@@ -28,8 +28,8 @@ impl ErrorBounds {
         ErrorBounds(bounds)
     }
 
-    /// Creates error bounds from the maximum errors that the user requests. `extent` returns the scene extent in scene
-    /// units; it is called only if a maximum error is relative to the extent.
+    /// Creates error bounds from `requested`, the maximum errors that the user requests. `extent` returns the scene
+    /// extent in scene units; it is called only if a maximum error is relative to the extent.
     ///
     /// # Errors
     /// Fails if an attribute is named twice, or if `extent` fails.

@@ -1,9 +1,9 @@
 //! Writes any sequence to a `.gseq` container, one frame block (consecutive frames) after the other. A tile has the
 //! values of one attribute of one block of Gaussians in one frame block. Attributes are the columns of the container.
 //!
-//! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and as much again
-//! while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column and block of
-//! Gaussians, and 16 per frame.
+//! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and the same
+//! amount again while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column
+//! and block of Gaussians, and 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -21,10 +21,12 @@ use crate::source::{FrameSource, Ids};
 /// Number of Gaussians per tile. One task of a scan reads such a block of Gaussians. The number is constant, so that
 /// the bytes of a container depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer.
+/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer
+/// frames per tile.
 pub const FRAME_BLOCK: usize = 32;
-/// Number of frames per tile in a container with error bounds. More frames pay with bounds, because the first frame of
-/// a tile takes as much space as all others together.
+/// Number of frames per tile in a container with error bounds. It is larger than [`FRAME_BLOCK`], because with error
+/// bounds the first frame of a tile takes as much space as all others together, and longer tiles have fewer first
+/// frames.
 pub const BOUNDED_FRAME_BLOCK: usize = 64;
 
 /// Encoding of the values in a container: compression and maximum errors.
@@ -83,9 +85,9 @@ impl Packing {
     }
 }
 
-/// Writes all frames of `source` to the container `path`, encoded as `packing`, with the metadata `attributes` (names
-/// and texts). The file appears only when it is complete. Calls `advance` with the number of Gaussian states (Gaussians
-/// × frames) encoded since the last call.
+/// Writes all frames of `source` to the container `path`, in the encoding `packing`, with the metadata `attributes`
+/// (names and texts). The file appears only when it is complete. Calls `advance` with the number of Gaussian states
+/// (Gaussians × frames) encoded since the last call.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -101,10 +103,10 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes the frame blocks with the numbers `blocks` and writes them to the scratch file `to`, from which
-/// [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the tile equals that
-/// of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
-/// last call.
+/// Encodes the frame blocks with the numbers `blocks` of `source` in the encoding `packing`, and writes them to the
+/// scratch file `to`, from which [`join_container`] reads them. Writes one record per tile, in order. An empty record
+/// means that the tile equals that of the frame block before. Calls `advance` with the number of Gaussian states
+/// (Gaussians × frames) encoded since the last call.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -124,9 +126,10 @@ pub fn spill_blocks(
     Ok(())
 }
 
-/// Writes the container `path` from frame blocks that [`spill_blocks`] encoded. The file is the same as that of
-/// [`write_container`]. `spills` lists the scratch files, each with the numbers of its frame blocks; together they must
-/// have all frame blocks, in order. Memory: a tile, and the index of the container.
+/// Writes the container `path` from the frame blocks of `source` that [`spill_blocks`] encoded with the same `packing`,
+/// and with the metadata `attributes` (names and texts). The file is the same as that of [`write_container`]. `spills`
+/// lists the scratch files, each with the numbers of its frame blocks; together they must have all frame blocks, in
+/// order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
 /// Fails if a scratch file cannot be read back or the container cannot be written.
@@ -165,8 +168,8 @@ pub struct ContainerWriter {
 }
 
 impl ContainerWriter {
-    /// Creates the container `path` for `count` Gaussians, with `frame_block` frames in a frame block, encoded as
-    /// `packing`, and with the metadata `attributes` (names and texts).
+    /// Creates the container `path` for `count` Gaussians of SH degree `sh_degree`, with `frame_block` frames in a
+    /// frame block, in the encoding `packing`, and with the metadata `attributes` (names and texts).
     pub fn create(
         path: &Path,
         count: usize,
@@ -192,7 +195,7 @@ impl ContainerWriter {
     }
 
     /// Creates the container `path` with the number of Gaussians, the SH degree and the frames per block that `source`
-    /// and `packing` need.
+    /// and `packing` need, and with the metadata `attributes` (names and texts).
     fn from_source(
         source: &dyn FrameSource,
         path: &Path,
@@ -203,10 +206,10 @@ impl ContainerWriter {
         ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
     }
 
-    /// Adds the frames `frames` of `source` as the next frame block. There must be as many frames as in a block; a
-    /// block with fewer must be the last one. Attributes that do not vary with time must have the same values as in the
-    /// blocks before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last
-    /// call.
+    /// Adds the frames `frames` of `source` as the next frame block. Their number must be the number of frames per
+    /// block; only the last block may have fewer. Attributes that do not vary with time must have the same values as in
+    /// the blocks before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
+    /// last call.
     pub fn append_block(
         &mut self,
         source: &dyn FrameSource,
@@ -225,7 +228,7 @@ impl ContainerWriter {
         Ok(())
     }
 
-    /// Adds all Gaussians of `source` to the present frame block, at the frames `frames` of `source`. In the container
+    /// Adds all Gaussians of `source` to the current frame block, at the frames `frames` of `source`. In the container
     /// they get consecutive indices from `first` on, which is a multiple of [`GAUSSIAN_BLOCK`]. Calls `advance` with
     /// the number of Gaussian states (Gaussians × frames) encoded since the last call.
     pub fn add_gaussians(
@@ -243,9 +246,9 @@ impl ContainerWriter {
     }
 
     /// Adds the frames `frames` of `source` as the next frame block, with the time stamps `times`, like
-    /// [`ContainerWriter::append_block`]. `presence` has one entry per block of Gaussians. It saves reading and
-    /// encoding: a block that does not change is read and encoded once for all frames, or not at all if it repeats the
-    /// frame block before.
+    /// [`ContainerWriter::append_block`]. `presence` says for each block of Gaussians how it changes in these frames.
+    /// This saves reading and encoding: of a block whose frames are all equal only the first is read and encoded, and
+    /// none if it repeats the frame block before.
     pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
@@ -265,7 +268,8 @@ impl ContainerWriter {
         )
     }
 
-    /// Writes one tile of the present frame block. `None` means that the tile equals that of the frame block before.
+    /// Writes `tile`, the values of column `column` for block number `gaussian_block` of Gaussians in the current frame
+    /// block. `None` means that the tile equals that of the frame block before.
     fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
@@ -282,7 +286,8 @@ impl ContainerWriter {
     }
 }
 
-/// Change of a block of Gaussians within a frame block (consecutive frames). It decides which tiles are encoded.
+/// Change of a block of Gaussians over the frames of one frame block (consecutive frames). It decides which tiles are
+/// encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
     /// Block that changes from frame to frame. Attributes that vary with time in the source are encoded for every
@@ -291,14 +296,15 @@ pub enum BlockChange {
     /// Block that may differ from the frame block before in every attribute. Attributes that vary with time in the
     /// source are encoded for every frame, the others for the first frame.
     New,
-    /// Block whose frames are all equal, so that only the first is encoded.
+    /// Block that is equal in all frames, so that only the first frame is encoded.
     Still,
-    /// Block whose frames are all equal, and equal to those of the frame block before. No tile is encoded.
+    /// Block that is equal in all frames, and equal to the frame block before. No tile is encoded.
     Repeating,
 }
 
-/// Returns the changes of all blocks of Gaussians for a frame block of a whole `source`. All blocks have the same
-/// change: [`BlockChange::New`] in the first frame block (`is_first`), [`BlockChange::Varying`] afterwards.
+/// Returns one [`BlockChange`] per block of Gaussians of `source`, for a frame block in which no block is known to be
+/// constant: [`BlockChange::New`] for all blocks if it is the first frame block (`is_first`), otherwise
+/// [`BlockChange::Varying`].
 fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
     // An attribute that never varies is encoded for the first frame block only.
     let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
@@ -311,10 +317,10 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes the frames `frames` of `source` as one frame block. `presence` has the change of each block of Gaussians.
-/// Calls `each` for every tile in the order of the container, with the number of its block of Gaussians, the number of
-/// its column, and the tile; `None` means that the tile equals that of the frame block before. Calls `advance` with the
-/// number of Gaussian states (Gaussians × frames) encoded since the last call.
+/// Encodes the frames `frames` of `source` as one frame block. `presence` says for each block of Gaussians how it
+/// changes in these frames. Calls `each` for every tile in the order of the container, with the number of its block of
+/// Gaussians, the number of its column, and the tile; `None` means that the tile equals that of the frame block before.
+/// Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
@@ -352,8 +358,8 @@ fn encode_frames(
     Ok(())
 }
 
-/// Encodes some blocks of Gaussians of `source` over the frames `frames` as one frame block. Returns the number of
-/// bytes that each column (attribute) takes. `blocks` has the numbers of the blocks.
+/// Encodes the blocks of Gaussians with the numbers `blocks` of `source`, with the frames `frames` as one frame block.
+/// Returns the number of bytes that each column (attribute) takes.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -373,8 +379,8 @@ pub fn column_bytes(
     Ok(bytes)
 }
 
-/// Encodes the tiles of the block of Gaussians `gaussians` over the frames `frames`. Returns one tile per attribute;
-/// `None` for attributes that are not in `columns`.
+/// Encodes the tiles of the block of Gaussians `gaussians` of `source` over the frames `frames`. Returns one tile per
+/// attribute; `None` for attributes that are not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,

@@ -50,7 +50,8 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     ))
 }
 
-/// Returns `times`, scaled to the range from 0 to 1 if one of them is outside that range.
+/// Returns `times` unchanged if all of them are in the range from 0 to 1. Otherwise scales them, so that the first
+/// becomes 0 and the last 1.
 fn scale_to_unit(times: &[f64]) -> Vec<f64> {
     match (times.first(), times.last()) {
         (Some(&first), Some(&last)) if first < 0.0 || last > 1.0 => {

@@ -132,7 +132,7 @@ impl FilmOutput {
         Ok(FilmOutput { shown: shown.to_owned(), size, fps, frames, added: 0, writer })
     }
 
-    /// Adds the next frame.
+    /// Adds the next frame, `image`.
     ///
     /// # Errors
     /// Fails if the frame has another size, if it cannot be written, or if the encoder ended early; the message then

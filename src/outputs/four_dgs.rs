@@ -67,9 +67,9 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
 }
 
 /// Rounds positions, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
-/// encoder accepts them. The encoder compares decoded values with its error bounds and does not allow for their
-/// rounding to f32. For coordinates of a few units, the rounding to f32 would push values that lie half a step away
-/// from the grid beyond the bound. Colors of 8 bits are half a step away if they are odd.
+/// encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
+/// quantization step, without a margin for the rounding of decoded values to f32. A value midway between two grid
+/// points could fail this check. Coordinates of a few units can lie there, and odd 8-bit colors do.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {

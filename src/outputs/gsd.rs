@@ -32,13 +32,14 @@ use crate::source::{FrameSource, ReadPlan};
 
 /// Frame rate stored in the file, in frames per second. Sequences have no frame rate of their own.
 const FRAME_RATE: f64 = 30.0;
-/// Centimeters per unit of the scene, which counts as a meter: the unit of the bounds in the JSON text.
+/// Centimeters per scene unit, which counts as one meter. The bounds in the JSON text are in centimeters.
 const CENTIMETERS: f64 = 100.0;
 /// Number of bits per axis of the Morton code.
 const MORTON_BITS: u32 = 10;
 
-/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message with the loss of the format. Some sources
-/// decode several frames together; at most `held` decoded frames are then kept in memory.
+/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message for the user: number of Gaussians and
+/// frame rate of the file, and the parts of the input that it does not contain. Some sources decode several frames
+/// together; at most `held` decoded frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -96,7 +97,7 @@ fn describe_sequence(name: &str, most: usize, frames: &[Value]) -> Value {
     })
 }
 
-/// Returns the side length in pixels of the square textures of `count` Gaussians.
+/// Returns the side length in pixels of square textures with at least one pixel per Gaussian, for `count` Gaussians.
 fn side(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
@@ -115,7 +116,7 @@ struct PackedFrame {
 }
 
 impl PackedFrame {
-    /// Packs the visible Gaussians of `state` into textures.
+    /// Packs the visible Gaussians of `state` into textures, without those that have a value that is not finite.
     fn new(state: &Gaussians) -> PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();
@@ -167,7 +168,7 @@ impl PackedFrame {
     }
 }
 
-/// Returns whether all stored values of the Gaussian `row` are finite.
+/// Returns whether all values of the Gaussian `row` of `state` that the file stores are finite.
 fn is_finite(state: &Gaussians, row: usize) -> bool {
     let base = state.sh.row::<3>(row).iter().all(|x| x.is_finite());
     let [position, scale] = [state.position.row::<3>(row), state.log_scale.row::<3>(row)];
@@ -185,8 +186,8 @@ fn half_bytes(value: f64) -> [u8; 2] {
     f16::from_f64(value.clamp(-most, most)).to_le_bytes()
 }
 
-/// Returns the Morton code of the position `place`, which is in scene units, within the box from `low` to `high`, which
-/// are in centimeters.
+/// Returns the Morton code of the position `place` within the box from `low` to `high`. `place` is in scene units, the
+/// box in centimeters, both in Unreal's axes.
 fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     let most = f64::from((1u32 << MORTON_BITS) - 1);
     (0..3).fold(0, |code, axis| {
@@ -196,7 +197,8 @@ fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     })
 }
 
-/// Adds a texture of `pixels` pixels with shuffled bytes: the values of the Gaussians `rows`, then `padding`.
+/// Appends a texture of `pixels` pixels with shuffled bytes to `textures`. Its pixels hold the numbers that `value`
+/// returns for each of the Gaussians `rows`; all further pixels hold `padding`.
 fn add_texture<const N: usize>(
     textures: &mut Vec<u8>,
     pixels: usize,

@@ -12,8 +12,8 @@ use npyz::{WriteOptions, WriterBuilder};
 
 use crate::error::{Error, Result};
 
-/// Writes the index map `new_index` (`[N]`) to `path`. Gaussians that were merged have the index of the proxy that
-/// replaces them.
+/// Writes the index map `new_index` (`[N]`) to `path`. It holds for each of N input Gaussians its index in the output,
+/// or `None` if it was pruned. Gaussians that were merged have the index of the proxy that replaces them.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

@@ -46,16 +46,17 @@ pub enum OutputKind {
 }
 
 impl OutputKind {
-    /// Returns the kind of output: `asked` if the user named a kind, else the kind for the file name `path`, else
-    /// `input_kind`, the kind of the input.
+    /// Returns the kind of output. This is `asked` if the user named a kind, else the kind that the ending of `path`
+    /// stands for, else the kind of the input, `input_kind`.
     pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
         asked.or(Self::from_name(path)).unwrap_or(input_kind)
     }
 
-    /// Checks that the file name `path` stands for a known kind of output, for users who do not name a kind.
+    /// Checks the ending of the file name `path`, for users who name no kind of output. Allowed are the endings of all
+    /// kinds of output, and names without a file ending.
     ///
     /// # Errors
-    /// Returns [`Error::Usage`] with the possible outputs if the name has the ending of another kind of file.
+    /// Returns [`Error::Usage`], which lists the possible outputs, for any other ending, such as `.zip`.
     pub fn check_name(path: &Path) -> Result<()> {
         let known = Self::from_name(path).is_some();
         let Some(ending) = foreign_ending(path).filter(|_| !known) else { return Ok(()) };
@@ -145,7 +146,7 @@ impl OutputKind {
 /// Checks that `path` can be the name of an output folder. `what` is the command that writes the folder, for messages.
 ///
 /// # Errors
-/// Returns [`Error::Usage`] if the name has an ending like a file.
+/// Returns [`Error::Usage`] if the name has the ending of a file, such as `.ply`.
 pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path) {
         Some(ending) => Err(Error::usage(format!(
@@ -159,7 +160,7 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
 /// Checks that `path` can be the name of a container. `what` is the command that writes the container, for messages.
 ///
 /// # Errors
-/// Returns [`Error::Usage`] if the name has the ending of another kind of file.
+/// Returns [`Error::Usage`] if the name has the ending of a file other than a container, such as `.ply`.
 pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path).filter(|ending| !ending.eq_ignore_ascii_case("gseq")) {
         Some(ending) => Err(Error::usage(format!(
@@ -170,8 +171,9 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Returns the ending of `path` if it looks like that of a file: letters only, or one of a few endings with digits.
-/// `small.v2` and `run.2024` count as names of folders, and an existing folder may have any name.
+/// Returns the ending of `path` if it looks like the ending of a file: letters only, or one of a few endings with
+/// digits. Otherwise returns `None`: `small.v2` and `run.2024` count as names of folders. Also returns `None` for an
+/// existing folder, which may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
     let ending = path.extension()?.to_str()?;

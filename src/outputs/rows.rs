@@ -61,8 +61,8 @@ impl TableColumn<'_> {
 }
 
 impl RowTable<'_> {
-    /// Writes the table as an archive that `numpy.load` opens. Its arrays `[N]` are float64, except `life`, which is
-    /// uint32, and `keep`, which is bool.
+    /// Writes the table to `path` as an archive that `numpy.load` opens. Its arrays `[N]` are float64, except `life`,
+    /// which is uint32, and `keep`, which is bool.
     ///
     /// # Errors
     /// Fails if the slices have different lengths or the file cannot be written.
@@ -72,8 +72,8 @@ impl RowTable<'_> {
         self.write_npz_to(file).map_err(Error::io("write", path))
     }
 
-    /// Writes the table as text with a header line: `id`, then the columns. Floats are written as the shortest text
-    /// that reads back as the same f64 (or `NaN`, `inf`), and `keep` as `true` or `false`.
+    /// Writes the table to `path` as text with a header line: `id`, then the columns. Floats are written as the
+    /// shortest text that reads back as the same f64 (or `NaN`, `inf`), and `keep` as `true` or `false`.
     ///
     /// # Errors
     /// Fails if the slices have different lengths or the file cannot be written.

@@ -20,18 +20,19 @@ use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
 /// Standard deviation of the time window of a Gaussian with constant opacity, as a multiple of the sequence's duration.
-/// The window is 1 with an error below 1e-7 at every time from 0 to 1.
+/// It is so large that the window differs from 1 by less than 1e-7 at every time of the sequence.
 const CONSTANT_DEVIATION: f64 = 2000.0;
 /// Minimum distance of an opacity from 0 and from 1, so that its logit is finite.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// Maximum number of Gaussians in a `.tsog` of single frames, all frames together. Its player shows no more by default.
+/// Maximum number of Gaussians in a `.tsog` of single frames, summed over all frames. The player of this format shows
+/// no more by default.
 pub const MAX_SINGLE_FRAME_GAUSSIANS: usize = 1_000_000;
-/// Maximum fraction of the visible states (Gaussians × frames) that may be far off in a fit of lines
-/// ([`FitError::far_off_fraction`]); above it single frames are written.
+/// Maximum fraction of the visible states (Gaussians × frames, weighted by opacity) in which fitted lines may be far
+/// off ([`FitError::far_off_fraction`]). If the fraction is larger, single frames are written.
 const MAX_FAR_SHARE: f64 = 0.1;
-/// Maximum number of intervals into which the trajectory of a Gaussian is divided for the lines of a `.tsog`. More
-/// lines take many bytes for the few Gaussians that need them.
+/// Maximum number of intervals into which the trajectory of a Gaussian is divided to fit the lines of a `.tsog`. More
+/// intervals would cost many bytes, and only few Gaussians need them.
 const COMPACT_INTERVALS: usize = 8;
 /// Approximate number of bytes of a line with its time window in a `.tsog`, as a multiple of the bytes of a Gaussian in
 /// a single frame.
@@ -118,9 +119,10 @@ pub fn write_fitted_windows(
     Ok(notes)
 }
 
-/// Returns whether single frames are written instead of `lines`. This is so if more than the fraction [`MAX_FAR_SHARE`]
-/// of the visible states are far off, or if single frames, which have no error of a fit, take about as few bytes.
-/// Single frames with more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians are not written.
+/// Returns whether single frames are written instead of `lines`, whose fit has the error `misfit`. Single frames are
+/// written in two cases: if lines are far off in more than the fraction [`MAX_FAR_SHARE`] of the visible states, or if
+/// single frames, which have no fit error, take about as few bytes. They are never written if they have more than
+/// [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians or [`MAX_FRAMES`] frames.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
@@ -128,8 +130,8 @@ fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAME_GAUSSIANS as u64 && frames <= MAX_FRAMES
 }
 
-/// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. Gaussians with values
-/// that are not finite are left out.
+/// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. `clip` maps the times of
+/// the frames to 0 to 1. Gaussians with values that are not finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
     let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(1))?;
@@ -193,7 +195,7 @@ fn is_finite(line: &CubicTrack) -> bool {
     values.chain(sh).all(|value| (value as f32).is_finite())
 }
 
-/// Sets the parameters of the Gaussian `row` to those of the fitted line `line`.
+/// Sets the parameters of the Gaussian `row` of `params` to those of the fitted line `line`.
 fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     let narrow = |value: f64| value as f32;
     let gaussians = &mut params.gaussians;
@@ -287,7 +289,8 @@ mod tests {
         );
     }
 
-    /// Returns `lines` Gaussians, and the error of a fit with `states` compared states that are all off by `position`.
+    /// Returns `lines` Gaussians, and the error of a fit in which `states` states were compared and each position is
+    /// off by `position`.
     fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, FitError) {
         let mut misfit = FitError::default();
         (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));

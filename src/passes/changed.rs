@@ -43,7 +43,7 @@ impl<'a> SourceWithDeltas<'a> {
         ChangedReader { reader, delta, trajectory, frames: self.info.times.len(), all_sh: self.dropped_sh_buffer() }
     }
 
-    /// Returns a buffer for all SH coefficients of `source` if some of them are dropped; otherwise `None`.
+    /// Returns a buffer for all SH coefficients of `source` if its SH degree is lowered; otherwise `None`.
     fn dropped_sh_buffer(&self) -> Option<AttributeValues> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)

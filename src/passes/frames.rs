@@ -58,7 +58,8 @@ impl<'a> FrameReaders<'a> {
 }
 
 impl BlockReader for FrameReaders<'_> {
-    /// Reads those attributes of `want` for which the readers were opened.
+    /// Reads the attributes `want` at frame `frame` into `state`. Attributes for which the readers were not opened are
+    /// ignored.
     fn read(&mut self, frame: usize, want: Attributes, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
         if want.is_empty() {

@@ -71,7 +71,7 @@ impl FrameSource for FramesInMemory {
 struct HeldReader<'a> {
     held: &'a FramesInMemory,
     len: usize,
-    /// Ranges of consecutive ids which together are the Gaussians to read, in the requested order.
+    /// Ranges of consecutive ids. Joined in this order, they are the ids of the Gaussians to read.
     runs: Vec<Range<usize>>,
 }
 

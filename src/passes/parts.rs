@@ -4,7 +4,8 @@
 use super::GAUSSIANS_PER_BLOCK;
 use crate::model::{Attributes, Gaussians};
 
-/// Place where one block of Gaussians is written: a mutable slice for every component of every attribute, in order.
+/// Destination of the values of one block of Gaussians: a mutable slice for every component of every attribute, in the
+/// order of the attributes.
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
@@ -22,7 +23,8 @@ impl<'a> BlockSlices<'a> {
         parts
     }
 
-    /// Copies the attributes `want` of `block` to the slices, which must be those of the same attributes.
+    /// Copies the attributes `want` of `block` to these slices. [`BlockSlices::split`] must have made them for the same
+    /// attributes.
     pub fn write(self, block: &Gaussians, want: Attributes) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));

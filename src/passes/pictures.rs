@@ -1,7 +1,9 @@
-//! Passes over views: reads the Gaussians at the frame of each view, and passes the views on in batches.
+//! Passes over views: these functions read the Gaussians at the frame of each view and call a function with batches of
+//! views.
 //!
-//! Views are in the order of their frames, because occlusion needs all Gaussians of a frame at once. Frames are read in
-//! blocks of Gaussians on all threads; then the views of a batch of frames are distributed among the threads.
+//! Views are processed in the order of their frames, because a render needs all Gaussians of its frame at once to
+//! account for occlusion. Frames are read in blocks of Gaussians on all threads; then the views of a batch of frames
+//! are distributed among the threads.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -20,25 +22,25 @@ use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 /// Number of views per thread in a batch: enough that waiting for the last view to finish costs little time.
 pub const VIEWS_PER_THREAD: usize = 4;
 
-/// Gaussians of a frame source to render, and the attributes to read for this.
+/// Selection of the Gaussians of a frame source to render, and of the attributes to read for this.
 pub struct RenderedSource<'a> {
     /// Frame source that is read.
     pub source: &'a dyn FrameSource,
-    /// Gaussians to render, for which readers stay open over all frames. `None`: all Gaussians, read in the way that is
-    /// cheapest for the source ([`FrameSource::open_all`]).
+    /// Ids of the Gaussians to render; their readers stay open over all frames. `None`: all Gaussians, read in the way
+    /// that is cheapest for the source ([`FrameSource::open_all`]).
     pub ids: Option<Ids<'a>>,
-    /// Attributes that are read; the others are empty.
+    /// Attributes that are read; all other attributes stay empty.
     pub columns: Attributes,
 }
 
 impl<'a> RenderedSource<'a> {
-    /// Returns all Gaussians of `source`, with all attributes.
+    /// Selects all Gaussians of `source`, with all attributes.
     pub fn all(source: &'a dyn FrameSource) -> RenderedSource<'a> {
         RenderedSource { source, ids: None, columns: Attributes::all() }
     }
 
-    /// Returns the decoder that computes pixel colors from the source's features, if the source has one and all
-    /// Gaussians are rendered.
+    /// Returns the decoder that computes the colors of pixels from blended features of the Gaussians (values that take
+    /// the place of colors). Returns `None` if the source has no such decoder, or if only some Gaussians are rendered.
     fn decoder(&self) -> Option<&'a dyn FeatureDecoder> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
@@ -51,33 +53,34 @@ impl<'a> RenderedSource<'a> {
     }
 }
 
-/// Maximum size of a batch of views.
+/// Limits on the size of a batch of views, and on the frames that readers keep in memory.
 #[derive(Debug, Clone, Copy)]
 pub struct BatchLimits {
-    /// Maximum number of different frames. For each of them, the Gaussians of every rendered source are in memory.
+    /// Maximum number of different frames in a batch. For each of these frames, the Gaussians of every rendered source
+    /// are in memory.
     pub frames: usize,
     /// Maximum number of views in a batch.
     pub views: usize,
-    /// Maximum number of frames that a reader keeps in memory of those that it decodes together.
+    /// Maximum number of decoded frames that a reader keeps in memory, for readers that decode several frames together.
     pub held: usize,
 }
 
 impl BatchLimits {
-    /// Returns the batch size for many views that take little memory each: views of several frames together, to keep
-    /// all threads busy.
+    /// Returns limits for many views that take little memory each: a batch has views of several frames, to keep all
+    /// threads busy.
     fn many_views(limits: &Limits) -> BatchLimits {
         let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
         BatchLimits { frames: limits.frames_together, views: pictures, held: limits.max_kept_frames }
     }
 
-    /// Returns the batch size for views whose renders stay in memory until the batch ends: one frame, one view per
-    /// thread.
+    /// Returns limits for views whose renders stay in memory until their batch ends: a batch has one frame, and at most
+    /// one view per thread.
     pub fn one_frame(limits: &Limits) -> BatchLimits {
         let pictures = rayon::current_num_threads().min(limits.views_together);
         BatchLimits { frames: 1, views: pictures, held: limits.max_kept_frames }
     }
 
-    /// Returns how many of the views at the start of `pictures` form a batch.
+    /// Returns the number of views at the start of `pictures` that form the next batch within these limits.
     fn batch_length(&self, pictures: &[FrameView]) -> usize {
         let (mut frames, mut last) = (0, None);
         let fits = |picture: &&FrameView| {
@@ -98,24 +101,31 @@ pub struct ViewStates<'a, const S: usize> {
     pub camera: &'a Camera,
     /// Gaussians of each subject at the view's frame.
     pub states: [&'a Gaussians; S],
-    /// Decoder and features of each subject whose colors are computed from features; `None` for the others.
+    /// Decoder, and features of the Gaussians at the view's frame, of each subject whose pixel colors are computed from
+    /// features; `None` for the others.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// Renders the subject with index `subject` over `background` on all threads of the pool, as the subject's own
-    /// renderer does. If the subject has features, these are blended and decoded to colors, without a background.
+    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool.
+    ///
+    /// If the subject has features, the renderer blends these in place of colors, and the decoder of its model computes
+    /// the color of each pixel from them. `background` is then ignored.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
         self.render_as(subject, self.states[subject], self.features(subject), background)
     }
 
-    /// Returns the features of the subject with index `subject`; `None` if its colors are not computed from features.
+    /// Returns the features (values that take the place of colors) of the Gaussians of the subject with index
+    /// `subject`; `None` if its colors are not computed from features.
     pub fn features(&self, subject: usize) -> Option<&AttributeValues> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// Renders other Gaussians, `state`, as [`ViewStates::render`] renders those of the subject. `state` must have as
-    /// many Gaussians as `features`.
+    /// Renders the Gaussians `state` with the camera of this view, in place of the Gaussians of the subject with index
+    /// `subject`. Works like [`ViewStates::render`] otherwise.
+    ///
+    /// `features` replaces the features of the subject and must have one row per Gaussian of `state`. If it is `None`,
+    /// the Gaussians are rendered with their own colors.
     pub fn render_as(
         &self,
         subject: usize,
@@ -145,13 +155,16 @@ impl<const S: usize> ViewStates<'_, S> {
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
-    /// Features of each subject whose colors are computed from features; empty for the others.
+    /// Features (values that take the place of colors) of the Gaussians of each subject; empty for a subject whose
+    /// colors are not computed from features.
     features: [AttributeValues; S],
 }
 
 /// Reads the Gaussians of all `subjects` for the views `pictures` and calls `visit` with batches of these views, in
-/// order. `pictures` must be in the order of their frames, with cameras as indices into `cameras`. Every frame is read
-/// once. Attributes that do not vary in time are read once into each buffer; there is one buffer per frame of a batch.
+/// order. `pictures` must be sorted by frame; their camera indices refer to `cameras`. Every frame is read once.
+///
+/// A batch has one buffer for each of its frames, which later batches use again. Attributes that do not vary in time
+/// are therefore read only once into each buffer.
 ///
 /// Memory: for each subject its reader, the frames that this reader keeps, and the Gaussians at every frame of a batch.
 ///
@@ -217,10 +230,13 @@ pub fn for_each_view_batch<const S: usize>(
     Ok(())
 }
 
-/// Workers that accumulate results over views; at most one per thread works at a time.
+/// Set of workers, each a value of type `W` that accumulates results over the views passed to it. At most one worker
+/// per thread works at a time.
 ///
-/// Memory per Gaussian: its reader; the attributes read, for each frame of a batch (at most 4 × threads views and
-/// [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::views_together`] workers.
+/// Memory per Gaussian:
+/// - its share of a reader;
+/// - its attributes at each frame of a batch (at most 4 × threads views and [`Limits::frames_together`] frames);
+/// - its share of the data of each worker; there are at most [`Limits::views_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
     /// Workers that process no view at the moment.
@@ -228,12 +244,13 @@ pub(crate) struct Workers<W> {
 }
 
 impl<W: Send> Workers<W> {
-    /// Creates an empty set of workers.
+    /// Creates a set without workers. They are created when they are needed.
     pub(crate) fn new(limits: Limits) -> Self {
         Workers { limits, free: Mutex::default() }
     }
 
-    /// Passes each of the views `pictures` of the Gaussians `subject` to one of the workers.
+    /// Passes each of the views `pictures` to one of the workers: `visit` gets the worker, the Gaussians of `subject`
+    /// at the frame of the view, and its camera. `new_worker` creates a worker if all others are busy.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

@@ -5,33 +5,35 @@ use std::num::NonZeroU32;
 use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
 
-/// Number of views for which reading a frame is worth its time. A selection of few views takes this many of each frame,
-/// and so reads fewer frames.
+/// Number of views per frame that makes reading the frame worth its time. A selection of few views takes this many
+/// views of each frame that it uses, and so reads fewer frames.
 pub const VIEWS_PER_FRAME: usize = 3;
 
-/// Maximum stride of the pixels of a view. Beyond it the work per Gaussian dominates the time of a render.
+/// Maximum stride at which the pixels of a view are rendered (every stride-th pixel in each direction). Beyond this
+/// stride, the work per Gaussian dominates the time of a render.
 const MAX_PIXEL_STRIDE: u32 = 4;
 
-/// Returns the largest stride, up to 4, that leaves about `wanted` of the `pixels` pixels of a view if only every
-/// stride-th pixel in each direction is rendered.
+/// Returns the stride n, from 1 to 4, such that every n-th pixel of a view in each direction gives about `wanted`
+/// pixels. `pixels`: number of all pixels of the view. The stride is rounded down.
 pub fn pixel_stride(pixels: u64, wanted: f64) -> NonZeroU32 {
     let stride = (pixels as f64 / wanted.max(1.0)).sqrt();
     NonZeroU32::new((stride as u32).min(MAX_PIXEL_STRIDE)).unwrap_or(NonZeroU32::MIN)
 }
 
-/// Selection of every n-th frame and of every m-th view in it, for frames that arrive one by one.
+/// Sampler of every n-th frame and of every m-th view in such a frame, for frames that arrive one by one.
 #[derive(Debug, Clone)]
 pub struct ViewSampler {
     frame_stride: usize,
     view_stride: usize,
-    /// Number of frames with views that have been passed so far.
+    /// Number of frames so far that had at least one view.
     frames_with_views: usize,
 }
 
 impl ViewSampler {
-    /// Creates a selection with the strides `frame_stride` and `view_stride` of `scan`. Of the frames that have views,
-    /// it takes the first and then every `frame_stride`-th. Of the views of such a frame, it takes every
-    /// `view_stride`-th. The first view taken moves on from frame to frame, so that all views are used in turn.
+    /// Creates a sampler with the strides `frame_stride` and `view_stride` of `scan`. Of the frames that have views, it
+    /// selects the first and then every `frame_stride`-th. Of the views of a selected frame, it selects every
+    /// `view_stride`-th. The number of views skipped before the first one grows by one from each selected frame to the
+    /// next (modulo `view_stride`), so that all views are selected in turn.
     pub fn new(scan: &recipe::ScanParams) -> Self {
         Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
     }
@@ -55,7 +57,7 @@ impl ViewSampler {
         taken.map(move |&(view, camera)| FrameView { frame, view, camera })
     }
 
-    /// Returns the schedule of the selected views of `schedule`.
+    /// Returns a schedule with only those views of `schedule` that this sampler selects.
     fn thin(mut self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
@@ -67,9 +69,11 @@ impl ViewSampler {
     }
 }
 
-/// Returns the views of `schedule` that the scoring pass described by `scan` renders. The strides of `scan` select them
-/// (see [`ViewSampler`]). If these are more than the maximum `look_pictures`, as many as the maximum are kept, spread over
-/// at least `frames` frames if possible (see [`select_evenly_over_frames`]).
+/// Returns the views of `schedule` that a scoring pass with the parameters `scan` renders.
+///
+/// A [`ViewSampler`] selects views by the strides of `scan`. If there are more of these than `look_pictures`, the
+/// maximum number of views in `scan` (0: no maximum), [`select_evenly_over_frames`] selects that number of them, from
+/// at least `frames` frames if possible.
 pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = ViewSampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pair_count() <= scan.look_pictures {
@@ -94,15 +98,15 @@ pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     frames.div_ceil(shortest as usize)
 }
 
-/// Selects at most `pictures` views as [`select_evenly`] does. Takes them from at least `frames` frames if there are that many
-/// views, but with at most [`VIEWS_PER_FRAME`] views of each frame.
+/// Selects at most `pictures` views with [`select_evenly`]. Usually takes [`VIEWS_PER_FRAME`] views of each frame that
+/// it uses; takes fewer (at least one) if otherwise fewer than `frames` frames would be used.
 pub fn select_evenly_over_frames(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
     select_evenly(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }
 
-/// Selects at most `pictures` views, spread evenly over all frames and view numbers. Uses no more frames than are
-/// needed with `views` views of each (see [`VIEWS_PER_FRAME`]). Selects all views if `schedule` has no more than
-/// `pictures`.
+/// Selects at most `pictures` views, spread evenly over all frames and view numbers. Takes up to `views` views of each
+/// frame that it uses, so that it uses as few frames as possible (see [`VIEWS_PER_FRAME`]). Selects all views if
+/// `schedule` has no more than `pictures`.
 pub fn select_evenly(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let pictures = pictures.min(schedule.pair_count());

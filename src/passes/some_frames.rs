@@ -1,4 +1,4 @@
-//! Some frames of a source, seen as a sequence of their own.
+//! Source of some frames of another source, as a sequence with its own frame indices.
 
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
@@ -13,13 +13,14 @@ pub struct SomeFrames<'a> {
 }
 
 impl<'a> SomeFrames<'a> {
-    /// Creates a source of the frames `frames` of `source`, which must increase.
+    /// Creates a source of the frames with the indices `frames`, in increasing order, of `source`.
     pub fn new(source: &'a dyn FrameSource, frames: Vec<usize>) -> SomeFrames<'a> {
         let times = frames.iter().map(|&frame| source.info().times[frame]).collect();
         SomeFrames { source, info: SequenceInfo { times, ..source.info().clone() }, frames }
     }
 
-    /// Returns the views of `schedule`, a schedule for all frames of the other source, at the chosen frames.
+    /// Returns the part of `schedule` for the chosen frames. `schedule` is the schedule of the original source, with
+    /// all frames.
     pub fn views(&self, schedule: &ViewSchedule) -> ViewSchedule {
         let mut chosen = ViewSchedule::new(schedule.cameras.clone());
         self.frames.iter().for_each(|&frame| chosen.push_frames(1, schedule.views(frame)));

@@ -39,7 +39,7 @@ impl<'a> FrameStates<'a> {
         Ok(&self.current)
     }
 
-    /// Returns the Gaussians at the frame that was read last; none before the first read.
+    /// Returns the Gaussians at the frame that was read last. Returns no Gaussians before the first read.
     pub fn current(&self) -> &Gaussians {
         &self.current
     }

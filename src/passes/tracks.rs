@@ -14,8 +14,8 @@ use crate::source::{FrameSource, Ids};
 /// Number of Gaussians whose attributes at all frames a thread holds in memory at once.
 pub const TRACKS_PER_BLOCK: usize = 64;
 
-/// Calls `make` with the trajectory of every Gaussian, which is its attributes at every frame, and returns the results
-/// in the order of the Gaussians. `times` holds the times of the frames, in any unit.
+/// Calls `make` with the trajectory of every Gaussian (its attributes at every frame), and returns the results of these
+/// calls in the order of the Gaussians. `times` holds the times of the frames, in any unit.
 ///
 /// Memory: the results; on every thread a reader and the attributes of [`TRACKS_PER_BLOCK`] Gaussians at all frames.
 pub fn map_tracks<R: Send>(

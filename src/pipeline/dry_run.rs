@@ -27,7 +27,7 @@ use crate::scene::{InputOptions, open_scene};
 pub struct DryRunReport {
     /// Name and version of the program.
     pub tool: String,
-    /// Always true; tells this report from the summary of a run.
+    /// Always true; distinguishes this report from the summary of a run.
     pub dry_run: bool,
     /// Path of the input as given.
     pub path: String,
@@ -43,17 +43,17 @@ pub struct DryRunReport {
     pub bytes: u64,
     /// Cameras whose views would be rendered.
     pub cameras: CameraSummary,
-    /// Number of Gaussians in the output, if it is known in advance; `None` if it depends on renders.
+    /// Number of Gaussians in the output; `None` if it is found only during the run.
     pub gaussians: Option<usize>,
-    /// Description of how the number of Gaussians in the output is determined.
+    /// Text that states how the number of Gaussians in the output is determined.
     pub size_by: String,
-    /// Description of how many Gaussians ranking and refinement would leave.
+    /// Text that states how many Gaussians ranking and refinement would leave.
     pub counts: String,
     /// Path of the output.
     pub output: String,
     /// Kind of the output.
     pub output_kind: OutputKind,
-    /// Paths that would be written: the output, and the files in or beside it.
+    /// Paths that would be written: the output, and the recipe, index map and summary in or beside it.
     pub would_write: Vec<String>,
     /// Expected time and memory of the run.
     pub forecast: Forecast,
@@ -67,8 +67,8 @@ pub struct DryRunReport {
 /// machine for the time estimates.
 ///
 /// # Errors
-/// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
-/// arrived completely.
+/// Fails for every reason for which a run would fail before its first stage. Also fails for a stream, whose size is
+/// unknown before it has arrived completely.
 pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     if request.input.is_stream() {
         return Err(Error::usage(
@@ -119,7 +119,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
     })
 }
 
-/// Returns a description of how the number of Gaussians in the output is determined.
+/// Returns a text that states how the number of Gaussians in the output of `request` is determined.
 fn size_by(request: &Request) -> String {
     match (&request.goal, &request.target) {
         (Some(Goal::Quality(Quality::Psnr(least))), _) => {

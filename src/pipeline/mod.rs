@@ -1,7 +1,7 @@
 //! The pipeline of a compression: scan, score, rank, prune, merge, refine, write.
 //!
-//! Before any work, a request is turned into a [`RunPlan`], which lists those of [`stages::STAGES`] that the request
-//! needs, in the order in which they run. [`run_stages`] runs them.
+//! Before any work, a request is turned into a [`RunPlan`]: the list of the stages that the request needs, in the order
+//! in which they run. The stages are taken from [`stages::STAGES`]; [`run_stages`] runs them.
 
 pub mod dry_run;
 mod ids;
@@ -39,7 +39,8 @@ use stage::{Measured, Phase, RunState};
 use stages::measure::MeasureStages;
 use summary::{InputSummary, Summary};
 
-/// Compresses the input of `request`, writes the result and returns the summary of the run.
+/// Compresses the input of `request`, writes the result and returns the summary of the run. A run that is limited to
+/// one shard (part of a divided stage) computes only this shard, writes no result and returns [`Completion::Shard`].
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe or the output is invalid. An error leaves no output behind.
@@ -58,22 +59,23 @@ fn compress_whole(request: &Request) -> Result<Summary> {
     Ok(run_stages(&scene, &plan, arrived, request, journal)?.0)
 }
 
-/// Compresses a scene that is already open, like [`compress`]. Returns the summary, and for every input Gaussian its
-/// index in the output, or `None` if it was removed.
+/// Compresses the open scene `scene` as `request` asks and writes the result, like [`compress`]. Returns the summary of
+/// the run, and for every input Gaussian its index in the output (`None` if it was removed).
 ///
 /// # Errors
-/// Fails where [`compress`] fails.
+/// Fails in the cases in which [`compress`] fails. A run of only one shard ends with [`Error::ShardDone`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
     run_stages(scene, &plan, None, request, Journal::default())
 }
 
-/// Returns the stages of a run that several processes can divide among themselves, in order, each as a line with its
-/// number of units of work.
+/// Returns a line of text for each divisible stage of a run of `request`, in the order in which the stages run. Several
+/// processes can share the work of a divisible stage. The line holds the name of the stage and its number of units of
+/// work, such as blocks of Gaussians or views. Opens the input, but reads nothing else.
 ///
 /// # Errors
-/// Fails if the input cannot be opened. Apart from opening the input nothing is read.
+/// Fails if the input cannot be opened, if the request is invalid, or if the memory budget is too small for it.
 pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |input, work: &Workload| RunPlan::within_memory(request, input, work);
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
@@ -82,17 +84,19 @@ pub fn shardable_stages(request: &Request) -> Result<Vec<String>> {
     Ok(plan.shardable_units(&scene))
 }
 
-/// Sets the memory limits of a scene that is already open so that a run of `request` stays within its memory budget.
+/// Sets the memory limits of the open scene `scene` so that a run of `request` stays within the memory budget that the
+/// request states.
 ///
 /// # Errors
-/// Fails if the budget is too small for the request, and where [`RunPlan::new`] fails.
+/// Fails if the budget is too small for the run, and in the cases in which [`RunPlan::new`] fails.
 pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<()> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     scene.plan_memory(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
-/// Measures the statistics of a scene, scores its Gaussians and selects the survivors (Gaussians that are not removed)
-/// by the parameters of `recipe`. `user` holds Gaussians that the user keeps or drops.
+/// Computes the statistics of the Gaussians of `scene`, scores the Gaussians and selects the survivors (Gaussians that
+/// are not removed) by the parameters of `recipe`. Returns statistics, scores and selection. `user` states which
+/// Gaussians the user wants to keep or to drop in any case.
 ///
 /// # Errors
 /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
@@ -100,8 +104,9 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Resu
     MeasureStages::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. `arrived` holds statistics that were computed while a stream
-/// arrived. Returns the summary, and for every input Gaussian its index in the output, or `None` if it was removed.
+/// Runs the stages of `plan`, one after the other. `arrived` holds the statistics of the Gaussians if these were
+/// already computed while the input, a stream, arrived. Returns the summary of the run, and for every input Gaussian
+/// its index in the output (`None` if it was removed).
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,
@@ -143,8 +148,8 @@ fn run_stages(
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
 }
 
-/// Returns the text of the file `recipe.toml` that is written beside the result. `own` is the digest of the input. Adds
-/// a note to `journal` if the recipe was made for an input with another digest.
+/// Returns the text of the file `recipe.toml` that is written beside the result. `own` is the digest of the input of
+/// this run. Adds a note to `journal` if the recipe was made for an input with another digest.
 fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
     if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
@@ -188,8 +193,8 @@ pub(crate) mod tests {
         super::score_scene(scene, recipe, user).unwrap()
     }
 
-    /// Returns the workload (sizes for estimates) of a container with `gaussians` Gaussians and 600 frames of two
-    /// views.
+    /// Returns the workload (sizes for estimates) of a container with `gaussians` Gaussians and 600 frames, each with
+    /// two views.
     pub(crate) fn work(gaussians: u64) -> Workload {
         let info = SequenceInfo {
             count: gaussians as usize,

@@ -1,12 +1,13 @@
-//! Opens a scene and computes its statistics. A stream is measured while it arrives, so that it is read only once.
+//! Opens a scene and computes the statistics of its Gaussians. For a stream they are computed while its frames arrive,
+//! so that the frames are read only once.
 //!
-//! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). When measuring, also the
-//! running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes each) and the memory of
-//! [`RunningContribution`].
+//! Memory for a stream: packing it into a scratch container ([`crate::models::stream`]). If statistics are computed
+//! while frames arrive, also the running statistics of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] bytes
+//! each) and the memory of [`RunningContribution`].
 //!
 //! The time span and the number of frames are known only at the end of the stream. Until then two assumptions are made:
-//! frames are evenly spaced, and views have exactly the times of frames. If an assumption proves wrong, the packed
-//! frames are measured again from the container; the result is the same in both cases.
+//! frames are evenly spaced, and every view has exactly the time of a frame. If an assumption proves wrong, the
+//! statistics are computed again from the packed frames in the container; the result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
@@ -40,12 +41,15 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens a scene and sets its limits within the memory budget. `plan` makes the plan of the run from facts about the
-/// scene. A stream is measured while it arrives, see [`receive_measured`]; then its statistics are returned as well.
+/// Opens the scene that `options` describe, and sets limits on what its stages keep in memory, so that the run stays
+/// within the memory budget. `plan` makes the plan of the run from facts about the scene. For a stream it is called
+/// before any frame is read, unless frames have to be linked (see [`is_linked`]).
+///
+/// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
+/// they were computed while it arrived (see [`receive_measured`]).
 ///
 /// # Errors
-/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails. `plan` is called before any frame of a
-/// stream is read.
+/// Fails if the input, the cameras or the budget is invalid, or if `plan` fails.
 pub fn open_to_measure(
     options: &InputOptions,
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
@@ -79,7 +83,9 @@ pub fn open_to_measure(
     Ok((scene, stages, None))
 }
 
-/// Sends the plan of the run and the time forecast as messages, if the user asked for them.
+/// Sends the plan of the run and the forecast of its time and memory as messages, if the user asked for them. Also
+/// stores the forecast in `journal`. A run of only one shard (part of a divided stage) has no forecast. `measured`:
+/// kinds of statistics that were already computed while the input, a stream, arrived.
 fn send_forecast(
     scene: &mut Scene,
     plan: &MemoryPlan,
@@ -102,9 +108,11 @@ fn send_forecast(
     Ok(())
 }
 
-/// Packs a stream into a scratch container. If memory suffices, also computes statistics of the frames as they arrive.
-/// `loaded` holds the user's cameras, if any. Returns the statistics unless the assumptions about the times of the
-/// stream (see the module) proved wrong.
+/// Packs a stream into a scratch container. If memory suffices, also computes the statistics of the Gaussians while the
+/// frames arrive. `loaded` holds the user's cameras, if any. `plan` makes the plan of the run from facts about the
+/// scene. Returns the scene, the plan of the run, and the statistics. The statistics are `None` if memory did not
+/// suffice, if an assumption about the times of the stream (see the module) proved wrong, or if Gaussians with NaN or
+/// infinity have to be dropped.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -197,9 +205,10 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about the limits of a stream, if the user asked for the plan or the forecast. `peak`: maximum
-/// memory, bytes. `most`: number of frames that fit the memory limit. `to_measure`: number of frames that can be
-/// measured as they arrive.
+/// Sends a message about memory before a stream is received, if the user asked for one:
+/// - for the forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
+/// - for the plan ([`Verbosity::Plan`]): `most`, the number of frames that fit the memory limit, and `to_measure`, the
+///   number of frames up to which memory suffices to compute statistics while they arrive.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {
@@ -213,8 +222,9 @@ fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64
     options.events.send(Message::Plan(&text));
 }
 
-/// Returns the statistics that were computed while the frames arrived. Returns `None`, and adds a note to the scene, if
-/// an assumption about the times of the stream proved wrong or Gaussians have to be dropped.
+/// Completes the statistics that were computed while the frames arrived, and returns them. Returns `None`, and adds a
+/// note to the scene, if an assumption about the times of the stream proved wrong, or if Gaussians with NaN or infinity
+/// have to be dropped.
 fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &mut Scene) -> Result<Option<Measured>> {
     let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
     let found = match measuring.failed_assumption(&complete, scene) {
@@ -238,18 +248,19 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &m
     }
 }
 
-/// Returns a virtual rig (cameras placed by the program) around the first of the frames `held` in memory.
+/// Returns a virtual rig (cameras placed by the program) around the first frame of `held`, the frames in memory.
 fn rig_around(held: &FramesInMemory) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.median, bounds.extent())
 }
 
-/// Running statistics of the frames of a stream received so far.
+/// Running statistics of all Gaussians over the frames of a stream received so far.
 struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Views of the frames received so far, under the assumption that views have exactly the times of frames.
+    /// Views that belong to the frames received so far, under the assumption that views have exactly the times of
+    /// frames.
     schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(ViewSampler, RunningContribution)>,
@@ -289,7 +300,8 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// Returns a description of the assumption about the stream that proved wrong, if any.
+    /// Returns a description of the assumption about the times of the stream that proved wrong, if any. `complete` is
+    /// the plan of the scan made from the times of all frames.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.can_finish(self.plan) {
             return Some("the frames are not evenly spaced in time");
@@ -302,11 +314,12 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Assignment of views to the frames of a stream while later frames are unknown: a frame has the views with exactly its
-/// time, and all views without a time.
+/// Rule that assigns views to the frames of a stream while later frames are unknown: a frame gets the views of the rig
+/// that have exactly its time, and all views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
-    /// Time and index in the rig of each view of the split that has a time, sorted by time, then index.
+    /// Time and index in the rig of each view that belongs to the requested split and has a time; sorted by time, then
+    /// by index.
     timed: Vec<(f64, usize)>,
     timeless: Vec<usize>,
     tolerance: f64,
@@ -327,7 +340,7 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// Returns the view number and camera index of each view of a frame at `time`, in the order of the rig.
+    /// Returns the views of a frame at `time`, each as its view number and camera index, in the order of the rig.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

@@ -24,7 +24,8 @@ use crate::scene::Scene;
 pub struct RunPlan {
     /// Stages in the order in which they run, and the omitted stages.
     pub(super) stages: StageList,
-    /// Stages that compute statistics. A stream is measured by them while it arrives.
+    /// Stages that compute the statistics and scores of the Gaussians. For a stream, the statistics are computed while
+    /// it arrives.
     pub measure: MeasureStages,
     /// Stage that writes the result; `None` if the run only measures and scores.
     pub output: Option<WriteStage>,
@@ -43,13 +44,14 @@ impl RunPlan {
     /// Returns the plan of a run for `request`, without regard to its memory limit.
     ///
     /// # Errors
-    /// Fails if a parameter of the recipe is out of range, if the input has fewer Gaussians than the target or lacks an
-    /// id of the request, or if options exclude each other.
+    /// Fails if a parameter of the recipe is out of range, if the input has fewer Gaussians than the target, if an id
+    /// that the request names does not exist in the input, or if options exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
         RunPlan::with_fallback(request, input, MemoryFallback::Nothing, true)
     }
 
-    /// Returns the plan of a run that only measures and scores, with the stages `measure`.
+    /// Returns the plan of a run that only runs `measure`, the stages that compute the statistics and scores of the
+    /// Gaussians.
     pub fn measure_only(measure: MeasureStages, input: InputMeta) -> RunPlan {
         let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
         plan.stages.add(Phase::Rank, measure);
@@ -57,13 +59,13 @@ impl RunPlan {
     }
 
     /// Returns the plan of a run within the memory limit of `request`. Refinement is reduced until the plan fits: first
-    /// its parameter deltas (what it adds to stored values) become constant in time, then SH coefficients above degree
-    /// 0 are not refined either, then nothing is refined. If even this exceeds the limit, the full plan is returned; it
-    /// is refused later with an error that names the smallest sufficient limit. The quality of the result is measured
-    /// if there is memory for this as well.
+    /// the values that it adds to stored parameters (parameter deltas) become constant in time, then SH coefficients
+    /// above degree 0 are not refined either, then nothing is refined. If even a run without refinement exceeds the
+    /// limit, the plan with full refinement is returned; it is refused later with an error that names the smallest
+    /// sufficient limit. The plan includes the measurement of the quality of the result if there is memory for it.
     ///
     /// # Errors
-    /// Fails where [`RunPlan::new`] fails.
+    /// Fails in the cases in which [`RunPlan::new`] fails.
     pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
         let fits = |plan: &RunPlan| {
             MemoryPlan::fits_budget(*work, request.input.memory, |work, limits| plan.estimates(work, limits))
@@ -73,7 +75,8 @@ impl RunPlan {
         Ok(if fits(&with_quality) { with_quality } else { plan })
     }
 
-    /// Returns the plan of [`RunPlan::within_memory`] but without measuring the quality of the result.
+    /// Returns the plan that [`RunPlan::within_memory`] describes, but without the stage that measures the quality of
+    /// the result. `fits` tells whether a given plan stays within the memory limit.
     fn refining_within_memory(
         request: &Request,
         input: InputMeta,
@@ -175,7 +178,8 @@ impl RunPlan {
     }
 
     /// Returns the resource estimates (memory, time, reads) of the stages that are still to run. `measured` states
-    /// which statistics were already computed while a stream arrived; these are not counted.
+    /// which kinds of statistics were already computed while the input, a stream, arrived; their computation is left
+    /// out.
     pub fn remaining_estimates(
         &self,
         work: &Workload,
@@ -185,14 +189,16 @@ impl RunPlan {
         self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns the resource estimates (memory, time, reads) of all stages except the optional ones.
+    /// Returns the resource estimates (memory, time, reads) of all stages except the optional ones, which only report
+    /// something.
     pub fn required_estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         let input = self.estimate_input(work, limits, MeasuredOnArrival::default());
         self.estimates_where(input, |stage| !stage.is_optional())
     }
 
-    /// Returns the resource estimates of the stages that certainly have to run. Leaves out stages that may find nothing
-    /// to do, because renders hardly change when the fraction `hardly_seen` of the Gaussians is removed.
+    /// Returns the resource estimates (memory, time, reads) of the stages that certainly have to run. Leaves out stages
+    /// that may turn out to be unnecessary because the run removes only Gaussians that hardly change renders.
+    /// `hardly_seen` is the fraction of such Gaussians.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -225,23 +231,25 @@ impl RunPlan {
         [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
     }
 
-    /// Returns whether the amount of work depends on results of stages, so that the time of the run is less certain.
+    /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
 
-    /// Returns the stages that several processes can divide among themselves, each as a line with its number of units
-    /// of work. Stages have the names of their cache entries (files with results).
+    /// Returns a line of text for each divisible stage, whose work several processes can share. The line holds the name
+    /// of the cache entries of the stage (files with results) and its number of units of work, such as blocks of
+    /// Gaussians or views.
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }
 
-    /// Returns a description of how many Gaussians ranking and refinement leave, for display.
+    /// Returns a line of text for display that states how many Gaussians ranking and refinement leave.
     pub fn counts_text(&self) -> String {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
-    /// Returns the plan as text for display: numbers of Gaussians, parameters of the stages, and omitted stages.
+    /// Returns the plan as text for display: numbers of Gaussians that ranking and refinement leave, parameters of the
+    /// stages, and omitted stages.
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
@@ -258,10 +266,11 @@ impl RunPlan {
         self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// Checks, before any work, that the scene has the files that the stages of the plan need.
+    /// Checks, before any work, that the stages of the plan can run on the scene: that the files which they need exist,
+    /// and that the output format can store the scene.
     ///
     /// # Errors
-    /// Fails if the check of a stage fails.
+    /// Fails if files are missing or too few, or if the output format cannot store the scene.
     pub fn check(&self, scene: &Scene) -> Result<()> {
         if let Some(search) = &self.search {
             search.check(scene)?;
@@ -270,11 +279,12 @@ impl RunPlan {
     }
 }
 
-/// Returns the kind of output (such as archive or model folder) that `request` asks for. `own` is the default for the
-/// input.
+/// Returns the kind of output (such as archive or model folder) that `request` asks for. `own` is the kind to use if
+/// neither an option nor the name of the output determines one.
 ///
 /// # Errors
-/// Fails if neither the name of the output nor an option tells its kind, or if options exclude each other.
+/// Fails if options exclude each other, or if no option states the kind and the name of the output ends like a kind of
+/// file that the program does not write.
 fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == PruneOrMerge::Merge || request.target.is_some()) {

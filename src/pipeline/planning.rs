@@ -1,4 +1,4 @@
-//! Input of the planning of stages: the request, and facts about the input model that several stages depend on.
+//! Information from which the stages of a run are planned: the request of the user, and facts about the input model.
 
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
@@ -10,7 +10,7 @@ use crate::scene::Scene;
 /// Facts about a scene that are known before its frames are read.
 #[derive(Debug, Clone, Copy)]
 pub struct InputMeta {
-    /// Number of Gaussians, N.
+    /// Number of Gaussians in the scene, N.
     pub gaussians: usize,
     /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
@@ -29,11 +29,12 @@ impl InputMeta {
     }
 }
 
-/// Input of the planning of stages: the request of the user, and decisions and facts that several stages depend on.
+/// Information from which the stages of a run are planned: the request of the user, facts about the input, and
+/// decisions that several stages depend on.
 pub struct Planning<'a> {
     /// Request of the user.
     pub request: &'a Request,
-    /// Facts about the input.
+    /// Facts about the input that are known before its frames are read.
     pub input: InputMeta,
     /// Kind of output that is written.
     pub output: OutputKind,
@@ -56,19 +57,20 @@ pub struct Planning<'a> {
 }
 
 impl Planning<'_> {
-    /// Returns the requested number of Gaussians as a fraction of the input's, if a target was requested.
+    /// Returns the requested number of Gaussians divided by the number of Gaussians in the input; `None` if no number
+    /// was requested.
     pub fn target_fraction(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 
-    /// Returns whether refinement chooses the SH degree for a requested size on disk. For each degree it refines as
-    /// many Gaussians as fit the size, and takes the degree with the best quality.
+    /// Returns whether refinement chooses the SH degree for a requested size on disk. If so, the run refines, for each
+    /// degree, as many Gaussians as fit the size, and takes the degree with the best quality.
     pub fn chooses_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
     }
 
-    /// Returns whether Gaussians are removed by a ranking that rendered views determine.
+    /// Returns whether Gaussians are pruned in the order of a ranking that is measured on rendered views.
     pub fn prunes_by_views(&self) -> bool {
         self.renders_views && self.prunes
     }
@@ -77,22 +79,22 @@ impl Planning<'_> {
 /// Parts of refinement that are omitted because they do not fit within the memory limit (`--memory`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum MemoryFallback {
-    /// Nothing is omitted: full refinement.
+    /// Full refinement; no part is omitted.
     #[default]
     Nothing,
-    /// Parameter deltas (what refinement adds to stored values) are constant in time.
+    /// Refinement without time-varying deltas: the values that it adds to stored parameters are constant in time.
     ConstantInTime {
-        /// Smallest memory limit with which deltas would vary in time, bytes.
+        /// Smallest memory limit, bytes, with which the added values would vary in time.
         required_bytes: u64,
     },
-    /// Parameter deltas are constant in time, and SH coefficients above degree 0 are not refined.
+    /// Refinement without time-varying deltas and without SH coefficients above degree 0.
     WithoutHarmonics {
-        /// Smallest memory limit with which SH coefficients above degree 0 would be refined, bytes.
+        /// Smallest memory limit, bytes, with which SH coefficients above degree 0 would be refined.
         required_bytes: u64,
     },
-    /// Nothing is refined.
+    /// No refinement.
     WithoutRefinement {
-        /// Smallest memory limit with which anything would be refined, bytes.
+        /// Smallest memory limit, bytes, with which at least a part of refinement would run.
         required_bytes: u64,
     },
 }

@@ -1,5 +1,6 @@
-//! Quality of a compressed model: on views by which a search for a quality compares models, and on other views, held
-//! back from the search, for the report.
+//! Measurement of the quality of a compressed model during the search for the smallest model with a requested quality.
+//! The search compares models on some of the views. The other views are held back from the search, and give the quality
+//! that is reported.
 
 use rayon::prelude::*;
 
@@ -15,27 +16,28 @@ use crate::source::FrameSource;
 
 /// Images with which renders of a compressed model are compared.
 pub(super) enum QualityReference<'a> {
-    /// Renders of the original: stored target renders, and for each view of the meter the index of its target.
+    /// Renders of the original: the stored renders, and for each view of the meter the index of its stored render.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
     Photographs(Photographs),
 }
 
-/// Views on which compressed models are measured, with the images that their renders are compared with.
+/// Views on which the PSNR of compressed models is measured, with the images to which renders of the models are
+/// compared.
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// Views in order of frames. The flag is true for a view held back from the search.
+    /// Views in order of frames, each with a flag that is true for a view held back from the search.
     pictures: Vec<(FrameView, bool)>,
     comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
     /// Returns a meter for the views `pictures`, in order of frames. The flag of a view is true if it is held back from
-    /// the search. `comparison` holds the images to compare with.
+    /// the search. `comparison` holds the images with which renders are compared.
     ///
     /// # Errors
-    /// Fails if no view is held back from the search, or all are.
+    /// Fails if no view is held back from the search, or if every view is.
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
@@ -53,8 +55,9 @@ impl<'a> QualityMeter<'a> {
         Ok(QualityMeter { scene, cameras, pictures, comparison })
     }
 
-    /// Returns the mean PSNR of renders of `source`, dB. If `held`, measures on the views held back from the search,
-    /// otherwise on the views of the search.
+    /// Returns the mean PSNR, dB, of renders of the model `source` against the images of the meter (renders of the
+    /// original, or photographs). If `held`, measures on the views held back from the search, otherwise on the views of
+    /// the search.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read.
@@ -99,8 +102,8 @@ impl<'a> QualityMeter<'a> {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
-    /// Returns the names of the views held back from the search, made of frame and view number. A view between the
-    /// cameras of the scene has only the frame in its name.
+    /// Returns the names of the views held back from the search. A name consists of frame and view number; the name of
+    /// a view from a camera between those of the scene has only the frame.
     pub(super) fn held_back_names(&self) -> Vec<String> {
         let name = |picture: &FrameView| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),

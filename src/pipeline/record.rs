@@ -25,7 +25,8 @@ pub struct Provenance {
     pub input_digest: String,
 }
 
-/// Options of a run that affect the result, except the parameters of the recipe. `None` means not given.
+/// Options of a run that affect the result, except the parameters of the recipe. A field is `None` if the user did not
+/// give the option.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunOptions {
@@ -33,11 +34,12 @@ pub struct RunOptions {
     pub mode: PruneOrMerge,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
-    /// Exact number of Gaussians in the output, as a fraction of those in the input.
+    /// Number of Gaussians in the output, as an exact fraction of those in the input.
     pub target_ratio: Option<f64>,
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     pub min_psnr: Option<f64>,
-    /// Maximum loss of mean PSNR against photographs, compared with the original model, dB.
+    /// Maximum amount, dB, by which the mean PSNR against photographs may be lower for the output than for the original
+    /// model.
     pub max_loss: Option<f64>,
     /// Folder of the photographs for `max_loss`. In a recipe file the path is relative to the folder of the file.
     pub ground_truth: Option<PathBuf>,
@@ -51,24 +53,27 @@ pub struct RunOptions {
     pub drop_ids: Option<String>,
     /// Box, in scene units, whose Gaussians are kept: the three low coordinates, then the three high ones.
     pub keep_box: Option<[f64; 6]>,
-    /// Kind of output, by the name that the option `--as` has for it.
+    /// Kind of output, such as archive or model folder, as stated with the option `--as`.
     pub output: Option<OutputKind>,
-    /// Training iteration whose files are read from a model folder.
+    /// Training iteration whose files are read, if the input is a model folder with the files of several iterations.
     pub iteration: Option<u32>,
-    /// Value of the option `--time-duration` for the input model.
+    /// Value of the option `--time-duration`: length of the training parameter `time_duration` of 4D Gaussian
+    /// Splatting, in the model's time unit. Colors of the input repeat after this period.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time_duration: Option<f64>,
-    /// Whether the option `--rot4d unflipped` was given for the input model.
+    /// Whether the option `--rot4d unflipped` was given: the 4D rotations of the input use the axis order of 4D
+    /// Gaussian Splatting from before 15 September 2024.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
-    /// Value of the option `--zero-rotation` for an input in the format `.splatv`.
+    /// Value of the option `--zero-rotation`: whether Gaussians with a zero quaternion in a `.splatv` or `.ftgs.ply`
+    /// input are removed or kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_rotation: Option<ZeroRotation>,
     /// File or folder of the cameras. In a recipe file the path is relative to the folder of the file.
     pub cameras: Option<PathBuf>,
     /// Split (training, test …) whose views were used for scoring; `None`: all views.
     pub split: Option<Split>,
-    /// Number of evenly spaced frames that a model continuous in time is divided into.
+    /// Number of evenly spaced frames at which an input model that is continuous in time is sampled.
     pub frames: Option<usize>,
     /// Width and height of views in pixels, for cameras that state no size.
     pub size: Option<(u32, u32)>,
@@ -76,12 +81,13 @@ pub struct RunOptions {
     /// file the path of a table of times is relative to the folder of the file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
-    /// Whether Gaussians were linked between frames; `None` if the program decided this.
+    /// Value of the option `--link`: whether Gaussians of successive frames are matched, to find the same Gaussian in
+    /// each frame. `None`: the program decides.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkMode>,
 }
 
-/// Tables of a recipe file other than the parameters of the method.
+/// Tables `[provenance]` and `[run]` of a recipe file: everything in it except the parameters of the method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecipeRecord {
     /// Program and input with which the recipe file was written.
@@ -99,8 +105,8 @@ impl RunOptions {
     /// Returns the requested goal (a quality or a size on disk), if any.
     ///
     /// # Errors
-    /// Fails with a message if several goals are given, if a goal is incomplete, or if a value in decibels is out of
-    /// range.
+    /// Fails with a message for the user if there are several goals or both a goal and a target, if `max_loss` or
+    /// `ground_truth` is given without the other, or if a value in decibels is out of range.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
         match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
             (_, None, None, None, None) => Ok(None),
@@ -121,7 +127,7 @@ impl RunOptions {
 }
 
 impl RunOptions {
-    /// Returns the options with every path replaced by what `path` returns for it.
+    /// Returns the options with every path `p` replaced by `path(p)`.
     fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> RunOptions {
         self.cameras = self.cameras.as_deref().map(&path);
         self.ground_truth = self.ground_truth.as_deref().map(&path);
@@ -134,8 +140,8 @@ impl RunOptions {
 }
 
 impl RecipeRecord {
-    /// Returns the record of a run of `request`. `user` holds the ids that the user keeps and drops, `input_digest` the
-    /// digest of the input.
+    /// Returns the record that describes a run of `request`. `user` holds the ids of the Gaussians that the user keeps
+    /// and drops, `input_digest` is the digest of the input.
     pub(super) fn new(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),
@@ -188,8 +194,8 @@ impl RecipeRecord {
         Ok(RecipeRecord { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
-    /// Returns the record for a recipe file in `folder`: every path is relative to `folder`, or is only a file name if
-    /// it cannot be.
+    /// Returns the record as it is written to a recipe file in `folder`. Every path is made relative to `folder`; a
+    /// path for which this is impossible is reduced to its file name.
     fn seen_from(&self, folder: &Path) -> RecipeRecord {
         RecipeRecord {
             run: self.run.clone().map(|run| run.with_paths(|path| relative_to_folder(path, folder))),
@@ -197,7 +203,7 @@ impl RecipeRecord {
         }
     }
 
-    /// Returns the text of the file `recipe.toml` that is written to `folder`.
+    /// Returns the text of the file `recipe.toml` that is written to `folder`: this record and the recipe of `request`.
     pub(super) fn text(&self, request: &Request, folder: &Path) -> String {
         format!(
             "# What this result was made with; give it to --recipe to repeat the run.\n{}\n{}",

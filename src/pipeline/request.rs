@@ -28,17 +28,17 @@ pub enum PruneOrMerge {
 pub enum Target {
     /// Exact number of Gaussians.
     Count(u64),
-    /// Fraction of the input's Gaussians, above 0 and at most 1. The product is rounded to the nearest number, at least
-    /// 1.
+    /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1. The resulting number of
+    /// Gaussians is rounded to the nearest one, at least 1.
     Ratio(f64),
 }
 
-/// Goal by which the number of Gaussians in the output is found.
+/// Goal from which the program finds the number of Gaussians in the output.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// The smallest output that has at least this quality.
+    /// Smallest output with at least this quality.
     Quality(Quality),
-    /// The best output whose files together have at most this number of bytes.
+    /// Best output whose files together have at most this number of bytes.
     Bytes(u64),
 }
 
@@ -47,11 +47,12 @@ pub enum Goal {
 pub enum Quality {
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     Psnr(f64),
-    /// Maximum loss of mean PSNR against photographs, compared with the original model.
+    /// Maximum amount by which the mean PSNR against photographs may be lower for the output than for the original
+    /// model.
     Loss {
-        /// Maximum loss, dB.
+        /// Maximum loss of mean PSNR, dB.
         most: f64,
-        /// Folder of the photographs.
+        /// Folder with the photographs, against which both models are compared.
         photographs: PathBuf,
     },
 }
@@ -59,7 +60,7 @@ pub enum Quality {
 /// Returns `value` if it is a valid number of decibels for a quality: above 0 and at most 100.
 ///
 /// # Errors
-/// Fails with a message that names the parameter `name` if `value` is out of this range.
+/// Fails if `value` is out of this range. The error message names the parameter by `name`.
 pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, String> {
     match value > 0.0 && value <= 100.0 {
         true => Ok(value),
@@ -78,7 +79,8 @@ pub struct Request {
     pub kind: Option<OutputKind>,
     /// Parameters of the method.
     pub recipe: Recipe,
-    /// Digest of the input for which the recipe was written, if known. For another input the user gets a note.
+    /// Digest of the input for which the recipe was written, if known. If the actual input has another digest, the user
+    /// gets a note.
     pub made_for: Option<String>,
     /// Minimum PSNR, dB, of renders of an archive against renders of the result before its values are quantized.
     /// `None`: derived from the quality of the result.
@@ -100,8 +102,8 @@ pub struct Request {
 }
 
 impl Request {
-    /// Returns a request that compresses `input` by the parameters of `recipe` and writes to `output`. Keeps and drops
-    /// no particular Gaussians and replaces no existing output.
+    /// Returns a request that compresses `input` by the parameters of `recipe` and writes to `output`. The request
+    /// names no Gaussians to keep or drop, and existing output is not replaced.
     pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
         Request {
             input,
@@ -122,11 +124,12 @@ impl Request {
 }
 
 impl Target {
-    /// Returns the requested number of output Gaussians for an input of `count` Gaussians.
+    /// Returns the requested number of output Gaussians for an input of `count` Gaussians. For an input without
+    /// Gaussians, returns 0 whatever number was requested.
     ///
     /// # Errors
-    /// Fails if the fraction is not above 0 and at most 1, or if the number is not from 1 to `count`. For an input
-    /// without Gaussians the number is always 0.
+    /// Fails if a fraction is not above 0 and at most 1. Also fails if `count` is above 0 and the number is not from 1
+    /// to `count`.
     pub fn resolve_count(self, count: usize) -> Result<usize> {
         let wanted = match self {
             Target::Count(wanted) => wanted,

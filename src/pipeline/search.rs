@@ -44,23 +44,27 @@ const NAME: &str = "search";
 const FIRST_FRACTION: f64 = 0.2;
 /// Usual number of sizes (numbers of Gaussians) that are tried; used for estimates of time.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Maximum number of sizes (numbers of Gaussians) that are tried, apart from the full size if all of them fail.
+/// Maximum number of sizes (numbers of Gaussians) that are tried. If all of them fail, the model of all Gaussians in
+/// the ranking is tried as well; the ranking leaves out Gaussians that are always dropped.
 const MAX_SIZES: usize = 8;
-/// Ratio of the smallest size (number of Gaussians) that passed to the largest that failed, at or below which the
-/// search ends.
+/// Ratio of two sizes (numbers of Gaussians) at which the search ends: the smallest size with the requested quality,
+/// divided by the largest size without it.
 const SAME_SIZE_RATIO: f64 = 1.04;
-/// Approximate cost of halving the number of Gaussians, from which the search guesses its next size: the PSNR falls by
-/// the first number, dB, and a loss of PSNR against photographs grows by the second, a factor.
+/// Approximate cost of halving the number of Gaussians, from which the search guesses its next size. First number:
+/// decrease of the PSNR against the original, dB; used if a minimum PSNR is requested. Second number: factor by which
+/// the loss of PSNR against photographs grows; used if a maximum loss is requested.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
-/// Surplus of quality that is small enough to end the search. Unit: number of times that the surplus would allow the
-/// number of Gaussians to be halved.
+/// Surplus of quality (quality above the requested one) that is small enough to end the search. Unit: number of times
+/// that the surplus would allow the number of Gaussians to be halved.
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
-/// Number n: one of every n views with photographs is held back from the search, for the report.
+/// Number n: one of every n views with photographs is held back from the search, to measure the quality that is
+/// reported.
 const HELD_EVERY: usize = 4;
 
-/// Search of a run for the smallest model with a requested quality. Repeats the stages that reduce the model.
+/// Search of a run for the smallest model with a requested quality. Repeats the stages that reduce the model to a
+/// number of Gaussians ([`Phase::Reduce`]).
 #[derive(Debug, Clone)]
 pub struct SearchStage {
     /// Quality that the user requested.
@@ -68,19 +72,21 @@ pub struct SearchStage {
     /// Quality that the search must reach. For an archive it is higher than requested, because quantization costs
     /// quality.
     searched: Quality,
-    /// Number of views of the original that models are refined on and compared with.
+    /// Number of views of the original to which models are fitted by refinement and with which their renders are
+    /// compared.
     pictures: usize,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// Margins of quality, dB, required for writing the deformation field in half precision and for dropping SH
-    /// degrees; `None` if the field or the degrees are not reduced.
+    /// Margins of quality, dB. First: margin required for writing the deformation field in half precision; `None` if it
+    /// stays exact. Second: margin required for dropping SH degrees; `None` if all degrees stay.
     margins: [Option<f64>; 2],
 }
 
 /// Model of one size (number of Gaussians) that was tried, with its quality.
 struct TriedSize {
     result: CompressedModel,
-    /// PSNR, or loss of PSNR, dB, on the views of the search.
+    /// Quality of the model on the views that the search uses, dB: PSNR against the original, or loss of PSNR against
+    /// photographs if a maximum loss is requested.
     value: f64,
     journal: Journal,
 }
@@ -111,8 +117,8 @@ impl SearchStage {
     }
 
     /// Returns the resource estimate (memory, time, reads) of the search. `repeated` holds the estimates of the stages
-    /// that run for every size. Memory is that of the largest of these stages plus the models that the search keeps;
-    /// time and reads are their sums, times the usual number of sizes.
+    /// that run for every size. The memory is that of the largest of these stages, plus that of the models which the
+    /// search keeps. Time and reads are the sums over these stages, times the usual number of sizes.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state_bytes(Attributes::all());
@@ -145,7 +151,8 @@ impl SearchStage {
         need
     }
 
-    /// Finds the smallest model with the requested quality. Stores the model and the summary of the search in `run`.
+    /// Finds the smallest model with the requested quality. Stores the model and the summary of the search in `run`. If
+    /// no tried size reaches the quality, stores the model of all Gaussians in the ranking.
     ///
     /// # Errors
     /// Fails if frames or photographs cannot be read, or if there are too few views for a search.
@@ -193,8 +200,9 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns the meter by which models are compared, against photographs if `photographs` is given, otherwise against
-    /// renders of the original.
+    /// Returns the meter that measures the quality of models: against `photographs` (test views with their photographs)
+    /// if given, otherwise against `targets`, the stored renders of the original. In the second case `parts` states
+    /// which of the target views the search may use and which are held back from it.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -268,9 +276,10 @@ impl SearchStage {
         Ok(Some(found))
     }
 
-    /// Tries sizes from the number of Gaussians that must stay to the number that may stay. Returns the smallest model
-    /// that has the requested quality, or the model of all Gaussians that may stay if none has. Also returns every
-    /// tried size with the PSNR or loss of its model, dB.
+    /// Tries sizes (numbers of Gaussians) from the number of protected Gaussians, which are always kept, to the number
+    /// of Gaussians in the ranking. Returns the smallest tried model that has the requested quality. If no tried model
+    /// has it, returns the model of all Gaussians in the ranking. Also returns every tried size with the quality of its
+    /// model, dB (see [`TriedSize::value`]).
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
@@ -313,7 +322,7 @@ impl SearchStage {
     }
 
     /// Runs the stages that reduce the model to `size` Gaussians, and measures the quality of the result on the views
-    /// of the search.
+    /// that the search uses. Returns the model with its quality and its journal.
     fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;
@@ -324,8 +333,9 @@ impl SearchStage {
         Ok(TriedSize { result, value, journal })
     }
 
-    /// Returns the quality of the model `result` in the form of the request, PSNR or loss of PSNR, dB. If `held`,
-    /// measures on the views held back from the search, otherwise on the views of the search.
+    /// Returns the quality of the model `result`, dB: its PSNR against the original, or its loss of PSNR against
+    /// photographs if a maximum loss is requested. If `held`, measures on the views held back from the search,
+    /// otherwise on the views that the search uses.
     fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
         let found = meter.measure(result, held)?;
         match self.searched {
@@ -334,8 +344,9 @@ impl SearchStage {
         }
     }
 
-    /// Returns by how much `value` (PSNR or loss, dB) is better than requested, as the approximate number of times that
-    /// the number of Gaussians could be halved. Negative if the quality is missed.
+    /// Returns by how much the quality `value` (PSNR or loss of PSNR, dB) is better than the search requires. Unit:
+    /// approximate number of times that this surplus would allow the number of Gaussians to be halved. Negative if the
+    /// quality is worse than required.
     fn surplus(&self, value: f64) -> f64 {
         match self.searched {
             // Renders with NaN or infinity never pass.
@@ -345,7 +356,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the PSNR or the loss of PSNR, dB, that the search must reach.
+    /// Returns the limit, dB, that the search must keep to: the minimum PSNR or the maximum loss of PSNR.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,
@@ -373,8 +384,8 @@ impl SearchStage {
     }
 }
 
-/// Returns a note for display about the result of the search. `searched`: number of views of the search. `gaussians`:
-/// number of Gaussians in the result. `is_met`: whether the result has the requested quality.
+/// Returns a note for display about the result of the search. `searched`: number of views that the search used.
+/// `gaussians`: number of Gaussians in the result. `is_met`: whether the result has the requested quality.
 fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());

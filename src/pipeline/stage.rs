@@ -27,18 +27,19 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::ScanResult;
 
-/// Fraction of the Gaussians that ranking keeps in a search for a quality without refinement.
+/// Fraction of the Gaussians that the last pruning round leaves if the run searches for the smallest model with a
+/// requested quality and does not refine.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run to which a stage belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// Stages from the input's frames to a ranking of all Gaussians.
+    /// Stages that read the frames of the input and make a ranking of all Gaussians.
     Rank,
-    /// Stages from the ranking to a model with one number of Gaussians. A search for a quality repeats these stages,
-    /// once for every number it tries.
+    /// Stages that make a compressed model with a given number of Gaussians from the ranking. A search for the smallest
+    /// model with a requested quality repeats these stages, once for every number of Gaussians that it tries.
     Reduce,
-    /// Stages from the model to the output files.
+    /// Stages that turn the compressed model into output files: quantization, measurement of the quality, and writing.
     Write,
 }
 
@@ -47,19 +48,20 @@ pub enum Phase {
 pub struct EstimateInput<'a> {
     /// Sizes of the input and of its views.
     pub work: &'a Workload,
-    /// Maximum amounts that stages keep in memory at a time.
+    /// Limits on what stages keep in memory at a time, such as numbers of frames and views.
     pub limits: &'a Limits,
-    /// Number of Gaussians in the output, as a fraction of the input's, above 0 and at most 1; 1 if not known in
-    /// advance.
+    /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1; 1 if the number is not
+    /// known in advance.
     pub left: f64,
-    /// Statistics of a stream that were already computed while it arrived.
+    /// Kinds of statistics that were already computed while the input, a stream, arrived.
     pub measured: MeasuredOnArrival,
 }
 
-/// Stage of a run, with its parameters.
+/// Stage of a run, such as the scan or merging. A type that implements this trait holds the parameters of its stage.
 pub trait Stage: Debug + Send + Sync {
-    /// Returns the estimates of the memory, time and reads of the stage, one for each part with a progress line of its
-    /// own. Empty if the stage has nothing to do for the input, or needs only a negligible amount.
+    /// Returns the estimates of the memory, time and reads of the stage, one for each part of the stage that is
+    /// reported under a name of its own. Empty if the stage has nothing to do for the input, or needs only negligible
+    /// memory and time.
     fn estimates(&self, input: EstimateInput<'_>) -> Vec<ResourceEstimate>;
 
     /// Returns the parameters that determine the duration of the stage, for display in the form "NAME: 3000 steps".
@@ -68,50 +70,57 @@ pub trait Stage: Debug + Send + Sync {
         String::new()
     }
 
-    /// Returns whether the stage may find nothing to do, because renders hardly change when the fraction `_hardly_seen`
-    /// of the Gaussians is removed. The lower bound of the time of a run leaves out such stages.
+    /// Returns whether the stage may turn out to be unnecessary because the run removes only Gaussians that hardly
+    /// change renders. `_hardly_seen` is the fraction of such Gaussians. The lower bound of the estimated time of a run
+    /// leaves out stages for which this method returns true.
     fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
         false
     }
 
-    /// Returns whether the stage only reports something and is omitted where memory does not suffice for it.
+    /// Returns whether the stage is optional: it only reports something, such as the quality of the result, and a run
+    /// without enough memory for the stage omits it.
     fn is_optional(&self) -> bool {
         false
     }
 
-    /// Returns the work that several processes can divide among themselves, one line per kind of unit: "NAME: 12 blocks
-    /// of Gaussians".
+    /// Returns the work of the stage that several processes can divide among themselves, as lines of text: one line per
+    /// kind of unit, such as "NAME: 12 blocks of Gaussians". `_counts` is the plan of how many Gaussians ranking and
+    /// refinement leave.
     fn shardable_units(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
         Vec::new()
     }
 
-    /// Checks, before any work, that the scene has the files that the stage needs.
+    /// Checks, before any work, that the stage can run on the scene: that the files which it needs exist, and that the
+    /// output format can store the scene.
     ///
     /// # Errors
-    /// Fails if files are missing or too few.
+    /// Fails if files are missing or too few, or if the output format cannot store the scene.
     fn check(&self, _scene: &Scene) -> Result<()> {
         Ok(())
     }
 
-    /// Runs the stage: reads its input from `run` and stores its results there, and adds its entries to the journal.
-    /// Results are cached under a key of the stage, so that a repeated run after an interruption does not compute them
-    /// again.
+    /// Runs the stage: takes its input from `run`, stores its results in `run`, and adds its entries to the journal of
+    /// `run`. Results are cached under a key of the stage, so that a run that is repeated after an interruption does
+    /// not compute them again.
     ///
     /// # Errors
     /// Fails if the input cannot be read, the output cannot be written, or the input cannot meet the request.
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Kinds of statistics of a stream that were already computed while it arrived.
+/// Kinds of statistics of the Gaussians that were already computed while the input, a stream, arrived. For other inputs
+/// no kind was, which is the default.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
-    /// Whether all frames were scanned for the statistics of every Gaussian, except its visible contribution.
+    /// Whether the scan of all frames was done. It gives all statistics of the Gaussians except their visible
+    /// contributions.
     pub scanned: bool,
-    /// Whether the visible contribution of every Gaussian was measured on views.
+    /// Whether the visible contribution of every Gaussian (Σ alpha · transmittance over pixels) was measured on
+    /// rendered views.
     pub visible_contribution: bool,
 }
 
-/// Statistics of all Gaussians before scoring.
+/// Statistics of all Gaussians, from which their scores are computed.
 pub struct Measured {
     /// Statistics of every Gaussian from the scan of all frames.
     pub scanned: ScanResult,
@@ -126,34 +135,37 @@ impl Measured {
     }
 }
 
-/// Plan of the numbers of Gaussians in a run: ranking removes the first Gaussians; refinement then removes the rest in
-/// prune steps (removals of the lowest-ranked Gaussians between optimization steps).
+/// Plan of how many Gaussians ranking and refinement leave. Ranking removes some of the Gaussians. Refinement then
+/// removes more of them, down to the target, in prune steps (removals of the lowest-ranked Gaussians between
+/// optimization steps).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Refinement begins with at least this fraction of all Gaussians and removes those above the target in prune
-    /// steps. `None`: ranking alone removes Gaussians.
+    /// Minimum fraction of all Gaussians with which refinement begins. Its prune steps then remove Gaussians until the
+    /// target is reached. `None`: ranking alone removes Gaussians.
     pub refinement_starts_at: Option<f64>,
     /// Whether the run searches for the number of Gaussians in the output.
     pub searches: bool,
 }
 
 impl CountPlan {
-    /// Returns the number of Gaussians with which refinement begins, of `all`, if the output is to have `wanted`
-    /// Gaussians.
+    /// Returns the number of Gaussians with which refinement begins, if the input has `all` Gaussians and the output is
+    /// to have `wanted`.
     pub fn count_before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
-    /// Returns the number of Gaussians, of `all`, that ranking leaves if the output is to have `wanted` Gaussians. A
-    /// search for a quality ranks only once, down to the number that its smallest model needs.
+    /// Returns the number of Gaussians that ranking leaves, if the input has `all` Gaussians and the output is to have
+    /// `wanted`. If the run searches for the smallest model with a requested quality, ranking runs only once for all
+    /// models that are tried. Then returns the number for the smallest of these models, whatever `wanted` is.
     pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
         self.count_before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
-    /// Returns as text for display how many of `all` Gaussians ranking and refinement leave. `target` is the number of
-    /// Gaussians in the output, if known; `merges` tells whether survivors are merged.
+    /// Returns a line of text for display: how many Gaussians are left after ranking and how many refinement then
+    /// removes. `all` is the number of Gaussians in the input, and `target` the number in the output, if known.
+    /// `merges` tells whether survivors (Gaussians that are not removed) are merged.
     pub(super) fn text(&self, target: Option<usize>, all: usize, merges: bool) -> String {
         let share =
             |count: usize| format!("{count} of {all} Gaussians ({:.0}%)", 100.0 * count as f64 / all.max(1) as f64);
@@ -175,14 +187,15 @@ impl CountPlan {
     }
 }
 
-/// Function that returns the resource estimate (memory, time, reads) of a stage for an input, within limits.
+/// Function that returns the resource estimate (memory, time, reads) of a stage, from the sizes of the input and the
+/// limits on memory use.
 type Estimate = Box<dyn Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync>;
 
 /// Stage or step that a run omits, with the reason.
 struct LeftOutStage {
     what: &'static str,
     why: String,
-    /// Estimate of the memory, time and reads that omitting the stage saves; `None` if it is not known.
+    /// Function that estimates the memory, time and reads that omitting the stage saves; `None` if they are not known.
     estimate: Option<Estimate>,
 }
 
@@ -191,25 +204,25 @@ struct LeftOutStage {
 pub struct StageList {
     stages: Vec<(Phase, Box<dyn Stage>)>,
     left_out: Vec<LeftOutStage>,
-    /// Numbers of Gaussians that ranking and refinement leave.
+    /// Plan of how many Gaussians ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether the amount of work depends on results of stages, so that the time of the run is less certain.
+    /// Whether the amount of work depends on intermediate results, so that the time of the run is less certain.
     is_open_ended: bool,
 }
 
 impl StageList {
-    /// Appends a stage to the list.
+    /// Appends `stage` to the list, as a stage of `phase`.
     pub fn add(&mut self, phase: Phase, stage: impl Stage + 'static) {
         self.stages.push((phase, Box::new(stage)));
     }
 
-    /// Adds the omitted work `what` with the reason `why`.
+    /// Records that the run omits the work `what` for the reason `why`. How much this saves is not known.
     pub fn leave_out(&mut self, what: &'static str, why: impl Into<String>) {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
     }
 
-    /// Adds the omitted stage `what` with the reason `why`; `estimate` returns the memory, time and reads that are
-    /// saved.
+    /// Records that the run omits the stage `what` for the reason `why`. `estimate` returns the memory, time and reads
+    /// that this saves.
     pub fn leave_out_stage(
         &mut self,
         what: &'static str,
@@ -219,17 +232,17 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
-    /// Removes the optional stages.
+    /// Removes the optional stages, which only report something (see [`Stage::is_optional`]).
     pub fn remove_optional(&mut self) {
         self.stages.retain(|(_, stage)| !stage.is_optional());
     }
 
-    /// Notes that the amount of work depends on results of stages.
+    /// Records that the amount of work depends on intermediate results, so that the time of the run is less certain.
     pub fn set_open_ended(&mut self) {
         self.is_open_ended = true;
     }
 
-    /// Returns whether the amount of work depends on results of stages.
+    /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
     pub fn is_open_ended(&self) -> bool {
         self.is_open_ended
     }
@@ -244,7 +257,7 @@ impl StageList {
         self.stages.iter().filter(move |(stage_phase, _)| *stage_phase == phase).map(|(_, stage)| &**stage)
     }
 
-    /// Runs the stages of `phase` in order.
+    /// Runs the stages of `phase` in order on the state `run`.
     ///
     /// # Errors
     /// Fails if a stage fails; later stages do not run then.
@@ -252,12 +265,13 @@ impl StageList {
         self.in_phase(phase).try_for_each(|stage| stage.run(run))
     }
 
-    /// Returns the omitted stages for display, one line each.
+    /// Returns one line of text for display per omitted stage, with the reason.
     pub fn omitted_stages_text(&self) -> impl Iterator<Item = String> {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
-    /// Adds the omitted stages to the journal, with the saved time and reads where an estimate exists.
+    /// Adds the omitted stages with their reasons to the journal. If an estimate exists for a stage, also adds the time
+    /// and the reads that are saved, for an input of the sizes `work` within `limits`.
     pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
         for LeftOutStage { what, why, estimate } in &self.left_out {
             match estimate.as_ref().map(|estimate| estimate(work, limits)) {
@@ -271,21 +285,23 @@ impl StageList {
     }
 }
 
-/// Content of an archive (compact file of the result, with quantized values).
+/// Content of an archive (compact file of the result, with quantized values) that has not been written to the output
+/// yet.
 #[derive(Debug, Serialize, Deserialize)]
 pub enum PreparedArchive {
     /// Encoded model or point cloud, ready to be written.
     Content(EncodedArchive),
-    /// Error bounds of the values, within which the frames are written later.
+    /// Error bounds of the values in an archive of frames. The frames are computed and rounded within these bounds only
+    /// when the archive is written.
     Frames(ErrorBounds),
 }
 
-/// Number of Gaussians with which an output of one SH degree fits the requested size on disk.
+/// Number of Gaussians with which an output of a given SH degree fits the requested size on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ByteLimitFit {
     /// SH degree of the output.
     pub sh_degree: usize,
-    /// Number of Gaussians that fits with this SH degree.
+    /// Number of Gaussians in the largest output of this SH degree that fits.
     pub gaussians: usize,
 }
 
@@ -303,27 +319,27 @@ pub struct RunState<'a> {
     pub input: Option<InputSummary>,
     /// Text of the file `recipe.toml` that is written beside the result.
     pub recipe: String,
-    /// Statistics of a stream that were already computed while it arrived.
+    /// Statistics of the Gaussians that were already computed while the input, a stream, arrived.
     pub arrived: Option<Measured>,
     /// Statistics and scores of all Gaussians.
     pub scored: Option<Arc<Scored>>,
-    /// Ranking of all Gaussians that may stay, most important first.
+    /// Ranking of all Gaussians except those that are always dropped, most important first.
     pub ranking: Option<Arc<Ranking>>,
     /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
     /// Numbers of Gaussians with which the output fits the requested size on disk, in order of decreasing SH degree.
     pub counts_within_bytes: Vec<ByteLimitFit>,
-    /// Model without Gaussians from which results of this run are made; holds the settings that they share, such as SH
-    /// degree and merge parameters.
+    /// Model without Gaussians that holds the settings of all models of this run, such as SH degree and merge
+    /// parameters. Compressed models are made from it by adding Gaussians.
     pub template: CompressedModel,
-    /// Compressed model as the stages so far have made it.
+    /// Compressed model in the state in which the last stage left it.
     pub result: CompressedModel,
-    /// Number of Gaussians of [`result`](RunState::result) that refinement is to leave.
+    /// Number of Gaussians of the model in [`result`](RunState::result) that are to be left after refinement.
     pub refine_to: usize,
-    /// States of refinement after prune steps (removals of the lowest-ranked Gaussians), from which a smaller model
-    /// continues; only in a search for a quality.
+    /// Refined models after prune steps (removals of the lowest-ranked Gaussians), from which the refinement of a
+    /// smaller model continues. Present only in a search for the smallest model with a requested quality.
     pub prune_steps: Option<PrunedModels<'a>>,
-    /// Counts of the merge stage, if Gaussians were merged.
+    /// Numbers of Gaussians that the merge stage merged, if it ran.
     pub merge: Option<MergeSummary>,
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
@@ -339,7 +355,8 @@ pub struct RunState<'a> {
 }
 
 impl<'a> RunState<'a> {
-    /// Returns the state of a run before its first stage.
+    /// Returns the state of a run before its first stage. `template` is a model without Gaussians that holds the
+    /// settings of all models of the run.
     pub fn new(
         scene: &'a Scene,
         request: &'a Request,
@@ -379,7 +396,7 @@ impl<'a> RunState<'a> {
         self.scored.clone().ok_or_else(|| Error::internal("a stage needs scores before they were computed"))
     }
 
-    /// Returns the ranking of all Gaussians that may stay.
+    /// Returns the ranking of all Gaussians except those that are always dropped.
     ///
     /// # Errors
     /// Fails with an internal error if no earlier stage has computed it.
@@ -387,8 +404,8 @@ impl<'a> RunState<'a> {
         self.ranking.clone().ok_or_else(|| Error::internal("a stage needs the ranking before it was computed"))
     }
 
-    /// Takes the compressed model out of the state so that a stage can change it. Leaves the empty template in its
-    /// place.
+    /// Takes the compressed model out of the state and returns it, so that a stage can change it. Leaves the template,
+    /// a model without Gaussians, in its place.
     pub fn take_result(&mut self) -> CompressedModel {
         std::mem::replace(&mut self.result, self.template.clone())
     }

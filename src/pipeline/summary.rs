@@ -29,18 +29,19 @@ pub struct GoalSummary {
     /// Requested kind of quality: `min_psnr` (PSNR against the original) or `max_loss` (loss of PSNR against
     /// photographs), both in dB.
     pub name: String,
-    /// Requested PSNR or loss, dB.
+    /// Requested value, dB: minimum PSNR against the original, or maximum loss of PSNR against photographs.
     pub asked: f64,
-    /// PSNR or loss of the output on the views that the search used, dB.
+    /// Quality of the output on the views that the search used, dB: PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "number")]
     pub searched: f64,
-    /// PSNR or loss of the output on views that the search did not use, dB.
+    /// Quality of the output on views that the search did not use, dB: PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "number")]
     pub held: f64,
-    /// Names of the views that the search did not use. A view between the cameras of the scene has only the frame in
-    /// its name.
+    /// Names of the views that the search did not use. A name consists of frame and view number; the name of a view
+    /// from a camera between those of the scene has only the frame.
     pub held_pictures: Vec<String>,
-    /// Every number of Gaussians that was tried, with its PSNR or loss on the views that the search used, dB.
+    /// Every number of Gaussians that was tried, with the quality of its model on the views that the search used, dB:
+    /// PSNR or loss of PSNR, as `name` says.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
 }
@@ -54,40 +55,45 @@ pub struct ArchiveSummary {
     pub psnr: f64,
     /// PSNR of renders of the result before quantization, compared with renders of the original on the same views, dB.
     pub level: f64,
-    /// By how much quantization lowers the PSNR against the original, dB.
+    /// Amount by which quantization lowers the PSNR against the original, dB.
     pub loss: f64,
     /// Number of bytes of each part of the archive; `None` for an archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parts: Option<ArchiveSize>,
-    /// Error bound of every attribute by its name, in the unit of the attribute; only for an archive of frames.
+    /// Error bound of every attribute, by name of the attribute and in its unit; `None` unless the archive stores
+    /// frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bounds: Option<BTreeMap<String, f64>>,
-    /// Number of bits of every attribute and tensor, by name; empty for an archive of frames.
+    /// Number of bits that each attribute and each tensor takes in the archive, by name; empty for an archive of
+    /// frames.
     pub bits: BTreeMap<String, f64>,
-    /// Measurements from which the quantization steps were derived. Each entry has the name of an attribute or tensor,
-    /// log2 of its step (of twice the error bound for frames), the squared error of renders caused by this step alone,
-    /// and the number of bits at this step (for frames: in some blocks of Gaussians).
+    /// Measurements from which the quantization steps were derived, one entry for each attribute or tensor:
+    /// - its name;
+    /// - log2 of its quantization step (in an archive of frames: of twice its error bound);
+    /// - squared error of renders if it alone is quantized with this step;
+    /// - number of bits that it takes with this step (in an archive of frames: in some blocks of Gaussians only).
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
 /// Description of the input of a run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
-    /// Path of the input. In files only the last component; on standard output the path as given by the user.
+    /// Path of the input. Summary files hold only its last component; a summary on standard output holds the path as
+    /// given by the user.
     pub path: String,
     /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
-    /// Digest of the bytes that were read.
+    /// Digest of the bytes of the input.
     pub digest: String,
-    /// Number of Gaussians, N.
+    /// Number of Gaussians in the input, N.
     pub gaussians: usize,
-    /// Number of frames, T; `None` for a model whose frames have not been chosen yet.
+    /// Number of frames of the input, T; `None` for a model whose frames have not been chosen yet.
     pub frames: Option<usize>,
     /// SH degree of the input.
     pub sh_degree: usize,
-    /// Names of the attributes that vary in time.
+    /// Names of the attributes of the input that vary in time.
     pub varying: Vec<String>,
-    /// Number of bytes of all files that a renderer opens; for a stream, of the bytes that arrived.
+    /// Number of bytes of all files of the input that a renderer opens; for a stream, number of bytes that arrived.
     pub bytes: u64,
     /// Number of bytes of each part of the input.
     pub size: ModelSize,
@@ -151,7 +157,7 @@ impl CameraSummary {
     }
 }
 
-/// Counts of the merge stage, which replaces clusters of Gaussians by one proxy each.
+/// Summary of the merge stage, which replaces clusters of Gaussians by one Gaussian each, a proxy.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MergeSummary {
     /// Reference frame, at which Gaussians were compared and merged.
@@ -162,15 +168,15 @@ pub struct MergeSummary {
     pub members: usize,
     /// Rule for the opacity of a proxy.
     pub opacity: ProxyOpacity,
-    /// Counts of every merge pass.
+    /// Statistics of every merge pass, in order: numbers of candidate pairs, of joins, and others.
     pub passes: Vec<PassCounts>,
-    /// Largest distance between the path of a proxy and that of its members over the sampled frames, scene units;
-    /// `None` without a deformation field.
+    /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
+    /// and sampled frames, in scene units. `None` if every proxy follows its members exactly.
     pub deviation: Option<f64>,
 }
 
 impl MergeSummary {
-    /// Sets the numbers of proxies and members from the merged clusters `clusters`.
+    /// Sets the numbers of proxies and of merged Gaussians from `clusters`, the merged clusters.
     pub(super) fn count(&mut self, clusters: &[Cluster]) {
         self.proxies = clusters.len();
         self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
@@ -182,7 +188,7 @@ impl MergeSummary {
 pub enum SummaryDetail {
     /// Number of Gaussians, size, quality, time, output and a few notes.
     Most,
-    /// In addition every stage, omitted stages with reasons, and all notes.
+    /// Number of Gaussians, size, quality, time and output, every stage, omitted stages with reasons, and all notes.
     All,
 }
 
@@ -200,7 +206,8 @@ pub struct Summary {
     pub input: InputSummary,
     /// Cameras whose views were used for scoring.
     pub cameras: CameraSummary,
-    /// Path of the output. In files only the last component; on standard output the path as given by the user.
+    /// Path of the output. Summary files hold only its last component; a summary on standard output holds the path as
+    /// given by the user.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Number of Gaussians in the output.
@@ -220,9 +227,9 @@ pub struct Summary {
     pub stages: Vec<StageRecord>,
     /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
-    /// Numbers of Gaussians with unusual values.
+    /// Numbers of Gaussians with unusual values, by kind.
     pub flags: FlagSummary,
-    /// Counts of merging (stage 3 of the paper); `None` if nothing was merged.
+    /// Numbers of Gaussians that were merged (stage 3 of the paper); `None` if nothing was merged.
     pub merge: Option<MergeSummary>,
     /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
@@ -249,7 +256,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Returns the amount read from the input by all stages together, in full reads (every frame once).
+    /// Returns the amount that all stages together read from the input. Unit: full reads (reading every frame once).
     pub fn full_reads(&self) -> f64 {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }

@@ -16,12 +16,12 @@ use crate::progress::format_duration;
 /// Maximum number of notes that are shown unless all details are asked for.
 const NOTES: usize = 2;
 
-/// Minimum width, in characters, of the title of the table (input and output).
+/// Minimum width, in characters, of the title of the table, which names the input and the output.
 const TITLE_WIDTH: usize = 52;
 
 impl Summary {
-    /// Returns the summary as text for people: the table of the result, and with [`SummaryDetail::All`] the stages before it
-    /// and all notes.
+    /// Returns the summary as text for people: the table that compares the result with the original, some notes, and
+    /// commands to run next. With [`SummaryDetail::All`], the stages come before the table, and all notes are included.
     pub fn text(&self, detail: SummaryDetail) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
@@ -35,7 +35,8 @@ impl Summary {
         out
     }
 
-    /// Writes the input, the cameras, the stages and the omitted stages.
+    /// Writes lines about the input, the cameras, each stage (Gaussians, time, reads, memory), and the omitted stages
+    /// to `out`.
     fn write_stages(&self, out: &mut String) -> std::fmt::Result {
         let input = &self.input;
         writeln!(
@@ -81,7 +82,7 @@ impl Summary {
         writeln!(out)
     }
 
-    /// Writes the title and the table, which compares the result with the original.
+    /// Writes the title and the table, which compares the result with the original, to `out`.
     fn write_table(&self, out: &mut String) -> std::fmt::Result {
         let (seconds, peak) = self.taken();
         let memory = peak.map_or(String::new(), |bytes| format!(", {} MiB peak", bytes >> 20));
@@ -197,21 +198,25 @@ impl Summary {
         Ok(())
     }
 
-    /// Returns the wall-clock seconds of all stages that this run computed, and the largest resident memory in bytes.
+    /// Returns the total wall-clock seconds of the stages that this run computed (rather than took from the cache), and
+    /// the largest resident memory of any stage in bytes.
     fn taken(&self) -> (f64, Option<u64>) {
         let seconds = self.stages.iter().filter(|stage| !stage.from_cache).map(|stage| stage.seconds).sum();
         (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
     }
 }
 
-/// Writes a row of the table: name, value before, value after, and a comment.
+/// Writes a row of the table to `out`: the name of a quantity, its value for the original, its value for the result,
+/// and a comment.
 fn row(out: &mut String, name: &str, before: &str, after: &str, comment: &str) -> std::fmt::Result {
     let line = format!("{name:<14}{before:>12}{after:>12}    {comment}");
     writeln!(out, "{}", line.trim_end())
 }
 
-/// Returns the ratio of `before` and `after` as text: "10.0× fewer", with `word` for "fewer", or "2.0× larger" if
-/// `after` is larger. Empty if they are equal or `after` is 0.
+/// Returns the ratio of `before` and `after` as text:
+/// - if `after` is smaller, for example "10.0× fewer", where `word` is "fewer";
+/// - if `after` is larger, for example "2.0× larger";
+/// - if both are equal or `after` is 0, an empty text.
 fn times(before: u64, after: u64, word: &str) -> String {
     match after {
         0 => String::new(),

@@ -25,19 +25,21 @@ use crate::source::{Ids, ReadPlan};
 
 /// Maximum duration of the calibration, as a fraction of the expected duration of the run.
 const MAX_TIME_FRACTION: f64 = 0.04;
-/// Maximum duration of the calibration with all threads busy, seconds.
+/// Maximum duration of the calibration, seconds, if it keeps all threads busy.
 const MAX_SECONDS: f64 = 1.0;
-/// Number of frames that the calibration reads of each block of Gaussians; more if more frames are stored together.
+/// Number of frames that the calibration reads of each block of Gaussians. If the input decodes frames in groups of
+/// more than this number, the calibration reads one whole group.
 const FRAMES_PER_BLOCK: u64 = 16;
-/// Number of views that each thread renders for each of three purposes: contribution, removal error and image.
+/// Number of views that each thread renders for each of three measurements: the time of computing contributions, of
+/// computing removal errors, and of rendering images.
 const VIEWS_PER_THREAD: usize = 2;
 
 /// Minimum expected duration, seconds, of a run that is preceded by a calibration.
 const MIN_RUN_SECONDS: f64 = 2.0;
 
-/// Returns the forecast (expected time and memory) of a run of `stages` with the memory plan `plan`. Statistics that
-/// are `measured` already are not counted. Calibrates first unless the run is short, and stores the measured speed in
-/// `scene`, whose limits must already be those of `plan`.
+/// Returns the forecast (expected time and memory) of a run of `stages` with the memory plan `plan`. `measured` states
+/// which kinds of statistics were already computed; their time is not counted. Calibrates first unless the run is
+/// short, and stores the measured speed in `scene`, whose limits must already be those of `plan`.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -60,18 +62,18 @@ pub(super) fn forecast(
 /// Result of a calibration of time estimates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Calibration {
-    /// Factors by which work takes longer on this machine than estimated, as measured.
+    /// Measured factors by which work takes longer on this machine than is assumed without a calibration.
     pace: Throughput,
     /// Fraction of the Gaussians whose removal hardly changes renders; 0 if no view was rendered.
     hardly_seen: f64,
 }
 
 impl Calibration {
-    /// Result if nothing was measured.
+    /// Result of a calibration that measured nothing.
     const NONE: Calibration = Calibration { pace: Throughput::UNKNOWN, hardly_seen: 0.0 };
 
-    /// Calibrates on `scene` for a run that is expected to take `expected` seconds on all threads. Before a short run
-    /// only states of some Gaussians are read, and no view is rendered.
+    /// Measures the speed of this machine on `scene`, and returns it. The run is expected to take `expected` seconds on
+    /// all threads. Before a short run, only states of some Gaussians are read and no view is rendered.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -105,9 +107,9 @@ impl Calibration {
         Ok(found)
     }
 
-    /// Renders views of one frame, and updates the time factors `pace` and `hardly_seen` (fraction of the Gaussians
-    /// whose removal hardly changes renders). `expected` holds the estimated core-seconds for contribution, removal
-    /// error and images.
+    /// Renders views of one frame. Updates `pace`, the time factors for views, and `hardly_seen`, the fraction of the
+    /// Gaussians whose removal hardly changes renders. `expected` holds the estimated core-seconds for computing
+    /// contributions, computing removal errors, and rendering images. The measured time is added to `spent`.
     fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;
@@ -159,9 +161,9 @@ impl Calibration {
     }
 }
 
-/// Returns which fraction of the Gaussians can be removed, beginning with the smallest removal errors, before the PSNR
-/// of renders falls below [`MAX_USEFUL_PSNR`]. `errors` are in units of [`RemovalError::SUM_UNIT`]; `values` is the number of
-/// color values that were rendered.
+/// Returns the fraction of the Gaussians that can be removed, in the order of increasing removal error, before the PSNR
+/// of renders falls below [`MAX_USEFUL_PSNR`]. `errors` holds the removal error of every Gaussian in units of
+/// [`RemovalError::SUM_UNIT`]; `values` is the number of color values in the renders (3 per pixel).
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
     let most = values * 10f64.powf(-MAX_USEFUL_PSNR / 10.0) / RemovalError::SUM_UNIT;
@@ -175,7 +177,7 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
 
 /// Measures the time of reading frame states. Returns the measured core-seconds divided by the estimated ones, from
 /// 0.05 to 20; 1 if the system does not report processor time. `budget` is the time that the whole calibration may
-/// take, core-seconds.
+/// take, in core-seconds. The measured time is added to `spent`.
 fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
     let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
@@ -205,7 +207,7 @@ fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut Measu
     Ok(took.map_or(1.0, |took| took / expected).clamp(0.05, 20.0))
 }
 
-/// Time that measurements took: seconds summed over all processors, and wall-clock seconds.
+/// Total time of several measurements: seconds summed over all processors, and wall-clock seconds.
 #[derive(Debug, Default)]
 struct MeasuredTime {
     processors: f64,
@@ -213,7 +215,8 @@ struct MeasuredTime {
 }
 
 impl MeasuredTime {
-    /// Runs `work` and returns its processor time in seconds; `None` if the system does not report it.
+    /// Runs `work`, adds its time to the total, and returns its processor time in seconds; `None` if the system does
+    /// not report processor time.
     fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Stopwatch::start();
         work();

@@ -11,18 +11,19 @@ use crate::progress::format_duration;
 const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
 /// Lowest and highest ratio of measured to estimated core-seconds of runs without a calibration.
 const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
-/// Lowest and highest ratio of measured to estimated core-seconds of a search for a quality, in which the number of
-/// refinements is not known in advance.
+/// Lowest and highest ratio of measured to estimated core-seconds of runs whose amount of work depends on intermediate
+/// results. An example is a search for a requested quality: it is not known in advance how often it refines a model.
 const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
-/// Minimum fraction of the processors that stages keep busy; some work is not divided among threads.
+/// Minimum fraction of the processors that the stages of a run keep busy on average. It is below 1 because some work is
+/// not divided among threads.
 const MIN_UTILIZATION: f64 = 0.6;
-/// Duration of starting, opening and writing in every run, seconds.
+/// Time that every run takes to start, to open its input and to write its output, seconds.
 const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
-    /// Returns the forecast of a run. `needs`: estimates of its stages. `least`: estimated core-seconds if all stages
-    /// that may find nothing to do are left out. `searches`: whether the amount of work depends on results of stages.
-    /// `memory_bytes`: maximum memory.
+    /// Returns the forecast of a run with the sizes `work`. `needs`: estimates of its stages. `least`: estimated
+    /// core-seconds without the stages that may turn out to be unnecessary. `searches`: whether the amount of work
+    /// depends on intermediate results. `memory_bytes`: maximum memory.
     pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
@@ -87,7 +88,7 @@ impl Forecast {
     }
 }
 
-/// Returns the estimated core-seconds of all stages together.
+/// Returns the sum of the estimated core-seconds of the stages `needs`.
 pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
     needs.iter().map(|need| need.seconds).sum()
 }

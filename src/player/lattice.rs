@@ -56,15 +56,15 @@ impl PlayerSteps {
     }
 }
 
-/// Returns the range of indices of the attribute `column` among all scalar components of a Gaussian. The attributes are
-/// in the order position, rotation, log scale, opacity, SH.
+/// Returns the range of indices of the attribute `column` among all scalar components of a Gaussian with SH degree
+/// `sh_degree`. The attributes are in the order position, rotation, log scale, opacity, SH.
 pub fn component_range(column: Attributes, sh_degree: usize) -> Range<usize> {
     let width = |column: Attributes| column.width(sh_degree);
     let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
     before..before + width(column)
 }
 
-/// Returns the number of scalar components of all attributes of a Gaussian.
+/// Returns the number of scalar components of all attributes of a Gaussian with SH degree `sh_degree`.
 pub fn component_count(sh_degree: usize) -> usize {
     11 + 3 * sh_coefficients(sh_degree)
 }
@@ -118,8 +118,8 @@ pub fn quantize_into(state: &Gaussians, which: Attributes, steps: &PlayerSteps, 
     unseen
 }
 
-/// Checks that the quantized positions in `points` are close to those of `state`. `points` holds all attributes of
-/// `state`, with SH up to `sh_degree`.
+/// Checks that the quantized positions in `points` are close to the positions of `state`. `points` holds all attributes
+/// of `state` as multiples of the quantization steps `steps`, with SH up to `sh_degree`.
 ///
 /// # Errors
 /// Fails if a visible Gaussian moved further than [`accuracy`](crate::files::accuracy) allows.

@@ -25,7 +25,8 @@ use crate::scene::outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
-/// Maximum number of cameras on the player page. If there are more cameras, an even selection is taken.
+/// Maximum number of cameras on the player page. If there are more cameras, an evenly spaced selection of them is
+/// taken.
 const CAMERAS: usize = 400;
 
 const PAGE: &str = include_str!("page/page.html");
@@ -79,7 +80,8 @@ pub struct PageScene {
     pub extent: f64,
     /// Mean upward direction of the cameras.
     pub up: [f64; 3],
-    /// Directions in which the training cameras see the scene; `None` if nothing is outside them.
+    /// Cone of the directions from which the training cameras see the scene; `None` if there are no training cameras,
+    /// or if they are all around the scene.
     pub rig: Option<PageRig>,
     /// Names of the files of the chunks (encoded groups of frames) to load, in order; empty if the page itself contains
     /// the chunks.
@@ -90,22 +92,24 @@ pub struct PageScene {
     pub poster: Option<String>,
 }
 
-/// Directions in which the training cameras see the scene, by which the page tells where nothing was fitted.
+/// Cone of the directions from which the training cameras see the scene. The page tells the user when the shown view is
+/// from outside this cone, because the model was not fitted to such views.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageRig {
-    /// Point where the optical axes of the cameras meet, in scene units.
+    /// Apex of the cone: the point where the optical axes of the cameras meet, in scene units.
     focus: [f64; 3],
-    /// Inward unit normals of the faces of the cone of directions from this point to the cameras.
+    /// Inward unit normals of the faces of the cone, which contains the directions from its apex to the cameras.
     faces: Vec<[f64; 3]>,
-    /// Sine of the angle from which a direction counts as outside.
+    /// Sine of the angle by which a direction must lie beyond a face of the cone to count as outside the cone.
     tolerance: f64,
 }
 
-/// Maximum number of training cameras whose cone is computed; of more cameras an even selection is taken.
+/// Maximum number of training cameras from which the cone of directions is computed. If there are more cameras, an
+/// evenly spaced selection of them is used.
 const RIG_CAMERAS: usize = 64;
 
-/// Returns the directions in which the training cameras of `rig` see the scene. Returns `None` if there are no such
-/// cameras, or if they are all around the scene.
+/// Returns the cone of the directions from which the training cameras of `rig` see the scene. Returns `None` if there
+/// are no such cameras, or if they are all around the scene.
 pub fn training_rig(rig: &Rig) -> Option<PageRig> {
     let all = training_cameras(rig);
     let step = all.len().div_ceil(RIG_CAMERAS).max(1);
@@ -130,7 +134,8 @@ pub struct PageCamera {
     eye: [f64; 3],
 }
 
-/// Returns the cameras of `rig`, one for each pair of view number and camera, at most 400.
+/// Returns a description, for the page, of each camera that takes a view of `rig`. A camera with several view numbers
+/// gets one entry per view number. Of more than 400 entries, returns an evenly spaced selection of at most 400.
 pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();
@@ -185,8 +190,8 @@ impl ChunkFiles {
         Ok(ChunkFiles { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
-    /// Adds the chunk `bytes`, which is chunk number `chunk` of model number `model`. `since` is the index of its first
-    /// frame as a fraction of the frames shown.
+    /// Adds the chunk `bytes`, which is chunk number `chunk` of model number `model`. `since` is the position in time
+    /// of its first frame: the index of the frame divided by the number of frames shown.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -208,8 +213,9 @@ impl ChunkFiles {
         self.folder.path().join(name(model, chunk))
     }
 
-    /// Returns the numbers (model, chunk) of all chunks in the order in which the page loads them. The order follows
-    /// their first frames, so that the first frames of both models load first.
+    /// Returns the pairs (model, chunk number) of all chunks in the order in which the page loads them. Chunks are
+    /// sorted by the position in time of their first frames, so that the chunks with the first frames of both models
+    /// load first.
     fn ordered(&self) -> Vec<(usize, usize)> {
         let mut made = self.made.clone();
         made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
@@ -235,8 +241,8 @@ impl ChunkFiles {
         Ok(fs::metadata(path).map_err(failed())?.len())
     }
 
-    /// Writes the page and, as separate files, its chunks into `folder`. Sets the file names in `stage`, the
-    /// description of the scene. Returns the names of all written files, and their total size in bytes.
+    /// Writes the page into `folder`, and its chunks as separate files beside it. Stores the names of the chunk files
+    /// in `stage`, the description of the scene. Returns the names of all written files, and their total size in bytes.
     ///
     /// # Errors
     /// Fails if a file cannot be read or written.
@@ -259,8 +265,9 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the HTML of the page before its chunks (scripts with encoded frames). `chunks` has the digests of the
-/// chunks, which the content security policy allows besides the scripts of the page itself.
+/// Returns the start of the HTML of the page for the scene `stage`, up to the place where the chunks (scripts with
+/// encoded frames) begin. `chunks` lists the scripts that the content security policy of the page allows besides its
+/// own: the digests of the chunks, or the keyword `'strict-dynamic'`.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
@@ -282,7 +289,8 @@ fn head(stage: &PageScene, chunks: &[String]) -> String {
     page.replace("<!--policy-->", &policy) + "<script>" + &begin + "</script>\n"
 }
 
-/// Returns the text in `page` between the first occurrence of `start` and the next occurrence of `end`.
+/// Returns the text in `page` between the first occurrence of `start` and the next occurrence of `end`. Returns an
+/// empty text if `start` does not occur, and the rest of `page` if `end` does not occur after it.
 fn between<'a>(page: &'a str, start: &str, end: &str) -> &'a str {
     let rest = page.split_once(start).map_or("", |(_, rest)| rest);
     rest.split_once(end).map_or(rest, |(content, _)| content)

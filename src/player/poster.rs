@@ -19,8 +19,9 @@ const MAX_PIXELS: f64 = 160_000.0;
 /// JPEG quality of a poster, from 1 to 100.
 const QUALITY: u8 = 80;
 
-/// Renders `source` by the first camera of `rig`, at the camera's time if it has one, else at the first frame. Returns
-/// a JPEG as a data URI; `None` without cameras or frames.
+/// Renders the first view of `rig` over the color `background`, and returns the image as a JPEG in a data URI. The
+/// frame of `source` is the one nearest to the time of the view, or the first frame if the view has no time. Returns
+/// `None` if there are no views or no frames.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

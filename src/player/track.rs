@@ -1,16 +1,20 @@
 //! Encoding of a sequence for the page: a first state, then groups of frames as differences in time.
 //!
-//! Input: a source of frames. Output: chunks of bytes, in order. Each chunk is a zlib stream (RFC 1950) and is decoded
-//! with the first chunk only. Memory: one state, and the grid points of a group's frames, at most [`GROUP_VALUES`] or
-//! those of one frame.
+//! Input: a source of frames. Output: chunks of bytes, in order. Memory: one state, and the quantized values of the
+//! frames of one group, which are at most [`GROUP_VALUES`] unless the group has only one frame.
 //!
-//! A chunk holds, for each of its scalar components (such as the x of the position), a byte of flags and then planes of
-//! bytes. Chunk 0 has every component at the first frame; the other chunks have the components of varying attributes at
-//! consecutive frames. Flags: bits 0 to 2, number of planes; bit 3, second-order differences; bit 4, some value takes
-//! more than 16 bits. Planes hold byte 0, 1, … of every difference d, coded as 2d or −2d − 1, Gaussian by Gaussian, and
-//! frame by frame for one Gaussian. The first difference of a Gaussian in a group is relative to the first frame of the
-//! sequence (in chunk 0 to 0), the second to the frame before. Later differences are relative to the frame before; with
-//! bit 3 the last step is extrapolated. No planes: all differences are 0.
+//! Chunk 0 holds the first frame with every scalar component (such as the x of the position). Each later chunk holds
+//! one group of consecutive frames, with the components of varying attributes. To decode a chunk, only this chunk and
+//! chunk 0 are needed.
+//!
+//! A chunk is a zlib stream (RFC 1950). For each of its components it holds a byte of flags, then planes of bytes:
+//! - Flags: bits 0 to 2 are the number of planes, bit 3 says that differences are of second order, bit 4 says that some
+//!   value takes more than 16 bits.
+//! - Plane k holds byte k of every difference. A difference d is coded as 2d, or as −2d − 1 if it is negative. The
+//!   order is Gaussian by Gaussian, and frame by frame for one Gaussian. If there are no planes, all differences are 0.
+//! - The first difference of a Gaussian in a chunk is relative to the first frame of the sequence (in chunk 0: to 0),
+//!   and the second is relative to the frame before. Later differences are relative to the frame before, or, if they
+//!   are of second order, to the value that a repetition of the last change between two frames would give.
 
 use std::io::Write;
 
@@ -54,8 +58,8 @@ pub struct PageSequence {
     pub varying: Vec<[usize; 2]>,
     /// Index of the first frame of each group, followed by the total number of frames.
     pub groups: Vec<usize>,
-    /// Largest number of Gaussians in a frame that the page does not show, because a value is not finite or a position
-    /// is too far away for the quantization grid.
+    /// Largest number of Gaussians that are invisible in one frame of the page, because a value is not finite or a
+    /// position is too far away for the quantization grid.
     #[serde(skip)]
     pub unseen: usize,
 }
@@ -99,8 +103,8 @@ fn changing(varying: Attributes) -> Attributes {
 }
 
 /// Encodes the frames `frames` of `source`, for which `track` was planned. Passes each chunk with its index to `sink`,
-/// in order. Counts invisible Gaussians in `track`. Some sources decode several frames together; at most `held` decoded
-/// frames are then kept in memory.
+/// in order. Stores the largest number of invisible Gaussians in `track.unseen`. Some sources decode several frames
+/// together; at most `held` decoded frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if a position cannot be stored accurately, or if `sink` fails.
@@ -159,9 +163,9 @@ pub fn encode(
     Ok(())
 }
 
-/// Encodes scalar components (such as x of the position) as a compressed chunk. Each component has the values of all
-/// Gaussians at the first frame of the sequence, and their values at every frame of the chunk; all values are
-/// quantized.
+/// Encodes scalar components (such as the x of the position) as a compressed chunk. An item of `components` is one
+/// component: the values of all Gaussians at the first frame of the sequence, and their values at every frame of the
+/// chunk; all values are quantized.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
@@ -191,8 +195,9 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
 }
 
 /// Returns the differences between successive frames, Gaussian by Gaussian, each with its sign in the lowest bit. The
-/// first difference of a Gaussian is relative to `start`. If `is_second`, differences after the second are of second
-/// order: relative to the value that the last step extrapolates.
+/// first difference of a Gaussian is relative to `start`, the others to the frame before. If `is_second`, the third and
+/// later differences are relative to an extrapolated value instead: the frame before, plus its change since the frame
+/// before that.
 fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
     let mut values = Vec::with_capacity(start.len() * frames.len());
     for (i, &first) in start.iter().enumerate() {

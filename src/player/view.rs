@@ -25,7 +25,8 @@ const NAME: &str = "view";
 /// Options of the command `view`, which writes a page that plays one or two models.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
-    /// Model to play, or the original of a compressed model. The split that these options request is ignored.
+    /// Model to play, or the original of a compressed model. [`InputOptions::split`] is ignored: the views of all
+    /// splits are used.
     pub original: InputOptions,
     /// Path of the compressed model to show beside the original, in any format.
     pub compressed: Option<PathBuf>,
@@ -61,7 +62,7 @@ pub struct ViewReport {
     pub notes: Vec<String>,
 }
 
-/// Checks, before any work, that the output may be written.
+/// Checks, before any work, that the output of `options` may be written.
 ///
 /// # Errors
 /// Fails as [`check_target`] does, for example if the output exists and may not be replaced.
@@ -170,7 +171,7 @@ struct ModelView<'a> {
 }
 
 /// Encodes the frames of `model` as model number `place` of the page and adds its chunks to `chunks`. Returns the
-/// description of the model.
+/// description of the model. `asked` holds the settings for this model, and `steps` the quantization steps.
 fn show(
     model: &dyn InputModel,
     place: usize,

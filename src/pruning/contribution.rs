@@ -1,8 +1,9 @@
 //! Visible contribution: how much every Gaussian adds to the views by which Gaussians are scored, occlusion included.
 //!
-//! Input: a source, its cameras frame by frame, and the views to render. Output: the contribution C `visible` (mean Σ
-//! alpha · transmittance) and its largest value W in one pixel (method.md, section 1). The results are sums of integers
-//! and maxima, so the order of views, threads and batches does not change a bit.
+//! Input: a source of frames, the cameras, and the views to render. Output, for every Gaussian: the contribution C
+//! `visible` (Σ alpha · transmittance over the pixels of a view, averaged over the views) and the peak W (largest alpha
+//! · transmittance in one pixel); see method.md, section 1. The results are sums of integers and maxima, so the order
+//! of views, threads and batches does not change a bit.
 
 use std::num::NonZeroU32;
 
@@ -19,19 +20,19 @@ use crate::source::{FrameSource, Ids};
 /// Attributes that the contribution depends on: all except color.
 const GEOMETRY: Attributes = Attributes::all().difference(Attributes::SH);
 
-/// Contributions of all N Gaussians to the views by which they are scored.
+/// Contributions of all N Gaussians to the views by which Gaussians are scored.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VisibleContribution {
-    /// `[N]`, contribution C: Σ alpha · transmittance over the pixels of a view, averaged over views, in pixels. A
-    /// sampled pixel stands for stride² pixels.
+    /// `[N]`, contribution C in pixels: Σ alpha · transmittance over the pixels of a view, averaged over the views. If
+    /// only a grid of pixels is rendered, each pixel counts for the stride² pixels that it stands for.
     pub coverage: Vec<f64>,
-    /// `[N]`, peak W: maximum alpha · transmittance in any sampled pixel of any view, in [0, 0.99].
+    /// `[N]`, peak W: maximum alpha · transmittance in any rendered pixel of any view, in [0, 0.99].
     pub peak: Vec<f64>,
 }
 
 impl VisibleContribution {
-    /// Converts `found`, the sums and maxima over `pictures` views, to contributions C and peaks W. Only every
-    /// `pixel_stride`-th pixel in each direction was sampled.
+    /// Converts the sums and maxima in `found` to contributions C and peaks W. `pictures`: number of views that were
+    /// rendered; only every `pixel_stride`-th column and row of their pixels was rendered.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();
@@ -39,15 +40,15 @@ impl VisibleContribution {
     }
 }
 
-/// Renders the views `pictures` and sums the contribution of every Gaussian to every `pixel_stride`-th pixel in each
-/// direction. [`VisibleContribution::new`] converts the result to C (mean contribution per view) and W (largest weight in a
-/// pixel).
+/// Renders the views `pictures` and returns the contribution of every Gaussian, summed over the views. Only every
+/// `pixel_stride`-th column and row of pixels is rendered. [`VisibleContribution::new`] converts the result to C (mean
+/// contribution per view) and W (largest weight in a pixel).
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing in this frame, and a view without pixels adds nothing.
-/// Without views all results are zero.
+/// Without views all results are zero. Fails if a frame cannot be read.
 ///
-/// Memory per Gaussian: that of the reader of the frames, and that of [`RunningContribution`]. Nothing grows with the number of frames or
-/// views.
+/// Memory per Gaussian: that of the reader of the frames, and that of [`RunningContribution`]. Memory does not grow
+/// with the number of frames or views.
 pub fn visible_contribution(
     source: &dyn FrameSource,
     (cameras, pictures): (&[Camera], &[FrameView]),
@@ -61,11 +62,12 @@ pub fn visible_contribution(
     Ok(running.sum())
 }
 
-/// Sums of the contributions to all views rendered so far.
+/// Running sums of the contributions of every Gaussian to all views rendered so far.
 ///
-/// Memory per Gaussian: 44 bytes for its state in each frame of a batch (of 4 × threads views, within `limits`), and 44
-/// for the state of a block; for each view rendered at the same time 12 bytes of sums and the view's buffers
-/// ([`crate::render`]).
+/// Memory per Gaussian:
+/// - 44 bytes for its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - 44 bytes for its state while its block of Gaussians is read;
+/// - for each view rendered at the same time, 12 bytes of sums and the buffers of the view ([`crate::render`]).
 pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
@@ -74,14 +76,15 @@ pub struct RunningContribution {
 }
 
 impl RunningContribution {
-    /// Creates sums of 0 for `count` Gaussians, of which every `pixel_stride`-th pixel in each direction will be
-    /// sampled.
+    /// Creates sums of 0 for `count` Gaussians. Only every `pixel_stride`-th column and row of pixels of the views will
+    /// be rendered.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
         RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Renders the views `pictures` of `source`, in the order of frames, and adds their contributions. Calls `advance`
-    /// after each view. All sources added must have the same Gaussians.
+    /// Renders the views `pictures` of `source`, in the order of frames, and adds the contributions of its Gaussians to
+    /// the sums. Every call must pass a source of the same Gaussians. Calls `advance` after each view. Fails if a frame
+    /// cannot be read.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
@@ -103,7 +106,7 @@ impl RunningContribution {
         )
     }
 
-    /// Returns the contributions C and the peaks W over all views added.
+    /// Returns the contributions C and the peaks W over all views added so far.
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
         VisibleContribution::new(&self.sum(), pictures, pixel_stride)
@@ -218,7 +221,7 @@ mod tests {
         assert_eq!(taken(100, 100), [(1, 0)]);
     }
 
-    /// Source in which all frames are the same.
+    /// Source of frames that all show the same Gaussians.
     struct Static(Gaussians, SequenceInfo);
 
     impl FrameSource for Static {

@@ -1,4 +1,4 @@
-//! Sampling and pruning (method.md, section 4): selects the Gaussians that stay, by their scores.
+//! Selection of the Gaussians that stay, by their scores ("sampling and pruning" in method.md, section 4).
 //!
 //! Input: scores. Output: for every Gaussian whether it stays, and a ranking of all Gaussians in which those that stay
 //! come first, so that any other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and
@@ -19,7 +19,7 @@ use crate::error::{Error, Result};
 use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
-/// Ids of Gaussians that the user keeps or drops whatever their scores, in any order.
+/// Ids, in any order, of Gaussians that are kept or dropped because the user says so, whatever their scores.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Overrides {
     /// Ids of Gaussians that are always kept.
@@ -28,57 +28,58 @@ pub struct Overrides {
     pub drop_ids: Vec<u32>,
 }
 
-/// Result of stage 1 (best fraction by score) and stage 2 (thresholds of the static and dynamic score).
+/// Result of the selection, which has two stages: stage 1 takes the best fraction of the Gaussians by score, stage 2
+/// applies thresholds to the static and the dynamic score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// For each Gaussian, whether it stays.
+    /// For each Gaussian, whether it is kept.
     pub keep: Vec<bool>,
     /// Ranking of the Gaussians that the user does not drop, best first. Its first `counts.kept` Gaussians are those
     /// that stay.
     pub ranking: Ranking,
-    /// Numbers of Gaussians kept and pruned by each stage.
+    /// Numbers of Gaussians that each stage of the selection keeps and prunes.
     pub counts: SelectionCounts,
 }
 
-/// Numbers of Gaussians at each stage of selection. Without the user's overrides, total = candidates + outside, and
-/// kept = candidates − pruned by stage 2 + rescued. "Outside" are the Gaussians that stage 1 does not make candidates.
+/// Numbers of Gaussians at each stage of the selection. `total` = `candidates` + `rescued` + `pruned_by_stage_1`, and
+/// `kept` = `candidates` − `pruned_by_stage_2` + `rescued` + `forced_keep` − `forced_drop`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SelectionCounts {
     /// Number N of all Gaussians.
     pub total: usize,
-    /// Number of candidates: the top fraction by score S, which stage 1 takes.
+    /// Number of candidates: the best fraction of the Gaussians by score S, which stage 1 takes.
     pub candidates: usize,
-    /// Number of Gaussians outside the candidates that stage 2 keeps nevertheless; 0 under [`LowScorePolicy::Drop`].
+    /// Number of Gaussians that stage 1 does not make candidates but stage 2 keeps; 0 under [`LowScorePolicy::Drop`].
     pub rescued: usize,
-    /// Number of Gaussians outside the candidates that are pruned.
+    /// Number of Gaussians that stage 1 does not make candidates and that are pruned.
     pub pruned_by_stage_1: usize,
     /// Number of candidates that are pruned because they reach neither threshold of stage 2.
     pub pruned_by_stage_2: usize,
-    /// Number of Gaussians that are kept only because the user keeps them.
+    /// Number of Gaussians that the stages prune but the user keeps.
     pub forced_keep: usize,
-    /// Number of Gaussians that are dropped only because the user drops them.
+    /// Number of Gaussians that the stages keep but the user drops.
     pub forced_drop: usize,
-    /// Number of Gaussians that stay in the end.
+    /// Number of Gaussians that stay in the end, with the user's overrides applied.
     pub kept: usize,
 }
 
-/// Bytes of memory per Gaussian for a selection and one further ranking.
+/// Bytes of memory per Gaussian for the result of a selection and a copy of its ranking.
 pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
-/// Bytes of memory per Gaussian that are needed only while selecting: the results of stage 2, overrides, positions in two orders, the order
-/// being sorted, and the sort keys.
+/// Bytes of memory per Gaussian that are needed only while selecting: the result of stage 2, the user's decision, the
+/// positions in two orders, the order being sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
 
-/// Applies stages 1 and 2 to N scored Gaussians, then the user's overrides.
+/// Applies stages 1 and 2 to N scored Gaussians, then the user's overrides, and returns which Gaussians stay.
 ///
-/// Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; ties by hashed
-/// id). Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D, where norm is the normalized score
-/// and τ a threshold of the recipe. It applies to the candidates, or under [`LowScorePolicy::Rescue`] to all Gaussians. If
-/// both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
-/// them, and stage 2 prunes none.
+/// Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; of equal
+/// scores, the Gaussian with the smaller hash of its id comes first). Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S
+/// or norm(S_dynamic) ≥ τ_D, where norm is the normalized score and τ a threshold of the recipe. It is applied to the
+/// candidates, or under [`LowScorePolicy::Rescue`] to all Gaussians. If both norms are 0 for all Gaussians, as for a
+/// single Gaussian or for copies of one, the scores cannot distinguish them, and stage 2 prunes none.
 ///
 /// # Errors
-/// Returns [`Error::Usage`] for an id beyond N, and for an id that is to be both kept and dropped.
+/// Returns [`Error::Usage`] for an id that is N or larger, and for an id that is to be both kept and dropped.
 pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> Result<Selection> {
     let n = scores.score.len();
     let forced = user_decisions(n, overrides)?;
@@ -120,7 +121,8 @@ pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> 
     Ok(Selection { keep, ranking: ordered.ranking(&forced), counts })
 }
 
-/// Returns for each Gaussian whether its static or its dynamic score reaches the threshold of stage 2.
+/// Returns for each Gaussian whether it passes stage 2: its normalized static or dynamic score reaches the threshold.
+/// All pass if all these scores are 0.
 fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let Scores { static_norm, dynamic_norm, .. } = scores;
     let norms = || static_norm.iter().zip(dynamic_norm);
@@ -132,7 +134,8 @@ fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
         .collect()
 }
 
-/// Returns the user's decision for each of the `n` Gaussians: keep (`true`), drop (`false`) or none (`None`).
+/// Returns the user's decision for each of the `n` Gaussians: keep (`true`), drop (`false`) or none (`None`). Fails for
+/// an id that is `n` or larger, and for an id that is to be both kept and dropped.
 fn user_decisions(n: usize, overrides: &Overrides) -> Result<Vec<Option<bool>>> {
     let mut decisions = vec![None; n];
     for (ids, keep) in [(&overrides.keep_ids, true), (&overrides.drop_ids, false)] {

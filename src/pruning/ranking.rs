@@ -1,5 +1,6 @@
-//! A ranking of all Gaussians in which the selected ones come first. Any target count is met exactly by taking the
-//! first Gaussians of the ranking. This equals the two stages of selection with both of their limits moved together.
+//! Ranking of all Gaussians in which the selected ones come first. For any target count n, the first n Gaussians of the
+//! ranking are kept. They are the same as if both stages of the selection (number of candidates in stage 1, thresholds
+//! in stage 2) were made stricter or looser together until n Gaussians passed.
 
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
@@ -8,7 +9,7 @@ use crate::model::hash_id;
 use crate::recipe::{LowScorePolicy, SelectParams};
 use crate::statistics::score::Scores;
 
-/// Ids of the Gaussians in the order in which they are kept, best first.
+/// Ids of Gaussians in the order in which they are kept, best first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ranking {
     order: Vec<u32>,
@@ -25,7 +26,7 @@ impl Ranking {
         &self.order
     }
 
-    /// Returns the first `m` ids of the ranking, or all if there are fewer, sorted by id.
+    /// Returns the first `m` ids of the ranking, or all ids if there are fewer, in increasing order.
     pub fn best_ids(&self, m: usize) -> Vec<u32> {
         let mut ids = self.order[..m.min(self.order.len())].to_vec();
         ids.sort_unstable();
@@ -33,22 +34,25 @@ impl Ranking {
     }
 }
 
-/// The two orders that determine a ranking. Each gives for every Gaussian its position, from 0.
+/// Two orders of all Gaussians, from which [`Orders::ranking`] makes a ranking. An order is stored as the rank of every
+/// Gaussian, by id; rank 0 is the best.
 pub(super) struct Orders {
-    /// Position of every Gaussian by descending score S, ties by hashed id.
+    /// Rank of every Gaussian by descending score S; 0 is the best. Of equal scores, the Gaussian with the smaller hash
+    /// of its id comes first.
     pub(super) by_score: Vec<u32>,
-    /// Position of every Gaussian by the descending maximum of norm(S_static)/τ_S and norm(S_dynamic)/τ_D (normalized
-    /// scores divided by the thresholds of stage 2), ties by score S.
+    /// Rank of every Gaussian by the criterion of stage 2, descending; 0 is the best. The criterion is the larger of
+    /// norm(S_static)/τ_S and norm(S_dynamic)/τ_D: the normalized static and dynamic scores, divided by their
+    /// thresholds. Ties are broken by score S.
     by_rule: Vec<u32>,
-    /// Number of first Gaussians in `by_score` that stage 1 keeps; `None` under [`LowScorePolicy::Rescue`], where stage 1
-    /// excludes none.
+    /// Number of Gaussians that stage 1 keeps: those with the best ranks in `by_score`. `None` under
+    /// [`LowScorePolicy::Rescue`], where stage 1 excludes none.
     stage_1: Option<usize>,
-    /// Number of Gaussians that pass stage 2, the thresholds of the static and dynamic score.
+    /// Number of Gaussians that pass stage 2, whose thresholds are applied to the static and the dynamic score.
     stage_2: usize,
 }
 
-/// Ranks all Gaussians in both orders. `candidates`: number of Gaussians that stage 1 keeps. `passes`: whether each
-/// Gaussian passes stage 2.
+/// Sorts all Gaussians in the two orders of [`Orders`]. `candidates`: number of Gaussians that stage 1 keeps. `passes`:
+/// for each Gaussian, whether it passes stage 2.
 pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();
@@ -79,12 +83,16 @@ pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, 
 }
 
 impl Orders {
-    /// Returns the ranking. Its key is, for each order, the position of a Gaussian divided by the number of Gaussians
-    /// that the stage keeps; the larger quotient counts. Gaussians that the user keeps (`forced`) come first; those
-    /// that the user drops are left out.
+    /// Returns the ranking of all Gaussians except those that the user drops. `forced`: the user's decision for each
+    /// Gaussian. Gaussians that the user keeps come first, then the others; both groups are sorted by increasing key.
     ///
-    /// The key is at most 1 exactly for the Gaussians that the recipe keeps. Ties are possible, because keys combine
-    /// positions in two orders; they are broken by score S.
+    /// The key of a Gaussian is the larger of two quotients:
+    /// - its rank by score S, from 1, divided by the number of Gaussians that stage 1 keeps (left out under
+    ///   [`LowScorePolicy::Rescue`]);
+    /// - its rank by the criterion of stage 2, from 1, divided by the number of Gaussians that pass stage 2.
+    ///
+    /// The key is at most 1 exactly for the Gaussians that the recipe keeps. Equal keys are possible, because the ranks
+    /// come from two orders; Gaussians with equal keys are sorted by score S.
     pub(super) fn ranking(&self, forced: &[Option<bool>]) -> Ranking {
         let key = |i: usize| {
             let stage_2_ratio = rank_over(self.by_rule[i], self.stage_2);
@@ -103,14 +111,16 @@ impl Orders {
     }
 }
 
-/// Returns the position `place`, counted from 1, divided by `kept`, the number of Gaussians that the stage keeps. If
-/// the stage keeps none, divides by one half: every quotient then exceeds 1, and the order is unchanged.
+/// Returns (`place` + 1) / `kept`: the rank of a Gaussian, counted from 1, divided by the number of Gaussians that a
+/// stage keeps. `place` is the rank counted from 0. If the stage keeps none, divides by one half: every quotient then
+/// exceeds 1, and the order is unchanged.
 fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// Returns `x`/`tau`, which is at least 1 exactly if x ≥ τ. With τ ≤ 0 the ratio is undefined: then it is infinite for
-/// all values that reach τ, so that these tie.
+/// Returns `x`/`tau` if `tau` > 0; the quotient is at least 1 exactly if `x` reaches the threshold `tau`. With `tau` ≤
+/// 0 the quotient would not show this. Then returns infinity if `x` ≥ `tau`, so that all values that reach the
+/// threshold tie, and −infinity otherwise.
 fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {
         x / tau
@@ -121,7 +131,7 @@ fn ratio(x: f64, tau: f64) -> f64 {
     }
 }
 
-/// Returns for each id its position in `order`, from 0.
+/// Returns for every id its index in `order`, which contains each id once.
 fn positions(order: &[u32]) -> Vec<u32> {
     let mut positions = vec![0; order.len()];
     for (place, &id) in order.iter().enumerate() {

@@ -1,5 +1,5 @@
-//! Removal error: the squared error of the scored views that removing one Gaussian would cause, for each Gaussian of a
-//! subset of the input.
+//! Removal error of each Gaussian of a subset of the input: the squared error that removing this Gaussian alone would
+//! cause in the views by which Gaussians are scored.
 
 use std::num::NonZeroU32;
 
@@ -11,24 +11,28 @@ use crate::passes::pixel_stride;
 use crate::render::{PixelGrid, RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. Other views change
-/// the ranking more than other pixels do.
+/// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. More pixels change
+/// the ranking less than a different choice of views does.
 const PIXELS_PER_GAUSSIAN: f64 = 1.0;
 
-/// Returns the stride of the pixels of the views by which `count` Gaussians are ranked. `pixels`: number of pixels of a
-/// view.
+/// Returns the stride n for the renders by which `count` Gaussians are ranked: only every n-th column and row of pixels
+/// is rendered. `pixels`: number of pixels of a view.
 pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
     pixel_stride(pixels, PIXELS_PER_GAUSSIAN * count as f64)
 }
 
-/// Renders the Gaussians `ids` alone and returns for each of them the [`RemovalError`], the squared error that removing
-/// it would cause, summed over every `stride`-th pixel in each direction of the views `pictures`. The thread count does
-/// not change a bit.
+/// Renders only the Gaussians `ids` and returns for each of them the [`RemovalError`], the squared error that removing
+/// it would cause, summed over the views `pictures`. Only every `stride`-th column and row of pixels is rendered. For
+/// `contrast_floor` see [`RemovalError::contrast_floor`]. Calls `advance` after each view. The result does not depend
+/// on the number of threads. Fails if a frame cannot be read.
 ///
-/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes, where d is the SH degree, for its state in each
-/// frame of a batch (frames with 4 × threads views between them, within `limits`) and once more for the state of a
-/// block; for each view rendered at the same time 8 bytes of sums and the view's buffers. Nothing grows with the number
-/// of frames or views.
+/// Memory per Gaussian of `ids`, where d is the SH degree and a state has 44 + 12·(d + 1)² bytes:
+/// - its reader;
+/// - its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - its state while its block of Gaussians is read;
+/// - for each view rendered at the same time, 8 bytes of sums and the buffers of the view.
+///
+/// Memory does not grow with the number of frames or views.
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],

@@ -26,15 +26,15 @@ use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
 use crate::statistics::{fill_anisotropy, snap_noise_to_zero, ulp};
 
-/// Name of the stage in messages and in the cache.
+/// Name of this stage in messages and in the cache.
 pub(crate) const NAME: &str = "score";
 
-/// Bytes of memory per Gaussian while scoring, for its statistics, its scores and the selection.
+/// Bytes of memory per Gaussian, while scoring, for its statistics, its scores and the selection of Gaussians to keep.
 pub const SCORING_BYTES_PER_GAUSSIAN: u64 =
     (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
-/// Returns the bytes of memory per Gaussian that stay in use after scoring: those of the selection, and of the
-/// statistics unless these are in a scratch file.
+/// Returns the named parts of the memory per Gaussian, in bytes, that stay in use after scoring: the selection of
+/// Gaussians to keep, and the statistics unless these are in a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.statistics_on_disk { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
@@ -45,34 +45,36 @@ pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
 pub struct ScoreStage {
     /// Whether motion that could be rounding noise of the positions is set to zero.
     pub snap_noise: bool,
-    /// Policy for Gaussians with NaN or infinity in an attribute: stop, drop or keep unchanged.
+    /// Policy for Gaussians with NaN or infinity in an attribute: stop with an error, drop them, or keep them
+    /// unchanged.
     pub non_finite: NonFinite,
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
-    /// Parameters of the selection: fraction kept by score, thresholds of the static and dynamic score.
+    /// Parameters of the selection: fraction kept by score, and thresholds of the static and the dynamic score.
     pub select: recipe::SelectParams,
-    /// Gaussians that the user keeps or drops whatever their scores.
+    /// Gaussians that are kept or dropped because the user says so, whatever their scores.
     pub user: UserOverrides,
 }
 
-/// Ratio of the number of frames to the median life span (frames in which a Gaussian is visible by opacity) from which
-/// life spans are short. The user is then told that linking frames may help.
+/// Minimum ratio of the number of frames to the median life span (number of frames in which a Gaussian is alive, by its
+/// opacity) at which life spans count as short. The user is then told about linking, which joins Gaussians that
+/// continue one another in later frames.
 const SHORT_LIFE: usize = 4;
 
 /// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
-    /// Statistics of every Gaussian. Motion within rounding noise is 0 if the recipe says so.
+    /// Statistics of every Gaussian. If the recipe says so, motion within rounding noise has been set to 0.
     statistics: StatisticsRows,
     /// Number of frames of the scene.
     frames: usize,
-    /// Number of frames that must be rendered so that Gaussians with short life spans are seen too; see
+    /// Number of evenly spaced frames that must be rendered so that Gaussians with short life spans are seen too; see
     /// [`frames_to_cover`].
     #[serde(rename = "frames_to_see")]
     pub frames_to_cover: usize,
-    /// Normalization of every term of the scores: percentiles and weight.
+    /// Terms of the scores: the quantities that are added, each with the percentiles by which it is normalized.
     pub terms: Vec<Term>,
-    /// Numbers of Gaussians with unusual values, such as NaN.
+    /// Number of Gaussians with unusual values, for each kind of unusual value (such as NaN).
     pub flags: FlagSummary,
     /// Selected Gaussians and ranking, with the user's overrides applied.
     pub selection: Selection,
@@ -81,23 +83,23 @@ pub struct Scored {
     /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
     /// Gaussians.
     pub absent: Vec<u32>,
-    /// Reference frame (in which most Gaussians are alive and at which they are compared with one another), and scene
-    /// extent.
+    /// Reference frame (the frame in which most Gaussians are alive, at which Gaussians are compared for merging), and
+    /// the extent of the scene at this frame.
     pub reference: ReferenceFrame,
     /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
     /// coordinate.
     pub position_ulp: f64,
 }
 
-/// Gaussians that the user keeps or drops, given by ids and by a box.
+/// Gaussians that are kept or dropped because the user says so. They are given by ids and by a box.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct UserOverrides {
-    /// Ids of Gaussians to keep, unchanged.
+    /// Ids of Gaussians to keep. These Gaussians are not changed.
     pub keep: Vec<u32>,
     /// Ids of Gaussians to drop.
     pub drop: Vec<u32>,
-    /// Box in scene units, given as low corner, then high corner. Gaussians that are inside it at the reference frame
-    /// are kept.
+    /// Box in scene units: low corner (x, y, z), then high corner. Gaussians whose centers are inside it at the
+    /// reference frame are kept.
     pub keep_box: Option<[f64; 6]>,
 }
 
@@ -118,14 +120,14 @@ impl ScoreStage {
         }
     }
 
-    /// Returns the increasing ids of the Gaussians that are dropped because a value is not finite; none if the recipe
-    /// does not drop them.
+    /// Returns the ids, in increasing order, of the Gaussians that are dropped because one of their values is not
+    /// finite. There are none if the recipe does not drop such Gaussians.
     pub fn absent_ids(&self, rows: &Rows) -> Vec<u32> {
         if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
-    /// Computes scores and a selection from the statistics `scanned` and, if measured, the visible contributions
-    /// `seen`.
+    /// Computes scores and a selection of the Gaussians to keep, from the statistics `scanned` and, if measured, the
+    /// visible contributions `seen`. Notes for the user are added to `journal`.
     ///
     /// # Errors
     /// Fails if values are not finite (unless the recipe drops or keeps such Gaussians), if no Gaussian is in any view
@@ -232,7 +234,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
-/// Counts the Gaussians with unusual values.
+/// Counts the Gaussians with unusual values, such as NaN, for each kind of unusual value.
 fn flags(rows: &Rows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
@@ -245,7 +247,7 @@ fn flags(rows: &Rows) -> FlagSummary {
     }
 }
 
-/// Fails if no Gaussian is in any view. This happens if the cameras belong to another scene.
+/// Fails if Gaussians are alive but none is in any view. This happens if the cameras belong to another scene.
 fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
     let seen = rows.vis.iter().filter(|&&vis| vis > 0.0).count();
@@ -262,7 +264,8 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
-    /// Returns the same result, with its statistics moved to a scratch file in `folder` if `limits` requires this.
+    /// Returns this result, with its statistics moved from memory to a scratch file in `folder` if `limits` requires
+    /// this.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -286,7 +289,7 @@ impl Scored {
         (0..self.gaussian_count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
     }
 
-    /// Returns the statistics of every Gaussian, read back from the scratch file if they are there.
+    /// Returns the statistics of every Gaussian; reads them back first if they are in the scratch file.
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -294,8 +297,8 @@ impl Scored {
         self.statistics.rows()
     }
 
-    /// Returns the contribution C and the visibility Vis (share of the views in which it is on screen) of every
-    /// Gaussian.
+    /// Returns two statistics of every Gaussian: the contribution C, and the visibility Vis (share of the views in
+    /// which the Gaussian is on screen).
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -313,7 +316,8 @@ impl Scored {
         self.statistics.len()
     }
 
-    /// Computes the scores, on which the selection is based, again from the statistics.
+    /// Computes the scores again from the statistics. The selection is based on these scores but does not hold them.
+    /// `recipe`: normalization and weights of the scores.
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
@@ -322,7 +326,8 @@ impl Scored {
         Ok(score(&rows, self.frames, recipe))
     }
 
-    /// Returns the percentiles between which each term of the scores is normalized.
+    /// Returns for each term of the scores its name, the 1st and 99th percentile between which it is normalized, and
+    /// whether these differ.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
         let summarize = |term: &Term| TermSummary {
             name: term.of.name().to_owned(),
@@ -333,9 +338,10 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes to the journal which parts of scanning and scoring the scene did not need, how many Gaussians have
-    /// unusual values, and what can be done about short life spans. If the scan `is_partial`, terms of motion and opacity
-    /// are not mentioned, because they were not measured.
+    /// Writes three kinds of notes to `journal`: parts of scanning and scoring that the scene did not need, numbers of
+    /// Gaussians with unusual values, and advice if life spans are short. If the scan `is_partial`, terms of motion and
+    /// opacity are not mentioned, because they were not measured. `median_life`: median number of frames in which a
+    /// Gaussian is alive.
     fn record(&self, scene: &Scene, median_life: u32, is_partial: bool, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {

@@ -1,4 +1,4 @@
-//! Tests of the selection. Expected values follow the definition to the letter.
+//! Tests of the selection. Expected values are computed literally as the two stages are defined, without a ranking.
 
 use proptest::prelude::*;
 
@@ -6,7 +6,8 @@ use super::*;
 use crate::model::hash_id;
 use crate::recipe::Recipe;
 
-/// Creates scores from pairs of normalized static and dynamic scores; the score S is their sum.
+/// Creates the scores of Gaussians from their pairs of normalized static and dynamic scores. The score S is the sum of
+/// a pair.
 fn scores(parts: &[(f64, f64)]) -> Scores {
     let (static_norm, dynamic_norm): (Vec<f64>, Vec<f64>) = parts.iter().copied().unzip();
     let score = parts.iter().map(|(s, d)| s + d).collect();
@@ -29,8 +30,8 @@ fn without_overrides(scores: &Scores, recipe: &SelectParams) -> Selection {
     select(scores, recipe, &Overrides::default()).unwrap()
 }
 
-/// Computes by the definition which Gaussians stay: sorts all, then applies the thresholds of stage 2, unless all
-/// normalized scores are 0.
+/// Returns for each Gaussian whether it stays, computed literally as defined: sorts all Gaussians by score, then
+/// applies the thresholds of stage 2, unless all normalized scores are 0.
 fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
@@ -48,7 +49,7 @@ fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
         .collect()
 }
 
-/// Generates scores in coarse steps, so that ties are frequent. Includes −0 and values outside [0, 1].
+/// Generates normalized scores in coarse steps, so that ties are frequent. Includes −0 and values outside [0, 1].
 fn any_norm() -> impl Strategy<Value = f64> {
     prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
 }

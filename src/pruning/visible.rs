@@ -1,4 +1,5 @@
-//! Stage `visible`: measures how much every Gaussian contributes to the scored views, occlusion included.
+//! Stage `visible`: measures how much every Gaussian contributes to the views by which Gaussians are scored, occlusion
+//! included.
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -15,22 +16,24 @@ use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
 
-/// Name of the stage in messages and in the cache.
+/// Name of this stage in messages and in the cache.
 pub(crate) const NAME: &str = "visible";
 
-/// Stage that renders views to measure the contribution C of every Gaussian (mean Σ alpha · transmittance) and its peak
-/// W (maximum in one pixel).
+/// Stage that renders views to measure the contribution C of every Gaussian (Σ alpha · transmittance over the pixels of
+/// a view, averaged over views) and its peak W (maximum in one pixel).
 #[derive(Debug, Clone)]
 pub struct VisibilityStage {
-    /// Parameters of the scan. Used are the strides of pixels, views and frames, and the maximum number of views.
+    /// Parameters of the scan, of which this stage uses the strides of pixels, views and frames, and the maximum number
+    /// of views.
     pub recipe: recipe::ScanParams,
-    /// Whether pruning rounds rank the Gaussians again. Then every n-th pixel is enough, see [`ranking_stride`].
+    /// Whether pruning rounds will rank the Gaussians again. Then it is enough to render every n-th column and row of
+    /// pixels, where n is [`ranking_stride`].
     pub is_preliminary: bool,
 }
 
 impl VisibilityStage {
-    /// Returns the stage, or `None` if `recipe` does not measure C by renders. `has_cameras`: whether the scene has
-    /// cameras of its own, rather than a virtual rig.
+    /// Returns the stage, or `None` if `recipe` does not measure the contribution C by renders. `has_cameras`: whether
+    /// the scene has cameras of its own, rather than a virtual rig (cameras placed by the program).
     pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<VisibilityStage> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,
@@ -67,20 +70,21 @@ impl VisibilityStage {
         ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
-    /// Returns the stride of the pixels of views of `pixels` pixels by which `count` Gaussians are measured.
+    /// Returns the stride n for the renders that measure the contributions of `count` Gaussians: only every n-th column
+    /// and row of pixels is rendered. `pixels`: number of pixels of a view.
     fn pixel_stride(&self, pixels: u64, count: usize) -> NonZeroU32 {
         let of_ranking = if self.is_preliminary { ranking_stride(pixels, count) } else { NonZeroU32::MIN };
         self.recipe.pixel_stride.max(of_ranking)
     }
 
-    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. If the number of views is
-    /// limited, they can be chosen only after the last frame.
+    /// Returns whether the views of a frame can be chosen as soon as the frame has been read. This is so if the number
+    /// of views is not limited. Otherwise views can be chosen only after the last frame.
     pub fn can_render_on_arrival(&self) -> bool {
         self.recipe.look_pictures == 0
     }
 
     /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of
-    /// frames in which each Gaussian is alive.
+    /// frames in which each Gaussian is alive. Writes a warning to `journal` if the cameras see very few Gaussians.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -113,14 +117,14 @@ impl VisibilityStage {
     }
 }
 
-/// Fraction of the Gaussians (of those alive in any frame) that the cameras must see; if they see fewer, they probably
-/// belong to another scene. Cameras of trained models see two thirds; those inside a scene that fills a room see a
-/// third.
+/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive in some frame.
+/// Cameras that see fewer probably belong to another scene. Cameras of trained models see two thirds; those inside a
+/// scene that fills a room see a third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
 
-/// Returns a warning if very few of the Gaussians that are ever alive contribute to any view, so that the cameras may
-/// belong to another scene. `peak`: largest contribution W of each Gaussian. `life`: number of frames in which it is
-/// alive. `origin`: origin of the cameras.
+/// Returns a warning for the user if very few of the Gaussians that are ever alive contribute to any view, so that the
+/// cameras may belong to another scene. `peak`: largest contribution W of each Gaussian to a pixel. `life`: number of
+/// frames in which each Gaussian is alive. `origin`: where the cameras came from, for the message.
 fn wrong_scene_warning(peak: &[f64], life: &[u32], origin: &str) -> Option<String> {
     let alive = life.iter().filter(|&&frames| frames > 0).count();
     let seen = peak.iter().zip(life).filter(|&(&peak, &frames)| frames > 0 && peak > 0.0).count();

@@ -1,5 +1,5 @@
-//! Effort of a run: one option that trades time for quality, with values from the curves that `splatsieve precision`
-//! draws.
+//! Effort of a run: one option that trades time for quality. Its values were chosen from measurements of error against
+//! run time (`splatsieve precision`).
 
 use super::{MOST_STEPS, Recipe};
 

@@ -31,8 +31,8 @@ pub const PRESETS: [(&str, &str); 4] = [
     ("strong", include_str!("strong.toml")),
 ];
 
-/// Maximum fraction of the Gaussians that one pruning round may leave. At this fraction, pruning 10 million Gaussians
-/// down to a few takes about 1300 rounds.
+/// Maximum fraction of the Gaussians that may be left after one pruning round. At this fraction, pruning 10 million
+/// Gaussians down to a few takes about 1300 rounds.
 pub const MAX_ROUND_FRACTION: f64 = 0.99;
 /// Maximum number of optimization steps of refinement; these take about one day.
 const MOST_STEPS: u32 = 1_000_000;
@@ -71,7 +71,8 @@ impl Recipe {
 
     /// Parses the text of a recipe file, which sets any subset of the parameters. The others come from the preset that
     /// its key `preset` names, or from the preset `fallback` if it names none. Ignores the tables `[provenance]` and
-    /// `[run]`, which recipe files written beside results have.
+    /// `[run]`, which recipe files written beside results have. Fails with a message if the text is not TOML, or if a
+    /// parameter is unknown or out of range.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
         let recipe: Recipe =
@@ -80,8 +81,9 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// Returns this recipe with the parameter `key` of the table `section` set from the text `value`: a TOML value, or
-    /// a name without quotes.
+    /// Returns this recipe with the parameter `key` of the table `section` set from the text `value`: a number, `true`,
+    /// `false`, or a name without quotes. Fails with a message if there is no such parameter, or if `value` is not of
+    /// its type.
     pub fn with_parameter(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
         let number = value.parse::<f64>().map(toml::Value::Float);
         let whole = value.parse::<i64>().map(toml::Value::Integer);
@@ -105,8 +107,8 @@ impl Recipe {
         recipe
     }
 
-    /// Returns this recipe with `steps` optimization steps. The steps before each prune step (removal of the
-    /// lowest-ranked Gaussians) change in proportion.
+    /// Returns this recipe with `steps` optimization steps. Changes in proportion the number of optimization steps
+    /// before each prune step (removal of the lowest-ranked Gaussians).
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
@@ -122,7 +124,8 @@ impl Recipe {
         toml::to_string(self).expect("a recipe is plain data")
     }
 
-    /// Checks that every parameter is within its range. The error message names the first parameter that is not.
+    /// Checks that every parameter is within its range. Otherwise fails with a message that names the first parameter
+    /// that is out of range.
     pub fn validate(&self) -> std::result::Result<(), String> {
         let in_unit = |x: f64| (0.0..=1.0).contains(&x);
         let nonnegative = |x: f64| x >= 0.0;
@@ -213,7 +216,7 @@ impl Recipe {
     }
 }
 
-/// Returns the TOML text of the preset `name`.
+/// Returns the TOML text of the preset `name`. Fails if there is no preset of that name.
 pub fn preset_text(name: &str) -> Result<&'static str> {
     match PRESETS.iter().find(|(known, _)| *known == name) {
         Some((_, text)) => Ok(text),
@@ -225,8 +228,11 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
     }
 }
 
-/// Returns the values of all parameters: from `over` where it has them, otherwise from the preset that `over` names, or
-/// from the preset `fallback`. A named preset may itself name another preset.
+/// Returns the parameters in `over`, completed by those of a preset. The preset is the one that the key `preset` of
+/// `over` names, otherwise `fallback`. It may itself be based on another preset.
+///
+/// Returns only the parameters in `over` if it names no preset and there is no fallback. Fails if the named preset does
+/// not exist.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
     over.remove("run");
@@ -243,8 +249,8 @@ fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Re
     Ok(table)
 }
 
-/// Replaces the values in `base` by those of `over`, table by table. Adds keys that `base` lacks; the typed parser
-/// refuses them later.
+/// Replaces the values in `base` by those of `over`, table by table. Also adds keys that `base` lacks: the later
+/// conversion to [`Recipe`] fails for an unknown key.
 fn overlay(base: &mut toml::Table, over: toml::Table) {
     for (key, value) in over {
         match (base.get_mut(&key), value) {

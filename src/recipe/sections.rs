@@ -36,15 +36,16 @@ pub enum ScanFrames {
     Needed,
 }
 
-/// Definition of the steps from one frame to the next that count as motion of a Gaussian, and of the number by which
-/// their sum is divided.
+/// Definition of the motion of a Gaussian: which steps from one frame to the next count, and by which number their sum
+/// is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
-    /// The paper's definition. Steps across gaps of the life span (frames with opacity of at least `alpha_min`) count;
-    /// the sum is divided by a number that follows from the length of the life span.
+    /// Definition of the paper: every step counts that ends in a frame in which the Gaussian is alive (its opacity is
+    /// at least `alpha_min`), even if it is not alive in the frame before. The divisor is the number of frames in which
+    /// it is alive; for the curvature, this number minus 2.
     Literal,
-    /// Only steps between consecutive frames of the life span count; the sum is divided by their number.
+    /// Only steps between consecutive frames in which the Gaussian is alive count. The divisor is their number.
     Runs,
 }
 
@@ -52,8 +53,9 @@ pub enum MotionParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Coverage {
-    /// [`Coverage::Visible`] if the scene has cameras of its own, otherwise [`Coverage::Projected`]: the cameras of a
-    /// virtual rig (placed by the program) may be behind walls that no real view shows.
+    /// [`Coverage::Visible`] if the scene has cameras of its own, otherwise [`Coverage::Projected`]. A virtual rig
+    /// (cameras placed by the program) is not rendered, because its cameras may stand behind walls, where no real
+    /// camera looks from.
     Auto,
     /// Sum over pixels of alpha · transmittance, so that hidden Gaussians contribute nothing.
     Visible,
@@ -135,7 +137,8 @@ pub struct SelectParams {
 pub enum LowScorePolicy {
     /// Gaussians that stage 1 does not choose as candidates are removed.
     Drop,
-    /// Stage 2 decides on Gaussians that stage 1 does not choose in the same way as on the candidates that it chooses.
+    /// Stage 2 also decides on the Gaussians that stage 1 does not choose as candidates, by the same rule as on the
+    /// candidates.
     Rescue,
 }
 
@@ -242,7 +245,7 @@ pub enum FieldPrecision {
 #[serde(try_from = "String", into = "String")]
 pub struct AttributeGroups(pub Attributes);
 
-/// Name, as used in a recipe, and attribute of every group that can be refined.
+/// Attributes that can be refined, each with its name in a recipe.
 const GROUPS: [(&str, Attributes); 5] = [
     ("color", Attributes::SH),
     ("opacity", Attributes::OPACITY),
@@ -323,8 +326,8 @@ pub enum MotionSimilarity {
 pub enum ProxyPosition {
     /// Weighted mean of the positions of the cluster's members.
     Mean,
-    /// Position of the leader, the member to which the others were joined. Second moments are then taken about this
-    /// position.
+    /// Position of the leader, the member of the cluster that the other members were merged into. The covariance of the
+    /// proxy is then computed about this position.
     Leader,
 }
 

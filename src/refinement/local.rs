@@ -8,13 +8,14 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Opacity logit below which a Gaussian counts as invisible in a frame, whatever refinement adds: its opacity is below
-/// 10⁻¹³.
+/// Opacity logit below which a Gaussian counts as invisible in a frame. Its opacity is below 10⁻¹³ then, so nothing
+/// that refinement adds makes it visible.
 const ABSENT_LOGIT: f32 = -30.0;
-/// A frame is stored sparsely if at most 1/[`SPARSE_DIVISOR`] of the Gaussians are visible in it.
+/// Divisor of the number of Gaussians: a frame is stored sparsely (only its visible Gaussians) if at most
+/// 1/[`SPARSE_DIVISOR`] of the Gaussians are visible in it.
 const SPARSE_DIVISOR: usize = 2;
 
-/// Attributes of the Gaussians at one frame, and their derivative with respect to the stored parameters.
+/// Attributes of the Gaussians at one frame, and their derivatives (Jacobian) with respect to the stored parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LinearizedState {
     /// Increasing indices of the Gaussians in `state` if `state` leaves out invisible Gaussians; `None` if it has all.
@@ -24,12 +25,13 @@ pub(super) struct LinearizedState {
 }
 
 impl LinearizedState {
-    /// Creates a state without Gaussians, whose SH coefficients have degrees up to `sh_degree`.
+    /// Creates an empty state (no Gaussians) for SH coefficients of degrees up to `sh_degree`.
     pub(super) fn none(sh_degree: usize) -> LinearizedState {
         LinearizedState { present: None, state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
     }
 
-    /// Returns the state of the Gaussians with the increasing indices `places` only.
+    /// Returns the state of only the Gaussians whose indices are in `places`, which must be increasing. Gaussian
+    /// `places[i]` has the index i in the result.
     pub(super) fn pick(&self, places: &[u32]) -> LinearizedState {
         let Some(present) = &self.present else { return self.rows(places, None) };
         let stays = |(to, place): (u32, &u32)| Some((present.binary_search(place).ok()? as u32, to));
@@ -37,7 +39,7 @@ impl LinearizedState {
         self.rows(&rows, Some(present))
     }
 
-    /// Returns the state of the visible Gaussians only, or `None` if they are too many for sparse storage.
+    /// Returns a state that holds only the visible Gaussians, or `None` if they are too many for sparse storage.
     fn to_sparse(&self) -> Option<LinearizedState> {
         let logits = self.state.opacity_logit.plane(0);
         let is_present = |&(_, &logit): &(u32, &f32)| logit >= ABSENT_LOGIT;
@@ -46,38 +48,39 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns the rows `rows` of this state. `present`: index of the Gaussian in each of these rows, if it is a sparse
-    /// state.
+    /// Returns a state with only the rows `rows` of this one (a row holds the values of one Gaussian). `present`: index
+    /// of the Gaussian in each of these rows if the returned state leaves out invisible Gaussians, else `None`.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {
         LinearizedState { present, state: self.state.pick(rows), jacobian: self.jacobian.pick(rows) }
     }
 
-    /// Returns the columns that are stored for every frame: the attributes `varying`, and the Jacobian.
+    /// Returns the arrays that the scratch file stores for every frame: the attributes in `varying`, and the Jacobian.
     fn stored_columns(&mut self, varying: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
         self.state.columns_mut(varying).chain(self.jacobian.columns_mut())
     }
 }
 
-/// Reader of the states of all frames. Keeps one state and 24 bytes per frame in memory.
+/// Reader of the scratch file with the frame states. Memory: one frame state, and 24 bytes per frame.
 #[derive(Debug)]
 pub(super) struct LinearizedFrames {
     file: Spill,
     varying: Attributes,
-    /// State of all Gaussians at the first frame. Gives the values of attributes that do not vary with time, and the
-    /// number of columns and rows of attributes that do.
+    /// State of all Gaussians at the first frame. Attributes that do not vary with time have these values in all
+    /// frames; for the other attributes it gives the number of components and Gaussians.
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
 }
 
-/// Place of a frame in the scratch file: byte offset `at`, and the number of Gaussians `present` if the frame is stored
-/// without its invisible Gaussians. The indices of those that are present then precede their values.
+/// Place of a frame in the scratch file: byte offset `at`, and, if the frame is stored without its invisible Gaussians,
+/// the number `present` of Gaussians that are stored. The indices of these Gaussians are written at `at`, then their
+/// values.
 #[derive(Debug, Clone, Copy)]
 struct StoredFrame {
     at: u64,
     present: Option<usize>,
 }
 
-/// Writer of the scratch file with the states of all frames.
+/// Writer of the scratch file with the frame states.
 pub(super) struct LinearizedFramesWriter {
     file: SpillWriter,
     varying: Attributes,
@@ -87,11 +90,11 @@ pub(super) struct LinearizedFramesWriter {
 }
 
 impl LinearizedFramesWriter {
-    /// Creates a writer to which no frame has been written yet. The attributes `varying` are stored for every frame,
-    /// all others for the first frame only.
+    /// Creates a writer without frames; the scratch file is created in the folder `scratch`. The attributes `varying`
+    /// are stored for every frame, all others for the first frame only.
     ///
     /// # Errors
-    /// Fails if no scratch file can be created in `scratch`.
+    /// Fails if the scratch file cannot be created.
     pub(super) fn new(scratch: &Path, varying: Attributes) -> Result<LinearizedFramesWriter> {
         Ok(LinearizedFramesWriter {
             file: SpillWriter::new(scratch)?,
@@ -107,7 +110,7 @@ impl LinearizedFramesWriter {
         self.first.is_none()
     }
 
-    /// Returns the state of the first frame written, or `None` before that.
+    /// Returns the state of the frame that was written first, or `None` if no frame has been written yet.
     pub(super) fn first(&self) -> Option<&LinearizedState> {
         self.first.as_ref()
     }
@@ -117,7 +120,8 @@ impl LinearizedFramesWriter {
         self.file.write(bytes)
     }
 
-    /// Appends the state `next` of the next frame to the scratch file.
+    /// Appends `next`, the state of the next frame, to the scratch file. All frames but the first are stored sparsely
+    /// if few Gaussians are visible in them.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -150,7 +154,7 @@ impl LinearizedFrames {
         self.first.as_ref()
     }
 
-    /// Reads the state of the `k`-th frame written into `to`.
+    /// Reads into `to` the state of frame `k`, counted from 0 in the order in which the frames were written.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
@@ -191,7 +195,8 @@ impl LinearizedFrames {
 mod tests {
     use super::*;
 
-    /// Creates a test state of `len` Gaussians with positions 0, 1, 2, …. Only the Gaussians `present` are visible.
+    /// Creates a test state of `len` Gaussians whose position values count up from 0. Only the Gaussians with the
+    /// indices `present` are visible.
     fn linearized_state(len: usize, present: &[usize]) -> LinearizedState {
         let mut linearized_state = LinearizedState { state: Gaussians::zeros(len, 0), ..LinearizedState::default() };
         linearized_state.state.position.planes_mut().iter_mut().zip(0..).for_each(|(x, k)| *x = k as f32);

@@ -12,8 +12,8 @@ use crate::render::Image;
 /// Factor of the mean square error in the loss. With it, the squared error and 1 − SSIM contribute about equally at 35
 /// dB if both have the weight 0.5.
 const SQUARED_WEIGHT: f64 = 20.0;
-/// Number of rendered pixels of a training view per survivor (Gaussian left by pruning) that is enough: with a stride
-/// that leaves 2 pixels or more, refinement loses at most 0.1 dB.
+/// Wanted number of rendered pixels of a training view per survivor (Gaussian left by pruning), from which the stride
+/// follows. In measurements with at least 2 pixels per survivor, refinement lost at most 0.1 dB.
 const PIXELS_PER_GAUSSIAN: f64 = 2.5;
 
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
@@ -28,16 +28,16 @@ pub(super) struct Loss {
 pub(super) struct RenderQuality {
     /// Mean PSNR over the views, in dB.
     pub(super) psnr: f64,
-    /// Root mean square error of all values of all views; values are from 0 to 1.
+    /// Root mean square error over all color values of all views; color values are from 0 to 1.
     pub(super) error: f64,
-    /// Mean of 1 − SSIM; 0 if SSIM is not part of the loss.
+    /// Mean of 1 − SSIM over the views; 0 if SSIM is not part of the loss.
     dissimilarity: f64,
 }
 
 impl Loss {
-    /// Returns the derivative of the loss with respect to each value of the render `picture`, multiplied by the number
-    /// of values and by a factor that is the same for all views. Values outside [0, 1] have the derivative 0, because a
-    /// screen clamps them.
+    /// Returns the derivative of the loss with respect to each color value of the render `picture`, multiplied by the
+    /// number of values and by a factor that is the same for all views. `target` has the values of the target view as
+    /// 16-bit integers. For values outside [0, 1] the derivative is 0, because a screen clamps these.
     pub(super) fn slope(&self, picture: &Image, target: &[u16]) -> Image {
         let mut slope = picture.clone();
         for (value, &wanted) in slope.data.iter_mut().zip(target) {
@@ -53,9 +53,9 @@ impl Loss {
         slope
     }
 
-    /// Returns the stride at which the pixels of training views are rendered and compared. `pixels`: number of pixels of
-    /// a view. `survivors`: number of Gaussians left by pruning. It is 1 if SSIM is part of the loss, because SSIM needs
-    /// neighboring pixels.
+    /// Returns the stride n of the training views: only every n-th column and row of pixels is rendered and compared.
+    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. The stride is 1 if SSIM
+    /// is part of the loss, because SSIM needs neighboring pixels.
     pub(super) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
         match self.ssim > 0.0 {
             true => NonZeroU32::MIN,
@@ -63,21 +63,22 @@ impl Loss {
         }
     }
 
-    /// Returns the mean square error of the render `picture`, and its 1 − SSIM, or 0 if SSIM is not part of the loss.
+    /// Returns two errors of the render `picture` against the 16-bit values `target` of its target view: the mean
+    /// square error, and 1 − SSIM, which is 0 if SSIM is not part of the loss.
     pub(super) fn errors(&self, picture: &Image, target: &[u16]) -> [f64; 2] {
         let dissimilarity = if self.ssim > 0.0 { 1.0 - ssim(picture, &image(picture, target)) } else { 0.0 };
         [mean_square(picture, target), dissimilarity]
     }
 
-    /// Returns the bytes of memory per pixel needed to compare `threads` views at once, in addition to the views and
-    /// their targets.
+    /// Returns the bytes of memory, per pixel of a view, for comparing `threads` renders in parallel with their target
+    /// views. The renders and target views themselves are not included. Returns 0 if SSIM is not part of the loss.
     pub(super) fn bytes_per_pixel(&self, threads: u64) -> u64 {
         let compared = threads * (12 + BYTES_PER_PIXEL) as u64;
         if self.ssim > 0.0 { compared.max((12 + SSIM_SLOPE_BYTES_PER_PIXEL) as u64) } else { 0 }
     }
 
-    /// Returns whether `now` is better than `best`: has a higher mean PSNR or, if SSIM is part of the loss, a lower
-    /// loss.
+    /// Returns whether the quality `now` is better than `best`: its loss is lower, or, if SSIM is not part of the loss,
+    /// its mean PSNR is higher.
     pub(super) fn is_closer(&self, now: &RenderQuality, best: &RenderQuality) -> bool {
         let loss =
             |of: &RenderQuality| (1.0 - self.ssim) * SQUARED_WEIGHT * of.error.powi(2) + self.ssim * of.dissimilarity;
@@ -86,13 +87,13 @@ impl Loss {
 }
 
 impl RenderQuality {
-    /// Returns the root mean square error of a view with the mean PSNR: the geometric mean of the errors of all views. A few
-    /// views with large errors raise it less than they raise [`RenderQuality::error`].
+    /// Returns the root mean square error that corresponds to the mean PSNR: the geometric mean of the root mean square
+    /// errors of all views. A few views with large errors raise it less than they raise [`RenderQuality::error`].
     pub(super) fn typical_error(&self) -> f64 {
         10f64.powf(-self.psnr / 20.0)
     }
 
-    /// Averages the results of [`Loss::errors`] for several views.
+    /// Returns the mean quality of several views. `pictures`: result of [`Loss::errors`] for each view.
     pub(super) fn from_errors(pictures: &[[f64; 2]]) -> RenderQuality {
         let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
         RenderQuality {
@@ -103,7 +104,7 @@ impl RenderQuality {
     }
 }
 
-/// Returns the target view `target`, given as 16-bit values, as an image of the size of `picture`.
+/// Returns the target view `target`, given as 16-bit color values, as an image of the width and height of `picture`.
 fn image(picture: &Image, target: &[u16]) -> Image {
     Image { data: target.iter().copied().map(wide).collect(), ..*picture }
 }

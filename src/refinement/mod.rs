@@ -4,13 +4,15 @@
 //! Pruning leaves holes that only the survivors can fill, by growing their footprints over them. Gradient descent
 //! reduces the squared error (and, if set, 1 − SSIM) of one target view after another. Target views are renders of the
 //! original from the cameras by which Gaussians are scored and from cameras in between, so that the result is not
-//! overfitted to a few views. If many Gaussians have to go, this happens in prune steps: optimize, rank the Gaussians
-//! again, remove the lowest, repeat. Some views are used for validation only. Of the parameters at the start of the
-//! last phase and at its validations, those with the best validation quality are written. A deformation field is not
-//! changed.
+//! overfitted to a few views. If many Gaussians have to go, refinement removes them in prune steps: optimize, rank the
+//! Gaussians again, remove the lowest-ranked, repeat. The final optimization steps follow the last prune step.
 //!
-//! Memory: an [`optimizer::Adam`], one view with its gradient, three frame states, and the best parameter delta so far.
-//! The target views and the states at their frames are in scratch files.
+//! Some target views are used for validation only. They are rendered before the final steps and several times during
+//! them, and the parameters with the best validation quality are written. A deformation field is not changed.
+//!
+//! Memory: an [`optimizer::Adam`], one view with its gradient, a few frame states (the exact number is in
+//! [`RefineStage::resource_estimate`]), and the best parameter delta so far. The target views and the states at their
+//! frames are in scratch files.
 
 mod local;
 mod loss;
@@ -38,26 +40,28 @@ use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use loss::Loss;
 
-/// Name of the stage in messages and in the cache.
+/// Name of the refinement stage in messages and in the cache.
 const NAME: &str = "refine";
 
 /// Time of one optimization step, divided by the time to render its view.
 const STEP_RENDERS: f64 = 3.0;
 
-/// Validation PSNR in dB from which refinement is skipped as useless: the root mean square error is then about a
-/// quarter of an 8-bit step.
+/// Validation PSNR in dB at or above which refinement is skipped as useless: the root mean square error is then at most
+/// about a quarter of an 8-bit step.
 pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
-/// Minimum fraction of all Gaussians with which refinement begins, chosen by ranking alone. Fewer are reached by prune
-/// steps between optimization steps.
+/// Minimum fraction of all Gaussians with which refinement begins. Ranking alone chooses the Gaussians at the
+/// beginning; prune steps between optimization steps then remove more of them.
 const MIN_START_FRACTION: f64 = 0.4;
 /// Minimum fraction of the remaining Gaussians that one prune step keeps.
 pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
-/// Number of views by which the Gaussians are ranked for one prune step. Every prune step uses other views.
+/// Number of views by which the Gaussians are ranked for one prune step. Each prune step takes the next views of the
+/// random order of the training views.
 const RANKING_VIEWS: usize = 48;
 /// Bytes of memory per Gaussian for its removal error, its position, a k-d tree and marks while a prune step chooses
 /// the Gaussians that stay.
 const NEIGHBOR_BYTES: u64 = 64;
-/// Maximum number of validation views by whose error the learning rates before a prune step are set.
+/// Maximum number of validation views that are rendered to set the learning rates of the optimization steps before a
+/// prune step. The rates depend on the error of these renders.
 const RATE_VIEWS: usize = 16;
 
 /// Stage that refines the Gaussians left by pruning, with its parameters.
@@ -78,11 +82,11 @@ pub struct RefineStage {
     pub pictures: usize,
     /// Whether refinement may remove Gaussians in prune steps between optimization steps.
     pub cuts: bool,
-    /// Minimum contrast, assumed when ranking for a prune step, between the color of a Gaussian and the colors that it
-    /// hides.
+    /// Minimum color difference (norm over red, green, blue, each from 0 to 1) that is assumed between a Gaussian and
+    /// the colors that it hides, when Gaussians are ranked for a prune step; see [`crate::render::RemovalError`].
     pub contrast_floor: f64,
-    /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. 0:
-    /// the delta is constant in time.
+    /// Maximum number of keyframes of the parameter delta that varies with time, for inputs with explicit frames. With
+    /// 0, parameter deltas are constant in time.
     pub knots: usize,
     /// Fraction of the Gaussians that the user wants to keep; `None` if not given.
     pub target: Option<f64>,
@@ -90,8 +94,8 @@ pub struct RefineStage {
 
 impl RefineStage {
     /// Returns the stage, or `None` if `recipe` optimizes no attribute or has no steps. `target`: fraction of the
-    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, because the run ranks Gaussians
-    /// by renders.
+    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, that is, whether the run ranks
+    /// Gaussians by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
@@ -120,8 +124,8 @@ impl RefineStage {
         RefineStage { knots: 0, ..self }
     }
 
-    /// Returns a copy of this stage with the numbers of steps multiplied by `part`, and with deltas that do not vary
-    /// with time.
+    /// Returns a copy of this stage with the numbers of optimization steps multiplied by `part` and rounded up, and
+    /// with deltas that do not vary with time.
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
         RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
@@ -138,21 +142,23 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the stride at which the pixels of training views are stored. `pixels`: number of pixels of a view.
-    /// `first`: number of Gaussians with which refinement begins. Prune steps remove most of them, so the stride is
-    /// that of a third as many, which may be larger than [`RefineStage::stride`] of `first`.
+    /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. `pixels`:
+    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. If prune steps are
+    /// possible, they will remove most of these, so the result is [`RefineStage::stride`] for a third of `first`. It
+    /// may be larger than the stride for `first`.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)
     }
 
-    /// Returns the stride of the pixels of training views, see [`Loss::stride`].
+    /// Returns the stride n of the training views: only every n-th column and row of pixels is rendered and compared.
+    /// `pixels`: number of pixels of a view. `survivors`: number of Gaussians left by pruning. See [`Loss::stride`].
     pub(crate) fn stride(&self, pixels: u64, survivors: usize) -> NonZeroU32 {
         self.loss.stride(pixels, survivors)
     }
 
-    /// Returns the number of optimization steps after the last prune step if a fraction `kept` of all Gaussians stays.
-    /// The number grows in proportion to the fraction pruned, up to `steps`.
+    /// Returns the number of final optimization steps (after the last prune step) for a model that keeps the fraction
+    /// `kept` of all Gaussians. The number grows in proportion to the fraction removed, up to [`RefineStage::steps`].
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - MIN_START_FRACTION)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
@@ -176,13 +182,14 @@ impl RefineStage {
         (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
     }
 
-    /// Returns the smallest fraction of all Gaussians with which refinement begins before it prunes further in prune
-    /// steps; `None` if there are no prune steps.
+    /// Returns the minimum fraction of all Gaussians with which refinement begins, before its prune steps remove the
+    /// surplus; `None` if there are no prune steps.
     pub fn start_fraction(&self) -> Option<f64> {
         self.cuts.then_some(MIN_START_FRACTION)
     }
 
-    /// Returns how many of the `all` Gaussians of the model refinement begins with if it is to end with `wanted`.
+    /// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
+    /// Gaussians of the model. Prune steps remove the difference.
     pub fn initial_count(&self, wanted: usize, all: usize) -> usize {
         start_count(self.start_fraction(), wanted, all)
     }
@@ -271,20 +278,21 @@ impl RefineStage {
     }
 }
 
-/// Returns the number of Gaussians with which refinement begins if it ends with `wanted` of the `all` Gaussians of the
-/// model. Refinement begins with at least the fraction `starts_at` of all and removes the surplus in prune steps. If
-/// `starts_at` is `None`, it begins with `wanted`.
+/// Returns the number of Gaussians with which refinement begins, given that it ends with `wanted` of the `all`
+/// Gaussians of the model. This is at least the fraction `starts_at` of all; prune steps remove the surplus. If
+/// `starts_at` is `None`, there are no prune steps, and the result is `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
-/// Returns the number of optimization steps of the time-varying delta that follow `steps` steps of the constant delta.
+/// Returns the number of optimization steps of the time-varying delta, which are run after `steps` optimization steps
+/// of the constant delta: two thirds of `steps`.
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }
 
-/// Returns the numbers of Gaussians before, between and after the prune steps that lead from `first` to `last`
-/// Gaussians.
+/// Returns the number of Gaussians before the first prune step and after each one, for prune steps that lead from
+/// `first` to `last` Gaussians.
 fn prune_counts(first: usize, last: usize) -> Vec<usize> {
     let ratio = last.max(1) as f64 / first.max(1) as f64;
     let cuts = (ratio.ln() / MIN_PRUNE_FRACTION.ln() - 1e-9).ceil().max(0.0) as usize;

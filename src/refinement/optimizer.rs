@@ -18,9 +18,9 @@ const EPSILON: f32 = 1e-15;
 /// Number of first steps during which learning rates grow to full size, because Adam's running means are still
 /// unreliable.
 const WARM_UP: usize = 10;
-/// Typical error of the renders at the start from which learning rates have full size: the geometric mean of the root
-/// mean square errors of the views, with values from 0 to 1. With a smaller error the rates are reduced in proportion, so
-/// that nearly correct parameters are not disturbed.
+/// Initial error of the renders at or above which learning rates have full size. The error is the geometric mean of the
+/// root mean square errors of the views, with color values from 0 to 1. For a smaller initial error the rates are
+/// reduced in proportion, so that nearly correct parameters are not disturbed.
 const FULL_ERROR: f64 = 0.036;
 
 /// Factor on all learning rates as a function of the optimization step.
@@ -32,8 +32,8 @@ pub struct RateSchedule {
 }
 
 impl RateSchedule {
-    /// Creates the schedule of `steps` steps, at the end of which the rates have fallen to the fraction `last` of those
-    /// at the beginning. `error`: geometric mean of the root mean square errors of the views at the start.
+    /// Creates the schedule of `steps` optimization steps. At the end the rates have fallen to the fraction `last` of
+    /// the rates at the beginning. `error`: geometric mean of the root mean square errors of the views at the start.
     pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
         RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
@@ -54,10 +54,11 @@ impl RateSchedule {
 #[derive(Debug)]
 pub struct Adam {
     change: ParamDelta,
-    /// Running means of the derivatives, and of the squared derivatives.
+    /// Running mean of the derivatives, and running mean of the squared derivatives.
     means: [Gaussians; 2],
-    /// Factors on the learning rates, one per Gaussian: first for positions (0.04 times the geometric mean of the
-    /// scales, scene units), then for all other attributes (1). Both are 0 for Gaussians that are not optimized.
+    /// Two lists of factors on the learning rates, with one factor per Gaussian: the first list for positions (0.04
+    /// times the geometric mean of the scales of the Gaussian, scene units), the second for all other attributes (1).
+    /// Both factors are 0 for Gaussians that are not optimized.
     reach: [Vec<f32>; 2],
     columns: Attributes,
     done: usize,
@@ -70,7 +71,7 @@ pub fn bytes_per_gaussian(columns: Attributes, sh_degree: usize) -> usize {
 }
 
 impl Adam {
-    /// Creates an optimizer whose parameters start at `start`. It changes the attributes `columns`, with SH
+    /// Creates an optimizer with the start parameters `start`. The optimizer changes the attributes `columns`, with SH
     /// coefficients up to `sh_degree`, of all Gaussians for which `fixed` is false.
     pub fn new(start: &Gaussians, columns: Attributes, sh_degree: usize, fixed: &[bool]) -> Adam {
         let mut change = Gaussians::default();
@@ -84,17 +85,17 @@ impl Adam {
         Adam { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
-    /// Returns the delta: present parameters minus start parameters.
+    /// Returns the delta: current parameters minus start parameters.
     pub fn delta(&self) -> &ParamDelta {
         &self.change
     }
 
-    /// Returns whether the delta (present parameters minus start parameters) has any value other than 0.
+    /// Returns whether the delta (current parameters minus start parameters) has any value other than 0.
     pub fn has_moved(&self) -> bool {
         self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
     }
 
-    /// Returns the delta and resets it to 0. The caller has to add the delta to the start parameters.
+    /// Returns the delta and resets it to 0. The caller has to add the returned delta to the start parameters.
     pub fn take_delta(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
@@ -120,15 +121,16 @@ impl Adam {
         (&self.change, &self.means, self.done)
     }
 
-    /// Sets the values that [`Adam::checkpoint`] of another optimizer with the same start parameters returned.
+    /// Restores the delta, running means and number of steps that [`Adam::checkpoint`] returned for an optimizer with
+    /// the same start parameters.
     pub fn resume(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }
 
-    /// Makes one step with the derivatives `weight` · `gradients` and the learning rates of `schedule`.
+    /// Makes one optimization step with the derivatives `weight` · `gradients` and the learning rates of `schedule`.
     ///
     /// # Panics
-    /// Panics if `gradients` has another number of Gaussians or lacks an optimized attribute.
+    /// Panics if `gradients` has a different number of Gaussians or lacks an optimized attribute.
     pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &RateSchedule) {
         let factor = schedule.at(self.done);
         self.done += 1;
@@ -161,7 +163,8 @@ impl Adam {
     }
 }
 
-/// Returns the learning rate of component `c` of the attribute `column`. For positions it is in units of `Adam::reach`.
+/// Returns the learning rate of component `c` of the attribute `column`. The rate of a position is a factor on
+/// `Adam::reach`, which depends on the size of the Gaussian.
 fn rate(column: Attributes, c: usize) -> f32 {
     match column {
         Attributes::POSITION => 1.0,
@@ -177,7 +180,7 @@ fn rate(column: Attributes, c: usize) -> f32 {
 mod tests {
     use super::*;
 
-    /// Returns the derivatives of Σ (value − aim)² / 2 with respect to every attribute value.
+    /// Returns the derivatives of Σ (value − `aim`)² / 2 with respect to every attribute value of `state`.
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
         let mut gradients = Gradients::new(state.len(), Attributes::all(), 0);
         for column in Attributes::all().iter() {

@@ -18,7 +18,7 @@ use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
-/// Loss, and which attributes are optimized.
+/// Settings of optimization steps: the loss and the attributes that are optimized.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StepParams {
     /// Attributes that are optimized.
@@ -39,18 +39,19 @@ pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     if keyframe_count > 1 { keyframe_count } else { 0 }
 }
 
-/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only
-/// with a deformation field; otherwise a state is always its first value plus the delta.
+/// Number of optimization steps between two evaluations of the frame states from the stored parameters. Needed only if
+/// the model has a deformation field; otherwise a frame state is always the state at the start plus the delta.
 pub(super) const REEVALUATE_EVERY: usize = 200;
 
-/// Optimizer, the Gaussians left by pruning with their states at the frames of the target views, and the delta so far.
+/// Optimizer together with its data: the frame states of the Gaussians left by pruning, at the frames of the target
+/// views, and the delta so far.
 ///
-/// With a deformation field, a frame state is not simply the stored parameters plus a delta. It is then evaluated anew
-/// every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the field and its
-/// derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
+/// If the model has a deformation field, a frame state is not simply the stored parameters plus a delta. Each state is
+/// then evaluated anew every [`REEVALUATE_EVERY`] steps and extrapolated along its Jacobian in between. Evaluating the
+/// field and its derivative at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
-/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame; a frame
-/// with few visible Gaussians has only these in the file.
+/// Memory: six frame states, [`Adam`], and a view with its gradient. A scratch file holds one state per frame. If few
+/// Gaussians are visible in a frame, its state in the file has only these.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
@@ -58,36 +59,41 @@ pub(super) struct OptimizerState<'a> {
     /// Indices of the frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Attributes,
-    /// State of each frame in `frames`, without the delta of the optimizer `descent`.
+    /// State of each frame in `frames`, without the delta that the optimizer `descent` holds.
     linearized: LinearizedFrames,
-    /// Stored parameters without the delta of the optimizer `descent`. Used only with a deformation field.
+    /// Stored parameters without the delta that the optimizer `descent` holds. Used only if the model has a deformation
+    /// field.
     stored: StoredParams,
-    /// Delta of earlier optimization steps, which `stored` and `linearized` already include.
+    /// Part of the constant delta that `stored` and `linearized` already include. The optimizer `descent` holds
+    /// the rest.
     before: ParamDelta,
     fixed: Vec<bool>,
-    /// Settings of the loss, and the attributes and SH degree that are optimized, as far as the model has them.
+    /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
+    /// derivatives its deformation field cannot compute.
     step_params: StepParams,
     descent: Adam,
     /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.
     course: Vec<Adam>,
-    /// For each Gaussian, the attributes that vary between frames; none with a deformation field.
+    /// For each Gaussian, the attributes that vary between frames; no attributes if the model has a deformation field.
     changing: Vec<Attributes>,
     gradients: Gradients,
-    /// Buffer for the frame state of the view being rendered.
+    /// Buffer for the state of the frame that is being rendered.
     now: LinearizedState,
     renderer: Renderer,
-    /// Stride of the pixels of training views, for optimization steps and ranking.
+    /// Stride n of the training views: only every n-th column and row of pixels is rendered in optimization steps and
+    /// for the ranking of a prune step.
     stride: NonZeroU32,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
-    /// Whether the frame states were evaluated again since the last prune step (or since the beginning, before the
-    /// first).
+    /// Whether the frame states were evaluated again since the optimizer `descent` was created, at the beginning or in
+    /// the last prune step.
     reevaluated: bool,
 }
 
 /// Contents of a checkpoint, in this order:
-/// - the stored parameters at the last evaluation of the frame states and the delta included in them; `None` if states
-///   were not evaluated again since the phase began,
+/// - the stored parameters at the last evaluation of the frame states, and the delta that they include; `None` if the
+///   frame states were not evaluated again since the optimizer was created (at the beginning or in the last prune
+///   step),
 /// - delta, running means and step number of the optimizer,
 /// - number of steps since the frame states were evaluated,
 /// - delta, running means and step number of the optimizer of each keyframe.
@@ -98,8 +104,8 @@ type OptimizerCheckpoint<Stored, Added, Means> =
 pub(super) type KeptCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {
-    /// Creates the optimizer state of the model `result`. All Gaussians are optimized, except those for which `fixed`
-    /// is true.
+    /// Creates the optimizer state for a pruned model whose frames `result` reads. Only Gaussians for which `fixed` is
+    /// false are optimized.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -165,7 +171,8 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Creates a new optimizer with a delta of 0, which starts at the present frame states.
+    /// Replaces the optimizer `descent` by a new one, with a delta of 0, for the Gaussians in `linearized`. Also sets
+    /// the stride that suits the number of these Gaussians.
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -179,9 +186,9 @@ impl<'a> OptimizerState<'a> {
         self.stride = stored.saturating_mul(multiple);
     }
 
-    /// Adds a time-varying delta with `keyframe_count` keyframes, which starts at 0. It changes only attributes that
-    /// vary with time in the input (others are stored once for all frames), and only SH coefficients of degree 0.
-    /// Returns false if there is no such attribute.
+    /// Adds a time-varying delta with `keyframe_count` keyframes, which starts at 0. The delta changes only attributes
+    /// that vary with time in the input (others are stored once for all frames), and of the SH coefficients only degree
+    /// 0. Returns whether there is an attribute to change.
     pub(super) fn enable_keyframes(&mut self, keyframe_count: usize) -> bool {
         let columns = self.step_params.columns & self.changing.iter().copied().collect();
         let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {
@@ -191,29 +198,30 @@ impl<'a> OptimizerState<'a> {
         true
     }
 
-    /// Returns the delta that varies with time, as its values at the keyframes.
+    /// Returns the time-varying delta: one parameter delta per keyframe.
     pub(super) fn course(&self) -> TrajectoryDelta {
         TrajectoryDelta(self.course.iter().map(|knot| knot.delta().clone()).collect())
     }
 
-    /// Returns the two keyframes around frame `frames[k]` with their interpolation weights.
+    /// Returns the two keyframes between which frame `frames[k]` lies, with their interpolation weights.
     fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
         TrajectoryDelta::keyframe_weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
-    /// Returns for each Gaussian whether it is excluded from optimization.
+    /// Returns for each Gaussian whether it is excluded from optimization because it is protected.
     pub(super) fn fixed(&self) -> &[bool] {
         &self.fixed
     }
 
-    /// Returns the total delta of the stored parameters that is constant in time.
+    /// Returns the total constant delta: the current stored parameters minus the stored parameters at the start. The
+    /// time-varying delta is not part of it.
     pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
         if self.descent.has_moved() { before.plus(self.descent.delta().clone()) } else { before }
     }
 
-    /// Evaluates the frame states anew from the stored parameters. Does nothing without a deformation field, because
-    /// states are then exact.
+    /// Evaluates the frame states anew from the stored parameters. Does nothing if the model has no deformation field,
+    /// because the states are then exact.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -263,7 +271,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the positions of all Gaussians at the first frame of the target views, deltas included.
+    /// Returns the positions of all Gaussians at the first frame of the target views, with the constant delta added.
     pub(super) fn positions(&self) -> AttributeValues {
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
         let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
@@ -271,8 +279,8 @@ impl<'a> OptimizerState<'a> {
         moved.position
     }
 
-    /// Restarts the optimizer from the total delta `change`, an earlier result of [`OptimizerState::change`] with the
-    /// same Gaussians.
+    /// Restarts the optimizer from the total constant delta `change`, an earlier result of [`OptimizerState::change`]
+    /// with the same Gaussians.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
@@ -281,8 +289,8 @@ impl<'a> OptimizerState<'a> {
         self.reevaluate_states()
     }
 
-    /// Adds the optimizer's delta to the stored parameters (with a deformation field) and to `before`, and resets it to
-    /// 0.
+    /// Adds the delta of the optimizer `descent` to the delta `self.before` and, if the model has a deformation field,
+    /// to the parameters `self.stored`. Then resets the delta of `descent` to 0.
     fn bake_delta(&mut self) {
         if !self.descent.has_moved() {
             return;
@@ -294,7 +302,7 @@ impl<'a> OptimizerState<'a> {
         self.before = std::mem::take(&mut self.before).plus(moved);
     }
 
-    /// Removes all Gaussians except those with the indices `places`. The others keep their present states.
+    /// Removes all Gaussians except those with the indices `places`. The remaining ones keep their current states.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
@@ -317,7 +325,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Computes the present state of frame `frames[k]`, deltas included, into `now`.
+    /// Computes the current state of frame `frames[k]`, with constant and time-varying deltas added, into `now`.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.descent.delta();
@@ -337,7 +345,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the index in `frames` of the frame of target view `k`.
+    /// Returns the index in `self.frames` of the frame of target view `k`.
     fn frame_index(&self, k: usize) -> usize {
         self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
     }
@@ -378,7 +386,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Renders target view `k` and computes the derivatives of its loss into `gradients`.
+    /// Renders target view `k` and computes the derivatives of its loss with respect to the stored parameters into
+    /// `self.gradients`.
     fn differentiate(&mut self, k: usize) -> Result<()> {
         let (target, view) = (self.targets.values(k, self.stride)?, self.targets.view(k, self.stride));
         let mut now = std::mem::take(&mut self.now);
@@ -413,7 +422,7 @@ impl<'a> OptimizerState<'a> {
     }
 
     /// Returns the squared error that removing each Gaussian would cause, summed over the target views with the indices
-    /// `views`.
+    /// `views`. `contrast_floor`: see [`RemovalError::contrast_floor`].
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.
@@ -439,7 +448,7 @@ impl<'a> OptimizerState<'a> {
         .unwrap_or_else(|| Ok(zero().1))
     }
 
-    /// Creates the renderer and the frame state buffer of one thread.
+    /// Creates a renderer and a frame state buffer, as each thread needs them.
     fn new_worker(&self) -> (Renderer, LinearizedState) {
         (Renderer::new(), LinearizedState::default())
     }

@@ -1,27 +1,30 @@
-//! Models of a search for the smallest sufficient number of Gaussians. The models of earlier prune steps are kept, so
-//! that smaller models can be made from them.
+//! Pruned models of a search for the smallest sufficient number of Gaussians. Models between two prune steps are kept,
+//! so that the search can make smaller models from them instead of from the beginning.
 
 use super::{MIN_PRUNE_FRACTION, RefineRun};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 
-/// Models that a search for a size has pruned and refined so far. A new size is pruned from the smallest model that has
-/// at least as many Gaussians.
+/// Models that a search for the smallest sufficient number of Gaussians has kept so far, each between two prune steps.
+/// To try another number of Gaussians, the search starts from the smallest of these models that is large enough.
 pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
-    /// Models made so far, from large to small.
+    /// Models between two prune steps, from the largest to the smallest. The model after the last prune step of a
+    /// request is not kept.
     models: Vec<CompressedModel>,
 }
 
 impl<'a> PrunedModels<'a> {
-    /// Creates an empty list; `refinement` will make its models.
+    /// Creates an empty collection of models. [`PrunedModels::refined`] adds models to it, which it makes by the
+    /// optimization and prune steps of `refinement`.
     pub(crate) fn new(refinement: RefineRun<'a>) -> PrunedModels<'a> {
         PrunedModels { refinement, models: Vec::new() }
     }
 
-    /// Returns a refined model of `size` Gaussians. Prunes it from the smallest earlier model with at least `size`
-    /// Gaussians. Without one it begins with `start`, the Gaussians that ranking alone leaves.
+    /// Returns a refined model of `size` Gaussians: prunes the smallest kept model that has at least `size` Gaussians,
+    /// then runs the final optimization steps. If no kept model is large enough, pruning begins with `start`, the model
+    /// of the Gaussians that ranking alone keeps. Notes for the user are added to `journal`.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -45,8 +48,8 @@ impl<'a> PrunedModels<'a> {
     }
 }
 
-/// Returns how many of `count` Gaussians the next prune step keeps if `wanted` are to remain in the end: a fraction
-/// [`MIN_PRUNE_FRACTION`] of them, but at least one less than `count` and at least `wanted`.
+/// Returns how many of `count` Gaussians the next prune step keeps, if `wanted` are to remain in the end. This is the
+/// fraction [`MIN_PRUNE_FRACTION`] of `count`, but at least `wanted`, and less than `count`.
 fn next_size(count: usize, wanted: usize) -> usize {
     ((MIN_PRUNE_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }

@@ -23,28 +23,32 @@ use crate::scene::between::SplitMix64;
 use crate::source::FrameSource;
 
 /// Minimum and maximum number of optimization steps between two renderings of the validation views. Within these limits
-/// it is a third of all steps.
+/// the number is a third of the final steps.
 const VALIDATE_EVERY: [usize; 2] = [100, 500];
 /// Minimum time between two checkpoints, divided by the time that writing the last one took.
 const CHECKPOINT_COST_FACTOR: u32 = 40;
 /// Minimum and maximum time between two checkpoints. With this maximum an interrupted run loses less than a minute.
 const CHECKPOINT_INTERVAL: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(30)];
-/// Minimum gain in dB for which deltas that vary with time are kept; a smaller gain is not worth their bytes.
+/// Minimum gain in validation PSNR, dB, for which deltas that vary with time are kept; a smaller gain is not worth the
+/// bytes that these deltas take.
 const MIN_KEYFRAME_GAIN: f64 = 0.01;
-/// Factor applied to the learning rates when optimization steps have lowered the quality of the validation views.
+/// Factor applied to the learning rates when the optimization steps since the last validation have lowered the quality
+/// of the validation views.
 const RATE_REDUCTION: f32 = 0.3;
-/// Learning rates of the last step as a fraction of those of the first step: before a prune step, and in the final
-/// steps.
+/// Learning rate at the last optimization step of a phase, divided by the learning rate at its first step. First value:
+/// steps before a prune step; second value: final steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
-/// Fraction of the final steps at the end, over which the parameters are averaged. The mean is closer to the optimum
-/// than the parameters after a single step, which scatter around it.
+/// Fraction of the final steps, taken from their end, over which the parameters are averaged. The mean is closer to the
+/// optimum than the parameters after a single step, which scatter around it.
 const AVERAGED_FRACTION: f64 = 0.4;
 /// Number of optimization steps between two parameter deltas that are averaged.
 const AVERAGE_EVERY: usize = 4;
 
 impl RefineStage {
-    /// Prunes the model `reduction` down to `wanted` Gaussians and refines it. Returns the parameters with the best
-    /// quality on the validation views. Protected Gaussians (which the user keeps) are not changed.
+    /// Prunes the model `reduction` in prune steps to `wanted` Gaussians and refines it. Returns the model with the
+    /// parameters that have the best quality on the validation views. Protected Gaussians (which the user keeps) are
+    /// not changed. `scored`: ranking and protected Gaussians. `journal` gets notes for the user, and the reason if
+    /// nothing was done.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.
@@ -79,8 +83,8 @@ impl RefineStage {
         journal.cached(&scene.work, NAME, key, run)
     }
 
-    /// Refines like [`RefineStage::run`], as part of the stage `stage`, and returns only the mean PSNR in dB of the
-    /// validation views, compared with the original.
+    /// Refines like [`RefineStage::run`], as part of the stage named `stage` and with the given target views. Returns
+    /// only the mean PSNR in dB of the validation views of the refined model, compared with the original.
     ///
     /// # Errors
     /// Fails like [`RefineStage::run`].
@@ -101,7 +105,7 @@ impl RefineStage {
     }
 }
 
-/// Random order in which target views are used. Every epoch takes all views once, in a new order.
+/// Random order in which training views are used. Each epoch takes all of them once, in a new order.
 struct EpochSampler {
     pictures: Vec<usize>,
     at: usize,
@@ -125,7 +129,8 @@ impl EpochSampler {
         self.pictures[self.at - 1]
     }
 
-    /// Takes views until `taken` views have been taken in all, to continue an interrupted run.
+    /// Skips views of the random order until `taken` views have been taken since the beginning. Used to continue an
+    /// interrupted run.
     fn skip_to(&mut self, taken: usize) {
         while self.taken < taken {
             self.next();
@@ -133,7 +138,8 @@ impl EpochSampler {
     }
 }
 
-/// Refinement of a model, with the data that all its phases share.
+/// Refinement of a model, with the data that all its phases share. A phase is one prune step with the optimization
+/// steps before it, or the final optimization steps.
 pub(crate) struct RefineRun<'a> {
     refine: &'a RefineStage,
     scene: &'a Scene,
@@ -145,22 +151,23 @@ pub(crate) struct RefineRun<'a> {
     /// Name of the stage that runs the refinement.
     stage: &'static str,
     progress: Progress,
-    /// Cache key of the parameters and target views. The model that is refined is not part of it.
+    /// Cache key of the stage's parameters and of the target views. The model that is refined is not part of it.
     key: CacheKey,
 }
 
-/// Decides when the next checkpoint of a refinement is written. A phase is one prune step with the optimization steps
-/// before it, or the final steps.
+/// State that decides when the next checkpoint of a refinement is written. A phase is one prune step with the
+/// optimization steps before it, or the final steps.
 struct CheckpointTimer {
     /// Cache key of the refinement, under which its checkpoints are stored.
     key: CacheKey,
     phase: usize,
-    /// Time of the last checkpoint. `interval` is the minimum time until the next one.
+    /// Time of the last checkpoint. The next one is written `interval` later at the earliest.
     saved_at: Instant,
     interval: Duration,
 }
 
-/// Contents of a checkpoint that is written in the middle of a phase.
+/// Contents of a checkpoint that is written in the middle of a phase (one prune step with its optimization steps, or
+/// the final steps).
 #[derive(Serialize, Deserialize)]
 struct ResumePoint<Checkpoint, Best> {
     phase: usize,
@@ -169,11 +176,11 @@ struct ResumePoint<Checkpoint, Best> {
     taken: usize,
     schedule: RateSchedule,
     checkpoint: Checkpoint,
-    /// Best parameters so far; only in the last phase, which validates.
+    /// Best parameters so far, in the final steps. `None` before a prune step, because there is no validation there.
     best_state: Option<Best>,
 }
 
-/// Parameter deltas with the best validation quality in the last phase.
+/// Parameter deltas that have had the best validation quality in the final optimization steps.
 #[derive(Clone, Serialize, Deserialize)]
 struct BestState<Delta, Trajectory> {
     before: RenderQuality,
@@ -189,16 +196,16 @@ struct BestState<Delta, Trajectory> {
     mean: MeanDelta<Delta>,
 }
 
-/// Mean of the parameter deltas after some of the last optimization steps.
+/// Mean of the parameter deltas after every [`AVERAGE_EVERY`]-th of the last optimization steps.
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
-    /// Number of deltas that were averaged.
+    /// Number of deltas in the mean.
     count: u32,
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Includes `next` in the mean.
+    /// Updates the mean with one more delta, `next`.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -208,12 +215,13 @@ impl MeanDelta<ParamDelta> {
     }
 }
 
-/// Progress of a resumed phase: number of optimization steps done, learning rates and, in the last phase, the best
-/// deltas so far.
+/// Progress of a phase that continues from a checkpoint: number of optimization steps done, learning rates, and, in the
+/// final steps, the best deltas so far.
 type Resumed = (usize, RateSchedule, Option<BestState<ParamDelta, TrajectoryDelta>>);
 
 impl<'a> RefineRun<'a> {
-    /// Creates a refinement for the stage `stage`, which uses the training and validation views of `parts`.
+    /// Creates a refinement that the stage named `stage` runs. `refine`: parameters. `targets`: target views. `parts`:
+    /// indices of the training and validation views among the target views.
     pub(crate) fn new(
         stage: &'static str,
         refine: &'a RefineStage,
@@ -234,7 +242,7 @@ impl<'a> RefineRun<'a> {
         self.progress.restart(steps as u64);
     }
 
-    /// Creates the optimizer for the model `reduction`, whose frames are read from `result`.
+    /// Creates the optimizer for the model `reduction`. `result`: reader of the frames of this model.
     fn start_optimizer<'b>(
         &self,
         reduction: &CompressedModel,
@@ -247,8 +255,9 @@ impl<'a> RefineRun<'a> {
         OptimizerState::new(self.scene, result, self.targets, self.refine.step_params(), fixed)
     }
 
-    /// Returns the cache key of pruning and refining `reduction` to `size` Gaussians if `wanted` are to remain in the
-    /// end.
+    /// Returns the cache key of a refined model that is made from `reduction` by removing Gaussians until `size` are
+    /// left. The number of optimization steps also depends on `wanted`, the number of Gaussians after the last prune
+    /// step, so `wanted` is part of the key.
     fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
         self.key.extended_by(&(reduction, size, wanted, self.sampler.taken))
     }
@@ -258,7 +267,7 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Prunes `reduction` to `wanted` Gaussians in prune steps and then runs `steps` final optimization steps. Returns
-    /// the refined model and the mean PSNR in dB of its validation views, compared with the original.
+    /// the refined model, and the mean PSNR in dB of its renders of the validation views, compared with the original.
     fn run_all(
         &mut self,
         reduction: &CompressedModel,
@@ -283,8 +292,8 @@ impl<'a> RefineRun<'a> {
         Ok((left, best.psnr))
     }
 
-    /// Makes one prune step: runs optimization steps, then prunes `reduction` to `size` Gaussians. `wanted` is the
-    /// number of Gaussians that remain after the last prune step.
+    /// Makes one prune step: runs optimization steps, then removes all but `size` Gaussians of `reduction`. Returns the
+    /// pruned model. `wanted`: number of Gaussians that remain after the last prune step.
     pub(crate) fn cut_down(
         &mut self,
         reduction: &CompressedModel,
@@ -306,7 +315,7 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on `reduction` and returns it with the best deltas found.
+    /// Runs the final optimization steps on the model `reduction`. Returns this model with the best deltas found.
     pub(crate) fn refine_best(
         &mut self,
         mut reduction: CompressedModel,
@@ -328,7 +337,8 @@ impl<'a> RefineRun<'a> {
         Ok(reduction)
     }
 
-    /// Returns the number of keyframes of the time-varying delta; 0 if the input has no explicit frames.
+    /// Returns the number of keyframes of the time-varying delta; 0 if deltas are constant in time, as for inputs
+    /// without explicit frames.
     fn keyframe_count(&self) -> usize {
         match self.scene.input.has_explicit_frames() {
             true => keyframe_count(self.refine.knots, self.scene.source().info().times.len()),
@@ -348,12 +358,13 @@ impl<'a> RefineRun<'a> {
         Ok(())
     }
 
-    /// Returns the name of the cache entry of the checkpoint.
+    /// Returns the name of the cache entry that holds the checkpoint of this refinement.
     fn checkpoint_name(&self) -> String {
         format!("{}-steps", self.stage)
     }
 
-    /// Continues the present phase from its last checkpoint. Returns `None` if there is no checkpoint of this phase.
+    /// Restores the optimizer and the position in the random order of views from the last checkpoint of the current
+    /// phase of `timer`. Returns the progress of this phase, or `None` if there is no checkpoint of it.
     fn resume(&mut self, optimizer: &mut OptimizerState<'_>, timer: &CheckpointTimer) -> Result<Option<Resumed>> {
         let kept: Option<ResumePoint<KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
             self.scene.work.load(&self.checkpoint_name(), timer.key)?;
@@ -364,8 +375,9 @@ impl<'a> RefineRun<'a> {
         Ok(Some((kept.steps, kept.schedule, kept.best_state)))
     }
 
-    /// Writes a checkpoint of the present phase (one prune step, or the final steps), of which `steps` optimization
-    /// steps are done. Does nothing if too little time has passed since the last checkpoint.
+    /// Writes a checkpoint of the current phase (one prune step with its optimization steps, or the final steps), after
+    /// `steps` optimization steps of this phase. Does nothing if too little time has passed since the last checkpoint,
+    /// or if the cache is disabled.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,
@@ -429,8 +441,9 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs `steps` optimization steps of the constant delta, then the steps of the time-varying delta. Returns the
-    /// deltas with the best validation quality.
+    /// Runs `steps` optimization steps of the delta that is constant in time, then the steps of the time-varying delta.
+    /// Returns the deltas with the best validation quality. Records in `journal` the gain in validation PSNR, or the
+    /// reason why nothing was gained.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -506,9 +519,11 @@ impl<'a> RefineRun<'a> {
         Ok(best_state)
     }
 
-    /// Runs the steps of the time-varying delta that follow `steps` steps of the constant delta. Starts from the best
-    /// constant delta, or from the checkpoint after `done` steps. Stores the best deltas in `best_state`. Returns
-    /// whether any step was run.
+    /// Runs the optimization steps of the time-varying delta, which follow the `steps` steps of the constant delta.
+    /// Stores the best deltas in `best_state`. `done` is the number of steps of both deltas in the checkpoint that was
+    /// loaded; 0 without a checkpoint. If it is above `steps`, this function continues after these steps with the
+    /// learning rates `schedule`; otherwise it starts from the best constant delta. Returns false if there is nothing
+    /// to do, because no attribute may vary with time or the constant delta is good enough.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -548,7 +563,7 @@ impl<'a> RefineRun<'a> {
 }
 
 impl BestState<ParamDelta, TrajectoryDelta> {
-    /// Creates the best state before any optimization step, with the validation quality `before` and the delta `delta`.
+    /// Creates the best state before any optimization step: the delta `delta`, with the validation quality `before`.
     fn new(before: RenderQuality, delta: ParamDelta) -> Self {
         BestState {
             before,
@@ -561,7 +576,7 @@ impl BestState<ParamDelta, TrajectoryDelta> {
         }
     }
 
-    /// Returns a copy for a checkpoint, which borrows the deltas.
+    /// Returns a version of this state for a checkpoint, which borrows the deltas instead of copying them.
     fn checkpoint(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
         let BestState { before, best, constant, ref delta, rate_factor, ref trajectory, ref mean } = *self;
         let mean = MeanDelta { delta: &mean.delta, count: mean.count };

@@ -6,13 +6,15 @@ use crate::model::AttributeValues;
 /// Number of candidates for removal, as a multiple of the number of Gaussians to remove.
 const CANDIDATES: f64 = 1.6;
 
-/// Returns the indices of the `count` Gaussians that a prune step keeps, in increasing order. `errors` are their removal
-/// errors (the squared error of renders without the Gaussian), `fixed` marks those that must stay if possible, and
-/// `positions` are their centers in scene units.
+/// Returns the indices of the `count` Gaussians that a prune step keeps, in increasing order. `errors` are the removal
+/// errors of all Gaussians (the squared error of renders without the Gaussian), `fixed` marks Gaussians that must stay
+/// if possible, and `positions` are the centers of the Gaussians in scene units.
 ///
-/// Gaussians are removed in order of increasing error, equal errors by decreasing index. A removed Gaussian protects its
-/// nearest neighbor, because each error assumes that all others remain, and two neighbors that cover for each other
-/// would otherwise both be removed. If that leaves too few candidates, protected ones are removed too.
+/// Gaussians are removed in order of increasing error; of equal errors, the higher index goes first. A removed Gaussian
+/// protects its nearest neighbor: each error assumes that all other Gaussians remain, so two neighbors that cover for
+/// each other would otherwise both be removed. Only the Gaussians with the smallest errors are candidates,
+/// [`CANDIDATES`] times as many as have to be removed. If too few of them are unprotected, Gaussians are then removed
+/// in the same order without regard to protection.
 pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions: &AttributeValues) -> Vec<u32> {
     let removed_count = errors.len().saturating_sub(count);
     let mut ranked: Vec<u32> = (0..errors.len() as u32).collect();
@@ -53,7 +55,7 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
 mod tests {
     use super::*;
 
-    /// Returns positions on a line, one per coordinate of `along`.
+    /// Returns positions on the x axis; their x coordinates are `along`.
     fn line(along: &[f32]) -> AttributeValues {
         AttributeValues::from_planes(3, [along, &vec![0.0; 2 * along.len()]].concat())
     }

@@ -16,22 +16,25 @@ use crate::scene::outside::cameras_outside;
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
-/// Shares of the target views, in 26ths: views from the scene's cameras, and views from cameras between two of these.
+/// Shares of the target views, in 26ths: views from the scene's cameras, and views from new cameras (between two of the
+/// scene's cameras, or outside the rig).
 const VIEW_SHARES: [usize; 2] = [3, 23];
 /// Maximum number of bytes of all target views in the scratch file. There are at least [`MIN_VIEWS`] views even if they
 /// exceed it.
 const MAX_BYTES: u64 = 1 << 30;
 /// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// One in this many views is a validation view, if there are at least [`MANY_VIEWS`] views and if there are fewer.
+/// Distance between two validation views in the list of target views: first value with at least [`MANY_VIEWS`] target
+/// views, second value with fewer.
 const VALIDATION_EVERY: [usize; 2] = [16, 8];
-/// Number of views from which a sixteenth of them is enough for validation.
+/// Minimum number of target views of which one in 16, not one in 8, is enough for validation.
 const MANY_VIEWS: usize = 400;
 
-/// One in this many views is a test view, used only for the reported quality. Applies to runs with a quality target.
+/// Distance between two test views in the list of target views. Only runs with a quality target have test views, which
+/// they use only for the reported quality.
 const TEST_EVERY: usize = 4;
 
-/// Indices of the target views, by the purpose they are used for.
+/// Indices of the target views, divided by the purpose of the view.
 #[derive(Clone)]
 pub(crate) struct ViewSplit {
     /// Training views, to which optimization steps fit the parameters.
@@ -42,30 +45,32 @@ pub(crate) struct ViewSplit {
     pub(crate) held: Vec<usize>,
 }
 
-/// Returns the numbers of target views from the scene's cameras and from cameras between these. Together they are at
-/// most `max_views`; fewer if the `pixels` pixels of each view would need too many bytes.
+/// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
+/// `max_views`, and smaller if views of `pixels` pixels would need too many bytes.
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
     VIEW_SHARES.map(|part| part * count / 26)
 }
 
-/// Renders of the original model, in a scratch file. Their cameras are those by which Gaussians are scored, and cameras
-/// between these. Of a training view only the pixels of a grid are rendered; validation and test views are whole.
+/// Target views: renders of the original model, in a scratch file. Their cameras are the cameras by which Gaussians are
+/// scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a training
+/// view only the pixels of a grid are rendered; validation and test views are whole.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
     pub(crate) pictures: Vec<FrameView>,
-    /// Stride of the grid of pixels of the training views.
+    /// Stride n of the training views: only every n-th column and row of pixels is rendered.
     stride: NonZeroU32,
     /// Whether every fourth view is a test view, used only for the reported quality.
     has_test_views: bool,
-    /// Scratch files, each with a range of consecutive views. A file has the color values of one view after the other,
-    /// from 0 to 1 as 16-bit integers.
+    /// Scratch files, each with the range of consecutive views that it holds. A file has the color values (0 to 1 as
+    /// 16-bit integers) of one view after the other.
     values: Vec<(Range<usize>, Spill)>,
 }
 
-/// Fraction of the views from other cameras than those of the scene that are outside the rig if the quality there counts
-/// fully.
+/// Fraction of the views from new cameras that are rendered from cameras outside the rig if [`Scene::outside`] is 1.
+/// For smaller values of it the fraction is smaller in proportion. A camera is outside the rig if it sees the scene
+/// from a direction that no camera of the scene, and no path between two of them, has.
 const OUTSIDE_SHARE: f64 = 0.5;
 
 /// Purpose of a target view.
@@ -78,8 +83,8 @@ enum Purpose {
 
 impl Targets {
     /// Renders `max_views` views of the original; fewer if they would need too many bytes. Of training views only every
-    /// `stride`-th pixel in each direction is rendered. If `has_test_views`, every fourth view is a test view; otherwise
-    /// there are none.
+    /// `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth view is a test view;
+    /// otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
@@ -110,7 +115,7 @@ impl Targets {
         Ok(targets)
     }
 
-    /// Returns the stride of the grid of pixels of the training views.
+    /// Returns the stride n of the training views: only every n-th column and row of pixels was rendered.
     pub(crate) fn stride(&self) -> NonZeroU32 {
         self.stride
     }
@@ -147,7 +152,8 @@ impl Targets {
         }
     }
 
-    /// Returns the pixels of target view `k` that are compared with its values at `stride`, see [`Targets::values`].
+    /// Returns the camera of target view `k` with the grid of the pixels to render. [`Targets::values`] returns the
+    /// target colors of the same pixels if it gets the same `stride`.
     pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
         self.grid(k, stride).viewed_from(self.camera(k))
     }
@@ -157,14 +163,15 @@ impl Targets {
         &self.cameras[self.pictures[k].camera as usize]
     }
 
-    /// Returns the numbers of columns and rows of view `k` on its grid with `stride`.
+    /// Returns the numbers of pixel columns and rows of view `k` that are rendered and compared with the stride
+    /// `stride`.
     fn size(&self, k: usize, stride: NonZeroU32) -> [usize; 2] {
         let camera = self.camera(k);
         self.grid(k, stride).size([camera.width, camera.height]).map(|pixels| pixels as usize)
     }
 
-    /// Reads the color values of view `k` at the pixels of [`Targets::view`], from 0 to 1 as 16-bit integers. `stride`
-    /// must be a multiple of [`Targets::stride`].
+    /// Reads the color values of target view `k` at the pixels that [`Targets::view`] returns: red, green, blue per
+    /// pixel, 0 to 1 as 16-bit integers. `stride` must be a multiple of [`Targets::stride`].
     ///
     /// # Errors
     /// Fails if the scratch file cannot be read.
@@ -188,13 +195,14 @@ impl Targets {
     }
 }
 
-/// Returns the distance between the indices of two validation views, if there are `views` target views.
+/// Returns the distance between two validation views in the list of target views, which has `views` views.
 pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }
 
-/// Chooses the cameras, and the views sorted by frame: views by which Gaussians are scored, views from cameras in
-/// between, and views outside the rig if these count ([`Scene::outside`]).
+/// Chooses the target views and their cameras: views by which Gaussians are scored, views from cameras between these
+/// cameras, and, if [`Scene::outside`] is not 0, views from cameras outside the rig. Returns the cameras, and the views
+/// sorted by frame.
 fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
     let mut pictures = select_evenly(&scene.schedule, scene_views, VIEWS_PER_FRAME);
@@ -218,13 +226,14 @@ fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>
     (cameras, pictures)
 }
 
-/// Returns the mean square error of the render `picture` against the 16-bit values `target`.
+/// Returns the mean square error of the render `picture` against the target view `target`, whose color values are
+/// 16-bit integers. Color values are from 0 to 1; the render is clamped to this range.
 pub(crate) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
     picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
 }
 
-/// Converts color values from 0 to 1 to 16-bit integers; values outside are clamped.
+/// Converts the color values of a render, 0 to 1, to 16-bit integers. Values outside this range are clamped.
 pub(super) fn narrow(picture: &Image) -> Vec<u16> {
     // NaN becomes 0.
     picture.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()

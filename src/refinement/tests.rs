@@ -27,8 +27,8 @@ use crate::render::render;
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Keeps the first `count` Gaussians of the ranking of `scene` and refines them in `steps` steps; the Gaussians `keep`
-/// are protected (not changed).
+/// Keeps the first `count` Gaussians of the ranking of `scene` and refines them in `steps` steps. The Gaussians with
+/// the ids `keep` are protected (not changed). Returns the refined model and the journal of the run.
 fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
@@ -38,7 +38,8 @@ fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Compre
     (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
 }
 
-/// Returns the mean PSNR in dB of `reduction` over the test views of `rig`, compared with the original.
+/// Returns the mean PSNR in dB of renders of `reduction` over the test views of `rig`, compared with renders of the
+/// original.
 fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
     let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
     let result = scene.input.reduced(reduction).unwrap();
@@ -161,7 +162,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     }
 }
 
-/// Demo scene in which each frame shows a third of the Gaussians; all others have the opacity logit of the third field.
+/// Demo scene in which each frame shows a third of the Gaussians. The third field is the opacity logit of the others.
 struct ShortLives(demo_scene::DemoScene, SequenceInfo, f32);
 
 struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);

@@ -128,7 +128,8 @@ pub(super) fn size_parts(size: &ByModel<ModelSize>) -> Vec<(&'static str, u64, u
     if both.len() > 1 { both } else { Vec::new() }
 }
 
-/// Returns an HTML table with a row for the original and one for each compressed model.
+/// Returns an HTML table with a row for the original and one for each compressed model in `results`. `names` has the
+/// names of the compressed models.
 fn table(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].data.evaluation;
     let has_photographs = results.iter().all(|result| result.data.evaluation.ground_truth.is_some());

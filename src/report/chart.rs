@@ -77,8 +77,8 @@ pub struct BarChart {
     pub label: String,
     /// Name and value of each bar, from top to bottom.
     pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers only the range of the values instead of starting at 0. Marks are drawn instead of bars
-    /// if so.
+    /// Whether the axis covers only the range of the values instead of starting at 0. If so, marks are drawn instead of
+    /// bars.
     pub is_fitted: bool,
 }
 
@@ -105,8 +105,8 @@ struct AxisScale {
 }
 
 impl AxisScale {
-    /// Returns a scale that covers `values` with a margin and runs from pixel `from` to pixel `to` of the chart; `None`
-    /// if there are no values to draw.
+    /// Returns a scale for the axis `axis` that covers `values` with a margin and runs from pixel `from` to pixel `to`
+    /// of the chart; `None` if there are no values to draw.
     fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
@@ -135,13 +135,15 @@ impl AxisScale {
         })
     }
 
-    /// Extends the range of values so that `room` pixels stay free behind the last value on the axis.
+    /// Extends the range of values at its upper end, so that `room` pixels stay free after the largest value on the
+    /// axis.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
 
-    /// Returns the pixel at which `value` is drawn; `None` if it is not finite, or not positive on a logarithmic axis.
+    /// Returns the position at which `value` is drawn, in SVG units (about pixels); `None` if the value is not finite,
+    /// or not positive on a logarithmic axis.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
         let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
@@ -316,13 +318,13 @@ impl StackedHistogram {
 /// Style of a series, which selects CSS classes of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Index of the style (color, shape, dash) in [`STYLE`], below [`LOOKS`].
+    /// Index of the style (color, shape, dash) in [`STYLE`]; less than [`LOOKS`].
     number: usize,
     hollow: bool,
 }
 
 impl SeriesStyle {
-    /// Returns the style with the index `number` modulo [`LOOKS`], drawn solid.
+    /// Returns the style with the index `number` modulo [`LOOKS`], with solid lines and filled marks.
     fn from_number(number: usize) -> SeriesStyle {
         SeriesStyle { number: number % LOOKS, hollow: false }
     }
@@ -447,8 +449,8 @@ impl Drawing {
         self.x_axis(x, x_label, [self.top, bottom]);
     }
 
-    /// Draws ticks, grid lines and label of a horizontal axis. The grid lines run from `top` to `bottom`, in SVG units
-    /// (about pixels).
+    /// Draws ticks, grid lines and label of the horizontal axis `x`. The grid lines run from `top` to `bottom`, in SVG
+    /// units (about pixels).
     fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };

@@ -5,8 +5,9 @@ use super::film::{IMAGE_NAMES, JPEG_QUALITY};
 use super::html::{db, escape, figure};
 use super::shown::{MEDIAN, ShownImage, WORST};
 
-/// Returns the HTML of two sliders: for the render with the median PSNR and for the worst render. A slider shows two
-/// images of one view with a movable border between them.
+/// Returns the HTML of two sliders for the compressed models `results`: one for the render with the median PSNR, and
+/// one for the worst render. A slider shows two images of one view with a movable border between them. `names` has the
+/// names of the compressed models.
 pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let median = place_of(first, MEDIAN);
@@ -79,8 +80,8 @@ fn scores(shown: &ShownImage) -> String {
     format!("PSNR {}, SSIM {:.4}{flip}", db(shown.choice.psnr), shown.choice.ssim)
 }
 
-/// Returns the HTML of the slider for the chosen render with the index `place`. Its images lie on one another; the CSS
-/// classes select the two visible images.
+/// Returns the HTML of the slider for the chosen render with the index `place`, with the heading `title`. The images of
+/// a slider lie on top of one another; CSS classes select the two that are visible.
 fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> String {
     let shown = &results[0].shown[place];
     let layers = layers(results, names, place);
@@ -124,7 +125,8 @@ fn at_size(shrunk: u32) -> String {
     }
 }
 
-/// Returns the HTML of the animations with their controls. Without scripts the first frames are visible.
+/// Returns the HTML of the animations with their controls. If scripts are disabled, only the first frame of each
+/// animation is visible.
 pub(super) fn films(results: &[Analysis], names: &[String]) -> String {
     let films = &results[0].films;
     let Some(first) = films.first() else { return String::new() };

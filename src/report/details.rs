@@ -14,7 +14,8 @@ use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::StageRecord;
 use crate::pipeline::summary::Summary;
 
-/// Returns the HTML of the collapsed sections of the page, each with a label and one line of explanation.
+/// Returns the HTML of the collapsed sections of the page, each with a label and one line of explanation. `results` are
+/// the compressed models and `names` their names; `sweep` and `precision` hold the curves to include.
 pub(super) fn details(
     results: &[Analysis],
     names: &[String],
@@ -91,7 +92,7 @@ fn absent(text: &str) -> String {
 }
 
 /// Returns the HTML of tables with all quality measures, the render times, and the parts of the size of the compressed
-/// model `name`.
+/// model `name`, whose data is `result`.
 fn numbers(result: &ResultData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(
@@ -194,8 +195,8 @@ fn stages(run: &RunFiles) -> String {
     out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
 }
 
-/// Returns a bar chart of the values that `value` returns for the stages of the run. Returns an empty text if fewer
-/// than two stages have a value.
+/// Returns a bar chart, with the caption `title` and the axis label `label`, of the values that `value` returns for the
+/// stages of the run. Returns an empty text if fewer than two stages have a value.
 fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
     let bars: Vec<(String, f64)> =
         summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
@@ -206,7 +207,8 @@ fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&Stage
     figure_of(title, &chart.svg())
 }
 
-/// Returns the histograms of the scores as charts; a score with equal values for all Gaussians becomes a line of text.
+/// Returns the histograms of the scores in `result` as charts; a score whose values all fall into one bin becomes a
+/// line of text.
 fn score_histograms(result: &ResultData) -> String {
     let Some(histograms) = &result.histograms else {
         return absent(
@@ -290,8 +292,8 @@ fn skipped(result: &ResultData, run: &RunFiles) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-/// Returns the chart of a search for a quality goal: the numbers of Gaussians that it tried. Empty if the run did not
-/// search.
+/// Returns the chart of a search for a quality goal, with the numbers of Gaussians that the search tried. Returns an
+/// empty text if the run made no search.
 fn searched(summary: &Summary) -> String {
     summary.goal.as_ref().map_or(String::new(), trade_off::search)
 }

@@ -1,4 +1,4 @@
-//! Frame of an HTML file that needs no network, and its building blocks.
+//! Skeleton of an HTML page that needs no network, and small parts for its content.
 //!
 //! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
 //! load only images that the file contains and to run only the scripts whose digests it lists.
@@ -48,7 +48,8 @@ pub(super) fn links(names: &[&str]) -> String {
     links.join(", ")
 }
 
-/// Returns the HTML heading of the compressed model with the index `number`; empty if there is only one model.
+/// Returns the HTML heading of the compressed model with the index `number` in `names`; empty if there is only one
+/// compressed model.
 pub(super) fn heading(names: &[String], number: usize) -> String {
     if names.len() < 2 { String::new() } else { format!("<h3>{}</h3>\n", escape(&names[number])) }
 }

@@ -19,14 +19,14 @@ use crate::render::{Image, render};
 /// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
 /// colors.
 pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
-/// Minimum difference in dB for a failure mode to be flagged: by so much the PSNR where the kind of Gaussian is visible
-/// is below the PSNR elsewhere. 3 dB lower is twice the squared error.
+/// Minimum gap in dB for a failure mode to be flagged: PSNR where the kind of Gaussian is not visible, minus PSNR where
+/// it is visible. A PSNR lower by 3 dB means twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
-/// Minimum share of a render's pixels that a kind of Gaussian must have for its failure mode to be judged in this
-/// render.
+/// Minimum share of a kind of Gaussian in the pixels of a render, from 0 to 1. If the share is smaller, the failure
+/// mode of this kind is not judged in this render.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
-/// Minimum lost fraction of a kind's contribution to renders for its failure mode to be flagged. Lost is the
-/// contribution of Gaussians that were dropped or merged.
+/// Minimum fraction of a kind's contribution to renders that must be lost for its failure mode to be flagged. The
+/// contribution of Gaussians that were dropped or merged is lost.
 pub const MIN_LOST_SHARE: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP_SIDE_PX: u32 = 64;
@@ -48,8 +48,8 @@ struct FailureSums {
     weight: f64,
     /// Sum over pixels of w e²: the share of the kind times the squared difference of the renders.
     error: f64,
-    /// Sum over pixels of w ∇c·∇o, where w is the share of the kind, and c and o are the brightness of the compressed
-    /// and of the original render. `detail` is the sum of w ∇o·∇o.
+    /// Sum over pixels of w ∇c·∇o. Here w is the share of the kind in the pixel, and c and o are the brightness of the
+    /// compressed and of the original render. The field `detail` is the sum of w ∇o·∇o.
     kept_detail: f64,
     detail: f64,
 }
@@ -124,16 +124,18 @@ pub struct FailureMode {
     pub worst: Option<WorstPlace>,
 }
 
-/// Counts and contribution of the Gaussians of one kind. They are known before rendering.
+/// Numbers and contribution of the Gaussians of one kind (fast, thin or changing in appearance). They come from the
+/// statistics, not from the compared renders.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KindMembers {
     /// Number of Gaussians of this kind.
     pub count: usize,
-    /// Numbers of Gaussians of this kind that were dropped and that were merged; `None` without an index map (file that
-    /// maps input to output Gaussians).
+    /// Two numbers of Gaussians of this kind: dropped, and merged. `None` without an index map (file that maps input to
+    /// output Gaussians).
     pub fates: Option<(usize, usize)>,
-    /// Two fractions: contribution of this kind to renders, as a fraction of the contribution of all Gaussians; and the
-    /// fraction of this kind's contribution that belongs to Gaussians that were dropped or merged.
+    /// Two fractions. First: the contribution of this kind to renders, divided by the contribution of all Gaussians.
+    /// Second: the contribution of the Gaussians of this kind that were dropped or merged, divided by the contribution
+    /// of this kind.
     pub shares: (f64, f64),
 }
 
@@ -198,8 +200,9 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `seen` has the error
-/// sums of all renders, `names` the frame and the view of each render.
+/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `members` has the
+/// counts and the contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the
+/// frame and the view of each render.
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
@@ -279,16 +282,17 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
     }
 }
 
-/// Returns the PSNR in dB. `error` is a weighted sum of squared errors, `weight` the sum of the weights; `None` if the
-/// weights sum to 0.
+/// Returns the PSNR in dB, at most [`PSNR_CAP_DB`]. `error` is a weighted sum of squared errors, and `weight` the sum
+/// of the weights; `None` if the weights sum to 0.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. The error is the
-/// sum of w e² over the pixels of the square, where w is the share of the kind in a pixel and e² the squared difference
-/// of the renders. The square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the
-/// first is taken, row by row.
+/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. `taken` has the
+/// renders of both models, and `shares` the shares of the kinds in every pixel. The error is the sum of w e² over the
+/// pixels of the square, where w is the share of the kind in a pixel and e² the squared difference of the renders. The
+/// square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the first is taken, row
+/// by row.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));

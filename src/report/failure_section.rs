@@ -4,7 +4,8 @@ use super::failure::{FailureMode, MIN_LOST_SHARE, MIN_PSNR_GAP_DB, VISIBLE_ERROR
 use super::findings::WorstPlaceImages;
 use super::html::{count, db, escape, figure, percent};
 
-/// Returns the HTML of a card for each failure mode, with its measurements and images of the place where it is worst.
+/// Returns the HTML of one card for each failure mode in `modes`. A card has the measurements of the failure mode and,
+/// if they are in `close`, the images of the place where it is worst.
 pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String {
     let mut out = format!(
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \

@@ -64,8 +64,8 @@ pub struct FilmPanel {
 /// Names of the three images of each frame, in the order of [`FilmPanel::images`].
 pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Returns the number of bytes of memory for the animations and for the page that contains them, estimated at one byte
-/// per pixel each.
+/// Returns the number of bytes of memory for the animations, and for the page that contains them. Each of the two is
+/// estimated at one byte per pixel.
 pub fn memory_bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)

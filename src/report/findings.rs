@@ -46,8 +46,9 @@ pub struct ResultData {
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
-    /// Measurements of the failure modes: for each kind of Gaussian (fast, thin, …), in the order of
-    /// [`super::traits::GaussianKind::ALL`], whether the loss is visible where Gaussians of this kind are visible.
+    /// Measurements of the failure modes, one per kind of Gaussian (fast, thin, …) in the order of
+    /// [`super::traits::GaussianKind::ALL`]. They tell whether the loss is visible where Gaussians of this kind are
+    /// visible.
     pub failure_modes: Vec<FailureMode>,
     /// Histograms of the scores of kept, merged and dropped Gaussians; `None` without an index map (file that maps
     /// input to output Gaussians).

@@ -96,8 +96,8 @@ fn even(frames: usize) -> Vec<f64> {
 }
 
 impl Histogram {
-    /// Counts `values` (one per Gaussian, with its fate in `fates`) in bins whose edges have equal ratios. Returns the
-    /// histogram.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in bins with equal ratios of upper to lower edge.
+    /// Returns the histogram of the quantity `name`, whose meaning is `meaning`.
     fn from_values(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
@@ -122,7 +122,8 @@ impl Histogram {
         Histogram { log: true, ..Histogram::within(name, meaning, edges, values, fates) }
     }
 
-    /// Counts `values` (one per Gaussian, with its fate in `fates`) in the bins between `edges`. Returns the histogram.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in the bins between `edges`. Returns the histogram
+    /// of the quantity `name`, whose meaning is `meaning`.
     fn within(name: &'static str, meaning: &'static str, edges: Vec<f64>, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let bins = edges.len().saturating_sub(1);

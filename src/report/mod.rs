@@ -239,8 +239,10 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are the split with as many
-/// views as the summary of the run states; if there is none, the training views, else all views.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are recognized by their
+/// number, which the summary of the run states. Tried in this order: the training views, all views, the held-out views.
+/// Without a summary, or if none of these has the stated number of views, returns the training views, or all views if
+/// there are no training views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -276,8 +278,9 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians. `traits` has the kinds of every
-/// Gaussian. `fates` is `None` without an index map (file that maps input to output Gaussians).
+/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians, from their statistics `rows`.
+/// `traits` has the kinds of every Gaussian. `fates` is `None` without an index map (file that maps input to output
+/// Gaussians).
 fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -291,8 +294,9 @@ fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMe
     })
 }
 
-/// Renders the chosen views once more for their images. Returns these images, and for each failure mode the images of
-/// the place where it is worst.
+/// Renders again the views of `choices` and the views in which failure modes are worst. Returns the images of
+/// `choices`, and for each failure mode in `modes` with a worst place the images of this place. `traits` has the kinds
+/// of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],
@@ -321,7 +325,7 @@ fn show_again(
     Ok((shown, close))
 }
 
-/// Writes the report page and its data files to the output folder.
+/// Writes the report page `page` and its data files, which hold `report`, to the output folder of `options`.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");

@@ -12,7 +12,8 @@ const SLIDER: &str = include_str!("slider.js");
 /// JavaScript of the animations.
 const FILM: &str = include_str!("film.js");
 
-/// Returns the HTML of the report page for one or more compressed models of one original.
+/// Returns the HTML of the report page for `results`, one or more compressed models of one original. `sweep` and
+/// `precision` hold curves to include, if there are any.
 pub(super) fn page(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
     let names = names(results);
     let title = format!("{} – splatsieve report", names.join(", "));

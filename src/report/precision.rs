@@ -57,7 +57,7 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
-/// Returns the HTML of the conditions under which the diagrams were measured, and of the notes.
+/// Returns the HTML of a paragraph on the conditions under which the diagrams were measured, followed by the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
@@ -115,7 +115,8 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of the error called `error` against a measure of work (time or memory), both on logarithmic axes.
+/// Returns the chart of the error called `error` against a measure of work (time or memory) for the settings of `knob`,
+/// both on logarithmic axes.
 fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
@@ -135,8 +136,8 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     (title, plot.svg())
 }
 
-/// Returns the label of a measurement in a chart: the value of the varied parameter, with a star if the recipe has this
-/// value.
+/// Returns the label of the measurement `mark` in the chart of `curve`: the value of the varied parameter, with a star
+/// if the recipe has this value.
 fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
     let own = if curve.recipe_value == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))

@@ -19,7 +19,7 @@ pub(super) fn charts(results: &[Analysis], names: &[String]) -> String {
     wrapped(charts)
 }
 
-/// Returns the HTML of the charts by frame of the quality measures other than PSNR.
+/// Returns the HTML of charts over the frames, one for each quality measure other than PSNR.
 pub(super) fn other_charts(results: &[Analysis], names: &[String]) -> String {
     let mut charts = by_frame(results, names, "SSIM", "SSIM", &|means| Some(means.ssim));
     charts += &by_frame(results, names, "Temporal error", "error", &|means| means.temporal);
@@ -31,7 +31,8 @@ fn wrapped(charts: String) -> String {
     if charts.is_empty() { charts } else { format!("<div class=\"charts\">\n{charts}</div>\n") }
 }
 
-/// Returns the HTML of a chart of one quality measure over the frames; empty for fewer than two frames.
+/// Returns the HTML of a chart of one quality measure, which `value` returns, over the frames; empty for fewer than two
+/// frames. `title` is its caption, and `label` its axis label.
 fn by_frame(
     results: &[Analysis],
     names: &[String],

@@ -54,8 +54,8 @@ pub struct ChosenRender {
     pub flip: Option<f64>,
 }
 
-/// Chooses the renders that the page shows, the worst first. A render that is chosen for several reasons occurs once,
-/// with all its reasons.
+/// Returns the renders that the page shows, chosen from the comparison `found`; the worst render comes first. A render
+/// that is chosen for several reasons occurs once, with all its reasons.
 pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     let pictures = &found.views;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
@@ -95,8 +95,8 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     chosen
 }
 
-/// Returns the renders `choices` with their scores in `found`, the evaluation of another compressed model. The renders
-/// were chosen for the first compressed model of the same original.
+/// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `found` is
+/// the evaluation of this other model; the scores in `choices` are those of the first compressed model.
 pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
         let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;

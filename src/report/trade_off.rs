@@ -108,8 +108,8 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of error against run time for the tried values of the parameter `knob`. For comparison it also has
-/// the result of the same method without refinement at the same number of Gaussians.
+/// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For comparison
+/// it also has the result of the same method without refinement at the same number of Gaussians.
 fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
@@ -158,11 +158,12 @@ struct MethodCurve<'a> {
     name: &'a str,
     /// Measurements by increasing number of Gaussians.
     points: Vec<&'a TradeOffPoint>,
-    /// Whether this method differs from the method listed before it only by its lack of refinement.
+    /// Whether this curve shows the same method as the curve before it, but without refinement.
     paired: bool,
 }
 
-/// Groups the measurements by method. A method measured with and without refinement comes first, as a pair.
+/// Groups the measurements by method, one curve per method. If a method was measured with and without refinement, its
+/// two curves come first: with refinement, then without.
 fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
     let mut curves: Vec<MethodCurve<'_>> = Vec::new();
     for point in &found.points {

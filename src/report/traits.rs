@@ -107,9 +107,9 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
     Ok(found)
 }
 
-/// Returns two fractions for each kind of Gaussian: the contribution of its Gaussians to renders, as a fraction of the
-/// contribution of all Gaussians; and the part of the kind's contribution that belongs to Gaussians for which `is_lost`
-/// is true, as a fraction.
+/// Returns two fractions for each kind of Gaussian. First: the contribution of the kind to renders, divided by the
+/// contribution of all Gaussians. Second: the contribution of the Gaussians of this kind for which `is_lost` is true,
+/// divided by the contribution of the kind. `traits` has the kinds of every Gaussian.
 pub fn contribution_shares(rows: &Rows, traits: &[KindFlags], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
@@ -137,8 +137,8 @@ fn samples(frames: usize) -> Vec<usize> {
 /// Measures how non-rigidly each of the Gaussians `ids` and its neighbors move. The neighbors are the nearest visible
 /// Gaussians at the reference frame. For each neighbor, the change of its distance over time (root mean square) is
 /// divided by the distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the
-/// lower median over its neighbors. A rigid motion, rotations included, gives 0. The median ignores neighbors that
-/// belong to another object.
+/// lower median of these relative changes over its neighbors. `frames` are the frames at which distances are measured.
+/// A rigid motion, rotations included, gives 0. The median ignores neighbors that belong to another object.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -265,8 +265,8 @@ mod tests {
         SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Attributes::all() }
     }
 
-    /// Returns the non-rigid motion ([`bending`]) of each point of a 5 × 5 × 5 lattice whose points `place` moves as a
-    /// function of time.
+    /// Returns the non-rigid motion ([`bending`]) of each point of a moving lattice of 5 × 5 × 5 points. `place`
+    /// returns the position of a lattice point at a time from 0 to 1.
     fn bent(place: impl Fn([f64; 3], f64) -> [f64; 3] + Sync + Send) -> Vec<f64> {
         let source = Made(info(125, 10), |id, frame, out: &mut Gaussians, row| {
             let at = [id % 5, id / 5 % 5, id / 25].map(|k| k as f64);

@@ -11,29 +11,30 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Ids of the absent Gaussians, in increasing order.
+/// Ids, in increasing order, of the absent Gaussians: those that are made invisible because some of their values are
+/// NaN or infinite.
 #[derive(Debug, Default)]
 pub(super) struct Absent(RwLock<Arc<[u32]>>);
 
 impl Absent {
-    /// Returns the ids of the absent Gaussians.
+    /// Returns the ids of the absent (invisible) Gaussians, in increasing order.
     fn ids(&self) -> Arc<[u32]> {
         self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Replaces the absent Gaussians by those with the ids `ids`, which must be in increasing order.
+    /// Replaces the ids of the absent (invisible) Gaussians by `ids`, which must be in increasing order.
     pub(super) fn set(&self, ids: &[u32]) {
         debug_assert!(ids.is_sorted(), "absent ids are sorted");
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = ids.into();
     }
 
-    /// Returns whether no Gaussian is absent.
+    /// Returns whether no Gaussian is absent (made invisible).
     pub(super) fn is_empty(&self) -> bool {
         self.ids().is_empty()
     }
 
-    /// Wraps `reader`, which reads the Gaussians `ids`, so that it returns invisible values for absent Gaussians.
-    /// Returns `reader` unchanged if none of its Gaussians is absent.
+    /// Wraps `reader`, which reads the Gaussians with the ids `ids`, in a reader that makes absent Gaussians invisible.
+    /// Returns `reader` itself if none of these Gaussians is absent.
     pub(super) fn hiding<'a>(&self, reader: Box<dyn BlockReader + 'a>, ids: &Ids<'_>) -> Box<dyn BlockReader + 'a> {
         let absent = self.ids();
         let rows = ids.iter().enumerate().filter(|(_, id)| absent.binary_search(&(*id as u32)).is_ok());
@@ -42,11 +43,11 @@ impl Absent {
     }
 }
 
-/// Reader that makes some of the Gaussians of another reader invisible: those that are excluded from the scene, because
-/// a value of theirs is NaN or infinite.
+/// Reader that returns the Gaussians of another reader, but makes the absent Gaussians (those with NaN or infinite
+/// values) invisible.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// Rows of the absent Gaussians among those that are read.
+    /// Rows, in the data that `reader` returns, of the Gaussians to make invisible.
     rows: Vec<usize>,
 }
 
@@ -66,8 +67,8 @@ impl BlockReader for HidingReader<'_> {
     }
 }
 
-/// Makes the Gaussian in row `row` of `state` invisible by setting its attributes `want`: a position of NaN (which lies
-/// in no box and is not rendered), an opacity of 0, the identity rotation, size 1 and no color.
+/// Makes the Gaussian in row `row` of `state` invisible by overwriting its attributes `want`: position NaN (which lies
+/// in no box and is not rendered), opacity 0, the identity rotation, scale 1 on each axis, and SH coefficients 0.
 fn clear_row(state: &mut Gaussians, want: Attributes, row: usize) {
     for column in want.iter() {
         let value = match column {

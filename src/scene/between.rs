@@ -5,19 +5,21 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::model::Camera;
 
-/// Smallest distance of a new camera from each of the two cameras that it lies between, as a fraction of the path
-/// between these two.
+/// Smallest distance of a new camera from either of the two cameras between which it is placed, as a fraction of the
+/// path between these two.
 const MIN_FRACTION: f64 = 0.15;
 /// Smallest cosine of the angle between two cameras, seen from the point where the optical axes meet, for a new camera
 /// to be placed between them: angles up to about 127° are allowed. Halfway between opposite cameras, the viewing
 /// direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
-/// Returns `count` new cameras, each on the path between two of `cameras`, with evenly interpolated rotation and
-/// distance. One of the two is chosen at random. The other is chosen at random among the cameras less than about 127°
-/// away from it, seen from the point where the optical axes meet; if there are none, it is the nearest camera at
-/// another position. (Paths between neighbors only would leave the middle of a rig empty.) Returns no camera if all
-/// cameras are at one position. The random numbers are the same in every run.
+/// Returns `count` new cameras, each at a random place on the path between two of `cameras`. Along the path, rotation
+/// and distance from the point where the optical axes meet are interpolated evenly. Returns no camera if all cameras
+/// are at one position. The random numbers are the same in every run.
+///
+/// The camera at the start of a path is chosen at random. The camera at its end is chosen at random among the cameras
+/// that are less than about 127° away, as seen from the point where the optical axes meet. If there are none, the
+/// nearest camera at another position is taken. (Paths between neighbors only would leave the middle of a rig empty.)
 pub fn cameras_between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);

@@ -6,12 +6,12 @@ use super::{InputOptions, Scene};
 use crate::error::{Error, Result, ShowPath};
 use crate::models::{self, InputModel, OpenOptions, TimeOrigin};
 
-/// Maximum difference between the times of the same frame in two models, as a fraction of the time span. Files round
-/// times.
+/// Maximum difference between the times of the same frame in two models, as a fraction of the time span of the
+/// sequence. Times that were written to a file are rounded, so they may differ slightly.
 const TIME_TOLERANCE: f64 = 1e-6;
 
-/// Opens the compressed model at `path` at the times of the original's frames. `options` are those the original was
-/// opened with; their training iteration is ignored.
+/// Opens the compressed model at `path`, with frames at the times of the frames of `original`. `options` are the
+/// options with which the original was opened; the training iteration in them is ignored.
 ///
 /// # Errors
 /// Fails if the model cannot be read, or if the number or the times of its frames differ from the original's.

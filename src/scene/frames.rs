@@ -7,14 +7,16 @@ use crate::model::SequenceInfo;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
 impl Scene {
-    /// Makes the Gaussians `ids` (in increasing order) invisible in all later reads of the scene's frames, and makes
-    /// visible all that were hidden before. The cache keys of stage results include these ids.
+    /// Makes the Gaussians with the ids `ids` (in increasing order) invisible in all later reads of the scene's frames.
+    /// Gaussians that an earlier call made invisible become visible again, unless they are in `ids`. The cache keys of
+    /// stage results include these ids.
     pub fn set_absent(&self, ids: &[u32]) {
         self.work.set_absent(ids);
         self.absent.set(ids);
     }
 
-    /// Returns the source of the scene's frames, in which absent Gaussians are invisible.
+    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_absent`]) are invisible in
+    /// it.
     pub fn source(&self) -> &dyn FrameSource {
         if self.absent.is_empty() { self.input.source() } else { self }
     }

@@ -1,4 +1,4 @@
-//! Options for opening an input together with its cameras.
+//! Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,18 +13,18 @@ use crate::models;
 use crate::models::{InputModel, LinkMode, OpenOptions, TrainingConventions};
 use crate::progress::Events;
 
-/// Options for opening an input together with its cameras.
+/// Options for opening an input (a model, a sequence of frames or a frame stream) together with its cameras.
 #[derive(Debug, Clone, Default)]
 pub struct InputOptions {
     /// Model folder, folder of PLY files, .ply or .gseq file; `-`: a frame stream on standard input.
     pub path: PathBuf,
     /// Training iteration to read from a model folder; `None`: the latest one found.
     pub iteration: Option<u32>,
-    /// Training conventions that the files of a model do not state.
+    /// Conventions of the training, such as the period of colors, that the files of some model formats do not state.
     pub conventions: TrainingConventions,
     /// Whether a folder with one PLY file per frame may lack frames.
     pub allow_gaps: bool,
-    /// Whether the Gaussians of successive frames are matched with each other and linked into tracks.
+    /// Choice whether the Gaussians of successive frames are matched with each other and linked into tracks.
     pub link: LinkMode,
     /// Number of frames at which a model that is continuous in time is evaluated; `None`: the times of the cameras are
     /// used.
@@ -33,7 +33,7 @@ pub struct InputOptions {
     pub cameras: Option<PathBuf>,
     /// Image width and height in pixels, for cameras whose file does not state them.
     pub size: Option<(u32, u32)>,
-    /// Origin of the times of views if the camera file does not state them.
+    /// Source of the times of views: the camera file, the names of the images, a table, or none.
     pub times: TimesSource,
     /// Split (training, validation or test) whose views are used; `None`: the views of all splits.
     pub split: Option<Split>,
@@ -56,7 +56,7 @@ impl InputOptions {
         self.path == Path::new("-")
     }
 
-    /// Returns those of the options that apply to the input without its cameras.
+    /// Returns the options for opening the input alone, without its cameras.
     pub fn open_options(&self) -> OpenOptions {
         OpenOptions {
             iteration: self.iteration,
@@ -99,7 +99,7 @@ impl InputOptions {
         Ok(())
     }
 
-    /// Returns the folder for temporary files.
+    /// Returns the folder for temporary files: `scratch`, or else the system's folder.
     pub fn scratch_folder(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }
@@ -115,10 +115,13 @@ pub struct OpenedInput {
     pub notes: Vec<String>,
 }
 
-/// Loads the cameras from `path`; returns `None` without a path. `times` and `clock` say how views get their times. If
-/// the camera file does not state the number of frames, the number that `input` was trained on is used, else that of
-/// `options`. The background color is that of the camera file. If the file has none and the input is a sequence of
-/// frames, which states none either, it is the training background of the model in whose folder the cameras are.
+/// Loads the cameras from the file or folder `path`; returns `None` if `path` is `None`. `times` states where the times
+/// of views come from, `clock` whether times in the camera file are normalized.
+///
+/// Values that the camera file does not state come from other places:
+/// - Number of frames: the number on which `input` was trained, else the number in `options`.
+/// - Background color: if `input` is a sequence of frames or `None`, the training background of the model in whose
+///   folder the cameras lie; otherwise none.
 ///
 /// # Errors
 /// Fails if the file does not exist or contains no cameras.

@@ -32,7 +32,8 @@ pub use stream::{FrameQuota, frame_quota, is_linked, link_stream, open_stream, r
 pub use work::open_cache;
 pub(crate) use work::stamps;
 
-/// Input together with its cameras, and what a run needs to read and cache it.
+/// Input (a model or a sequence of frames) together with its cameras, the schedule of its views, and the memory limits,
+/// folders and cache of the run.
 pub struct Scene {
     /// Path of the input as the user gave it.
     pub path: PathBuf,
@@ -40,9 +41,11 @@ pub struct Scene {
     pub input: Box<dyn InputModel>,
     /// Cameras and the views they took, of all splits (training, validation, test).
     pub rig: Rig,
-    /// Views at each frame, from the cameras of the chosen split, and from cameras outside the rig if these were added.
+    /// Views at each frame: from the cameras of the chosen split and, if these were added, from cameras outside the rig
+    /// (in directions from which no camera of the rig sees the scene).
     pub schedule: ViewSchedule,
-    /// How far outside the rig the quality of renders counts, see [`Scene::add_outside_views`]; 0: not at all.
+    /// How far outside the directions of the rig's cameras the quality of renders counts, from 0 to 1 (`reach` of
+    /// [`Scene::add_outside_views`]); 0: not at all.
     pub outside: f64,
     /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside
@@ -53,16 +56,17 @@ pub struct Scene {
     pub background: [f32; 3],
     /// Maximum amounts (frames, views, Gaussians) that passes over the scene keep in memory at a time.
     pub limits: Limits,
-    /// Maximum number of full reads of the input, from the memory plan that set `limits`; `None` before a plan is made.
+    /// Maximum number of times that the run reads the whole input, according to the memory plan that set `limits`;
+    /// `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// Measured speed of this machine for this scene, as a multiple of assumed times, from which later stages estimate
-    /// their time.
+    /// Measured times of this machine for this scene, as multiples of the times assumed for planning. Later stages
+    /// estimate their time with these factors.
     pub pace: Throughput,
     /// Folder for temporary files during the run.
     pub scratch: PathBuf,
-    /// Cache of stage results; it may be off and store nothing.
+    /// Cache of stage results. A disabled cache stores nothing.
     pub work: Cache,
-    /// Hash of the input's content, if it is known already.
+    /// Hash of the input's content; `None` if it has not been computed yet.
     digest: Option<String>,
     /// Notes about the input to show to the user.
     pub notes: Vec<String>,
@@ -73,8 +77,8 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Creates the scene of `input` seen by the cameras of `rig` in `split` (`None`: all splits), without memory
-    /// limits.
+    /// Creates the scene of `input` and the cameras of `rig`, with the views of `split` (`None`: of all splits) and
+    /// without memory limits.
     ///
     /// # Errors
     /// Fails if a camera has a time that is not the time of any frame.
@@ -123,7 +127,8 @@ impl Scene {
         Ok(())
     }
 
-    /// Makes this scene keep to the limits of the memory plan `plan`.
+    /// Applies the memory plan `plan`: sets the limits for passes over this scene, and lets the input keep decoded
+    /// tiles in memory if the plan says so.
     pub fn apply_plan(&mut self, plan: &MemoryPlan) {
         self.limits = plan.limits;
         self.planned_reads = Some(plan.full_reads());
@@ -136,7 +141,7 @@ impl Scene {
     /// takes.
     ///
     /// # Errors
-    /// Fails if a file does not exist any more.
+    /// Fails if a file of the input does not exist any more.
     pub fn full_read(&self) -> Result<Reads> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;

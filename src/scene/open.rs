@@ -19,8 +19,8 @@ use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
 
-/// Opens an input, and loads its cameras if it has any. The cameras determine the times of frames that the input does
-/// not state.
+/// Opens an input, and loads its cameras if it has any. If the input does not state the times of its frames, the times
+/// of the cameras' views are used.
 ///
 /// # Errors
 /// Fails if the input or the cameras are invalid, if the cameras belong to a sequence with other frames, or if an
@@ -67,9 +67,10 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     check_frames(OpenedInput { input, rig, notes }, path)
 }
 
-/// Loads the cameras that `options` name, or else those found with `input`. The camera file of a model may count time
-/// differently from frames with time stamps. If the normalized times match no frames, the times as the file gives them
-/// are tried.
+/// Loads the cameras that `options` name, or else the cameras found with `input`. Returns `None` if there are neither.
+/// The times in a camera file may be on another scale than the time stamps of frames. If the normalized times of the
+/// views are not among the time stamps, the times as the camera file states them are used, provided that these are
+/// among the time stamps.
 fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the image names of a still scene are not times.
@@ -88,8 +89,9 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
     }
 }
 
-/// Returns evenly spaced frame times from 0 up to the time span `span`, for a model whose cameras give no times.
-/// `given` is the number of frames that the user gave; if there is none, a default is used and a note is added.
+/// Returns evenly spaced frame times from 0 up to but not including `span`, for a model whose cameras give no times.
+/// `given` is the number of frames that the user gave; if it is `None`, a default is used and a message about this is
+/// added to `notes`.
 ///
 /// # Errors
 /// Fails if the number of frames is not from 1 to 1,000,000.
@@ -124,7 +126,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 }
 
 /// Creates the scene of an opened input, seen by the cameras of the split in `options`. If the input has no cameras,
-/// virtual ones are placed by the Gaussians of the first frame.
+/// virtual ones are placed around the Gaussians of the first frame.
 ///
 /// # Errors
 /// Fails if the cameras belong to another scene, or if the split has no views.
@@ -172,7 +174,8 @@ fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf
     options.cameras.clone().or_else(|| cameras::find_training_cameras(input.data_folder()?, &options.path))
 }
 
-/// Returns virtual cameras all around the surface of a scene with only one frame. Memory: 64 bytes per Gaussian.
+/// Returns a rig of virtual cameras (placed by the program) all around the surface of a scene with only one frame.
+/// Memory: 64 bytes per Gaussian.
 fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     let state = gather_all(source, 0, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::OPACITY)?;
     let positions: Vec<DVec3> =
@@ -186,7 +189,7 @@ fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     Ok(cameras::surrounding_rig(&positions, &weights))
 }
 
-/// Returns a virtual camera rig (cameras placed by the program) around the robust box of the first frame, which leaves
+/// Returns a rig of virtual cameras (placed by the program) around the robust box of the first frame. This box leaves
 /// out the outermost 1% of the positions on each side.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     let (middle, extent) = first_frame_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.median, found.extent()));
@@ -203,7 +206,8 @@ pub fn first_frame_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
 }
 
 /// Returns the folder for temporary files of a run that writes `output`: the folder that contains the output, since a
-/// disk with space for the result also has space for packed input. Returns `None` if `output` is a device or a FIFO.
+/// disk with space for the output also has space for a temporary copy of packed input. Returns `None` if `output` is a
+/// device or a FIFO.
 pub fn scratch_beside(output: &Path) -> Option<PathBuf> {
     if std::fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return None;

@@ -1,5 +1,5 @@
-//! Cameras outside the rig of a scene: viewing directions that none of its cameras, and no path between two of them,
-//! has. In a player or in VR, people move there.
+//! Cameras outside the rig (the cameras of a scene): they see the scene from directions that neither a camera of the
+//! rig nor a camera on a path between two of them has. In a player or in VR, people move to such places.
 
 use std::collections::BTreeSet;
 use std::f64::consts::PI;
@@ -10,24 +10,31 @@ use super::Scene;
 use super::between::{SplitMix64, cameras_between, meeting_point};
 use crate::model::{Camera, Rig, Split, ViewSchedule};
 
-/// View number of the views from cameras outside the rig, which no data set has.
+/// View number of all views from cameras outside the rig. No data set uses this number.
 const VIEW_NUMBER: u32 = u32::MAX;
-/// Number of different cameras outside the rig for each of them that a frame has, and their maximum number.
+/// Number of different cameras outside the rig that are created, as a multiple of the largest number of views at one
+/// frame.
 const CAMERAS_PER_VIEW: usize = 8;
+/// Maximum number of different cameras outside the rig.
 const MAX_CAMERAS: usize = 64;
-/// Angle outside the rig from which a camera counts as outside, radians (2°).
+/// Smallest angle between the direction of a camera and the nearest direction of the rig at which the camera counts as
+/// outside the rig, radians (2°).
 pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
-/// Number of random cameras that are tried for each new camera.
+/// Maximum number of random cameras that are tried for each wanted camera outside the rig.
 const TRIES: usize = 64;
-/// Maximum number of directions that the search for the nearest direction of a rig tries, and the gain below which it
-/// ends.
+/// Maximum number of iterations of the search for the direction of a cone that is nearest to a given direction
+/// ([`RigCone::angle`]).
 const MAX_DIRECTIONS: usize = 64;
+/// Tolerance of the search for the nearest direction of a cone. The search ends if every direction of the cone has a
+/// dot product with the remainder of at most this value. Vectors count as linearly dependent if their determinant is at
+/// most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
-/// Sine of the angle below which a direction counts as being on a face of the cone, and two faces as the same.
+/// Tolerance for the faces of a cone: sine of the angle below which a direction counts as being on a face, and distance
+/// of unit normals up to which two faces count as the same.
 const FLAT: f64 = 1e-6;
 
-/// Directions in which the cameras of a rig see the scene: the convex cone of the directions from the point where their
-/// optical axes meet to the cameras.
+/// Directions from which the cameras of a rig see the scene: the convex cone of the directions from the point where
+/// their optical axes meet to the cameras.
 pub struct RigCone {
     focus: DVec3,
     directions: Vec<DVec3>,
@@ -45,8 +52,8 @@ impl RigCone {
         RigCone { focus, directions }
     }
 
-    /// Returns the angle in radians, 0 to π/2, between the direction of `camera` and the nearest direction of the cone.
-    /// It is 0 inside the cone, and for a camera at the point where the optical axes meet.
+    /// Returns the angle in radians, 0 to π/2, between the direction of `camera` (seen from the point where the optical
+    /// axes meet) and the nearest direction of the cone. It is 0 inside the cone, and for a camera at that point.
     pub fn angle_outside(&self, camera: &Camera) -> f64 {
         let direction = (camera.center() - self.focus).try_normalize().filter(|_| !self.directions.is_empty());
         direction.map_or(0.0, |direction| self.angle(direction))
@@ -57,8 +64,8 @@ impl RigCone {
         self.focus
     }
 
-    /// Returns the inward unit normals of the flat faces of the cone. A direction is inside if its dot product with
-    /// none of them is negative. Takes time in proportion to the cube of the number of cameras.
+    /// Returns the inward unit normals of the flat faces of the cone. A direction is inside the cone if its dot
+    /// products with all of them are at least 0. Takes time in proportion to the cube of the number of cameras.
     pub fn faces(&self) -> Vec<DVec3> {
         let all = &self.directions;
         let pairs = (0..all.len()).flat_map(|i| (0..all.len()).filter(move |&j| j != i).map(move |j| (i, j)));
@@ -72,7 +79,7 @@ impl RigCone {
         faces
     }
 
-    /// Returns whether `camera` is outside the rig by more than a small angle.
+    /// Returns whether `camera` is outside the cone by an angle of at least [`MIN_ANGLE`] (2°).
     pub fn is_outside(&self, camera: &Camera) -> bool {
         self.angle_outside(camera) >= MIN_ANGLE
     }
@@ -99,8 +106,8 @@ impl RigCone {
     }
 }
 
-/// Sets the weights of the unit vectors `used` so that their weighted sum is as near to `direction` as weights above 0
-/// allow, and removes vectors without a weight. Returns false if the vectors are linearly dependent.
+/// Sets the weights of the unit vectors `used` so that their weighted sum is as near to `direction` as weights of at
+/// least 0 allow, and removes vectors whose weight is 0. Returns false if the vectors are linearly dependent.
 fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     loop {
         let Some(free) = least_squares(used, direction) else { return false };
@@ -115,8 +122,9 @@ fn fit_weights(used: &mut Vec<(DVec3, f64)>, direction: DVec3) -> bool {
     }
 }
 
-/// Returns the weights, of any sign, with which the sum of the unit vectors `used` is nearest to `direction`; `None` if
-/// the vectors are linearly dependent or more than three.
+/// Returns the weights, of any sign, for which the weighted sum of the unit vectors in `used` is nearest to
+/// `direction`. The weights in `used` are ignored. Returns `None` if the vectors are linearly dependent or more than
+/// three.
 fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
     match *used {
         [(a, _)] => Some(vec![a.dot(direction)]),
@@ -137,9 +145,9 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
 
 /// Returns at most `count` cameras outside the rig of `cameras`. Each is one of `cameras`, or a camera between two of
 /// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from
-/// the mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly
-/// anything outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in
-/// every run.
+/// the mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if hardly any direction is
+/// outside the rig, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every
+/// run.
 pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
     let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
@@ -171,8 +179,8 @@ pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
     training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
 }
 
-/// Returns `camera` turned by `turn` about the point `focus`. The scene looks from there as it does from `camera` after
-/// a turn the other way.
+/// Returns `camera` after the rotation `turn` about the point `focus`. The turned camera sees what `camera` would see
+/// if the scene were rotated the other way about `focus`.
 fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
     let center = focus + turn * (camera.center() - focus);
     let rotation = camera.rotation * DMat3::from_quat(turn).transpose();
@@ -180,10 +188,11 @@ fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
 }
 
 impl Scene {
-    /// Adds cameras outside the rig, so that Gaussians that only these see are kept, and refined. `reach`, from 0 to 1,
-    /// states how far outside the quality counts: the angles of the rig from its mean direction grow up to the factor
-    /// 1 + `reach`, and every frame gets `reach` times as many views outside the rig as it has inside. Adds none if
-    /// `reach` is 0 or the rig has no outside (see [`cameras_outside`]).
+    /// Adds views from cameras outside the rig to the views of every frame (`self.schedule`), so that Gaussians that
+    /// only these views show are kept and refined. `reach`, from 0 to 1, states how far outside the rig the quality of
+    /// renders counts. Angles from the mean direction of the rig grow by a factor of up to 1 + `reach`. Every frame
+    /// gets `reach` times as many views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera
+    /// outside the rig can be found (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
         if reach == 0.0 {
             return;
@@ -210,7 +219,8 @@ impl Scene {
         self.depend_on_views();
     }
 
-    /// Returns the cameras of the rig that take views of the schedule.
+    /// Returns the cameras of the rig from which at least one view in `self.schedule` (the views at each frame) is
+    /// seen. Cameras that were added outside the rig are not included.
     pub fn rig_cameras(&self) -> Vec<Camera> {
         let used = self.schedule.used_cameras().into_iter().map(|index| index as usize);
         used.filter(|&index| index < self.rig.cameras.len()).map(|index| self.schedule.cameras[index].clone()).collect()

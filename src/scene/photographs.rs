@@ -18,7 +18,8 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Creates the list from pairs of a view and the path of its photograph; all of them lie in `folder`.
+    /// Creates the list from pairs of a view and the path of its photograph. `folder`, in which all photographs lie, is
+    /// named in errors.
     ///
     /// # Errors
     /// Fails if two views have the same photograph, or with the first error in `found`.
@@ -42,10 +43,12 @@ impl Photographs {
     /// Finds the photographs of the views `pictures` in `folder`. Returns the views that have a photograph, and the
     /// paths of these photographs.
     ///
-    /// First, photographs are searched by the image paths in the camera file: the longest suffix of such a path for
-    /// which a file in `folder` exists. Only if this finds no photograph of any view, they are searched by names with
-    /// numbers: `tNNN_vNN.png` (frame, view), else `camNN/images/FFFF.png` as in DyNeRF (position of the view among the
-    /// folders `cam…`, frame).
+    /// First, photographs are found by the image paths in the camera file: a photograph is the file in `folder`
+    /// whose path is the longest suffix of the image path. Only if no view has such a photograph, photographs are
+    /// found by names with numbers:
+    /// - `tNNN_vNN.png`, with the numbers of frame and view,
+    /// - else `camNN/images/FFFF.png` as in DyNeRF, with the number of the frame. The folders `cam…`, sorted by their
+    ///   numbers, belong to the views 0, 1, 2 and so on.
     ///
     /// # Errors
     /// Fails if the folder cannot be read, if no view has a photograph, or if two views have the same photograph.
@@ -83,8 +86,8 @@ impl Photographs {
         self.files.contains_key(&(picture.frame, picture.view))
     }
 
-    /// Returns path, length in bytes, and time of the last change (ns) of the photographs of the views `pictures`. They
-    /// show whether the photographs have changed, without reading them.
+    /// Returns for each photograph of the views `pictures` its path, its length in bytes, and the time of its last
+    /// change (ns since 1970). They show whether the photographs have changed, without reading them.
     ///
     /// # Errors
     /// Fails if a file does not exist any more.
@@ -114,7 +117,7 @@ fn view_name(picture: FrameView) -> String {
     format!("frame {}, view {}", picture.frame, picture.view)
 }
 
-/// Checks that `folder` is an existing folder.
+/// Checks that `folder` is an existing folder; fails if it is not.
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
         return Err(Error::usage(format!("{}: --ground-truth expects a folder of photographs", folder.shown())));
@@ -122,8 +125,8 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Returns the photograph of the view `picture`, found by the numbers of its frame and view: `tNNN_vNN.png` in
-/// `folder`, or the frame's file in the view's folder among the camera folders `cameras`.
+/// Finds the photograph of the view `picture` by its frame and view number: `tNNN_vNN.png` (frame, view) in `folder`,
+/// else the frame's file in the camera folder `cameras[view]`. Returns `None` if neither file exists.
 fn numbered_file(folder: &Path, picture: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
     let in_camera = cameras.get(picture.view as usize).map(|camera| in_rig(camera, picture));
     let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];

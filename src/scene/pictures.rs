@@ -20,8 +20,8 @@ pub enum ViewSet {
     All,
 }
 
-/// Returns the views of `rig` that `part` selects, in the order of frame, then view number. `frame_times` holds the
-/// times of the frames.
+/// Returns the views of `rig` that `part` selects, ordered by frame, then view number. `frame_times` holds the times of
+/// the frames.
 ///
 /// # Errors
 /// Fails if a view has a time that is not the time of any frame, if the split has no views, or if two cameras have the
@@ -78,9 +78,9 @@ pub fn select_view(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, 
     })
 }
 
-/// Returns the views of at most `count` (at least one) different frames of `pictures`. The frames are evenly spaced and
-/// include the first and the last. Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even,
-/// as numpy's `round(linspace(0, K − 1, count))` does.
+/// Returns those of the views `pictures` that belong to at most `count` different frames (to one frame if `count` is
+/// 0). The frames are evenly spaced and include the first and the last. Of K frames, this function keeps those with the
+/// indices round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K − 1, count))` does.
 pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
@@ -97,8 +97,9 @@ pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
 /// Returns at most `most` of the views `pictures`, spread evenly over frames and view numbers. `pictures` must be
 /// sorted by frame, then view.
 ///
-/// The list of views of the n-th frame is rotated by the fractional part of n times the golden ratio, so that even
-/// steps through all lists do not meet the same view numbers again.
+/// The views are picked at equal distances from the list of all views. Before that, the part of the list for the n-th
+/// frame is shifted cyclically, by the fractional part of n times the golden ratio (as a fraction of its length).
+/// Without the shift, the picks would meet the same view numbers again and again.
 pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (pictures.len(), most.max(1));
     if count <= most {
@@ -134,7 +135,7 @@ pub fn render_background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32;
 }
 
 /// Returns the resource estimate (memory, time, reads) of the stage `stage`, which renders all views of `models` models
-/// and holds `pixel` bytes per pixel of each render.
+/// and keeps `pixel` bytes per pixel in memory for each view being rendered.
 pub fn render_estimate(
     work: &Workload,
     limits: &Limits,

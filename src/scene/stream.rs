@@ -42,8 +42,8 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Packs the stream on standard input into a temporary container, or links its frames, and opens the result with its
-/// cameras.
+/// Opens the stream on standard input together with its cameras. The Gaussians of its frames are linked into tracks if
+/// [`is_linked`] says so; otherwise the frames are packed into a temporary container.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
@@ -74,7 +74,8 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     header.is_unlinked || options.link.always_links()
 }
 
-/// Receives a stream of frames and links their Gaussians into tracks; for streams for which [`is_linked`] holds.
+/// Receives a stream of frames and links their Gaussians into tracks. Only for streams for which [`is_linked`] returns
+/// true.
 ///
 /// # Errors
 /// Fails if the stream is invalid, or if the memory budget is too small for one block of frames (the frames in a tile
@@ -96,7 +97,8 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     Ok(OpenedInput { input: Box::new(input), rig, notes })
 }
 
-/// Returns how many frames of a stream can be packed within the memory budget, as a quota that counts arriving frames.
+/// Creates a quota for the frames of a stream. It counts arriving frames and knows how many can be packed within the
+/// memory budget.
 ///
 /// # Errors
 /// Fails if the memory budget is too small for one block of frames (the frames in a tile of the container).
@@ -122,14 +124,14 @@ pub struct FrameQuota {
     arrived: u64,
     /// Maximum number of frames for which the memory budget suffices.
     pub most: u64,
-    /// Advice to the user if more frames arrive.
+    /// Advice to the user, shown in the error if more frames arrive than fit.
     hint: String,
     budget: Budget,
 }
 
 impl FrameQuota {
-    /// Finds the maximum number of frames for `budget`. `peak(limit, frames)` returns the memory in bytes that a run
-    /// with a budget of `limit` bytes takes for a stream of `frames` frames.
+    /// Creates a quota for `budget`: finds the maximum number of frames that fit. `peak(limit, frames)` returns the
+    /// memory in bytes that a run with a budget of `limit` bytes takes for a stream of `frames` frames.
     pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
         // Finds the number bit by bit; a stream has fewer than 2^32 frames.

@@ -36,8 +36,8 @@ impl Scene {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)
     }
 
-    /// Returns the digest (hash of the content) of another input, which was opened with `options`. The cache stores it
-    /// too.
+    /// Returns the digest (hash of the content) of another input, which was opened with `options`. The digest is also
+    /// stored in the cache of this scene.
     ///
     /// # Errors
     /// Fails if a file or the cache folder cannot be read.
@@ -85,7 +85,8 @@ fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -
 }
 
 /// Returns a key that changes whenever the content of the input may have changed, without reading the input. It stands
-/// for the path of the input, and the name, length and time of the last change of each of its files.
+/// for the path of the input, for the options with which it is read, and for the path, length and time of the last
+/// change of each of its files.
 fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
@@ -93,8 +94,8 @@ fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
-/// Appends the path, length in bytes, and time of the last change (ns) of every file at `path` and below it, in the
-/// order of the paths.
+/// Appends the path, the length in bytes, and the time of the last change (ns since 1970) of the file `path` to
+/// `files`. If `path` is a folder, appends them for all files in it and in its subfolders, in the order of their paths.
 pub(crate) fn stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
     let name = path.to_string_lossy().into_owned();
     // Broken links are not part of an input, so only their paths are recorded.

@@ -69,7 +69,8 @@ impl StatisticsRows {
         }
     }
 
-    /// Returns the contribution C and the fraction of views Vis of every Gaussian.
+    /// Returns two values of every Gaussian: the contribution C, and Vis, the fraction of the views in which it is on
+    /// screen.
     pub(crate) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
             StatisticsRows::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
@@ -109,7 +110,7 @@ impl SpilledRows {
         self.values(&self.columns[..index])
     }
 
-    /// Reads one value per Gaussian; the values lie in the file behind those of the statistics `before`.
+    /// Reads one value per Gaussian. The values lie in the file after the values of the statistics `before`.
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
         let start = before.iter().map(|statistic| statistic.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];

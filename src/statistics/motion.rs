@@ -69,9 +69,10 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame with these positions (`[3, len]`) and opacities. `steps` holds the durations of the latest time
-    /// step and of the one before, each divided by the mean duration of a step. `steady` is true if the opacities have
-    /// been the same in every frame so far, this one included.
+    /// Adds a frame with the positions `position` (`[3, len]`) and the opacities `opacity`. A Gaussian is alive if its
+    /// opacity is at least `alpha_min`. `steps` holds the durations of the latest time step and of the one before, each
+    /// divided by the mean duration of a step. `steady` is true if the opacities have been the same in every frame so
+    /// far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
@@ -95,8 +96,8 @@ impl MotionSums {
     }
 
     /// Adds a frame by the definition `Runs` of motion, in which only steps between consecutive frames of the life span
-    /// count. `EVEN` states that both time steps have the mean duration, so that no division is needed; divisions would
-    /// take longer than the rest of the loop.
+    /// count. `EVEN` states that the last two time steps have the mean duration, so that no division is needed;
+    /// divisions would take longer than the rest of the loop.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,
@@ -124,9 +125,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame like [`MotionSums::add_frame_of_runs`], if its opacities equal those of all frames before. Which
-    /// steps and turns count is then known without reading the history, so half as much memory is accessed (`cargo
-    /// bench --bench scan`).
+    /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame whose opacities equal the opacities of all
+    /// earlier frames. Which steps and turns count is then known without reading the history, so half as much memory is
+    /// accessed (`cargo bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -238,10 +239,10 @@ fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns the square of the last step and the length of the turn (second difference of the positions) about the
-/// previous frame, both per mean step. The positions are those in the current frame, the previous one and the one
-/// before. `step` and `step_before` are the durations of the last two steps, in mean steps. With fewer than three
-/// frames the values are meaningless.
+/// Returns two values: the square of the last step, and the length of the turn (second difference of the positions)
+/// about the previous frame. Both are scaled to time steps of the mean duration. `now`, `previous` and `before` are the
+/// positions in the current frame and in the two frames before it. `step` and `step_before` are the durations of the
+/// last two time steps, divided by the mean duration. With fewer than three frames the values are meaningless.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);

@@ -52,7 +52,8 @@ pub fn scan_units(info: &SequenceInfo) -> usize {
     info.count.div_ceil(GAUSSIANS_PER_BLOCK)
 }
 
-/// Scans only the blocks of Gaussians `blocks` at all frames. [`ScanResult::join`] combines several such results.
+/// Scans only the blocks of Gaussians with the numbers `blocks`, at all frames, like [`scan`]. [`ScanResult::join`]
+/// combines several such results.
 pub fn scan_blocks(
     source: &dyn FrameSource,
     schedule: &ViewSchedule,
@@ -74,9 +75,9 @@ pub fn scan_blocks(
 }
 
 impl ScanResult {
-    /// Turns the result of a scan of the frames `frames` (increasing) into one for all `all` frames of the sequence. Life
-    /// spans grow in proportion. Frames that were not read have no Gaussians alive. Sets D, κ and V to 0, because steps
-    /// between the frames that were read are not the steps of the sequence.
+    /// Converts the result of a scan that read only the frames `frames` (increasing) into a result for the whole
+    /// sequence, which has `all` frames. Life spans grow in proportion. Frames that were not read have no Gaussians
+    /// alive. Sets D, κ and V to 0, because steps between the frames that were read are not the steps of the sequence.
     pub fn for_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
         let mut alive_per_frame = vec![0; all];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
@@ -88,7 +89,8 @@ impl ScanResult {
         ScanResult { alive_per_frame, is_partial: true, ..self }
     }
 
-    /// Appends the result of a scan of the Gaussians that follow these, at the same frames.
+    /// Appends `other`, the result of a scan of the Gaussians that follow the Gaussians of this result, at the same
+    /// frames.
     pub fn join(&mut self, mut other: ScanResult) {
         self.rows.append(&mut other.rows);
         self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
@@ -96,7 +98,8 @@ impl ScanResult {
     }
 }
 
-/// Joins the rows and the largest coordinates of consecutive blocks of Gaussians into one result.
+/// Joins consecutive blocks of Gaussians, each given by its rows and its largest coordinate, into one result.
+/// `alive_per_frame` holds the number of Gaussians alive in each frame.
 fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
     let mut rows = Rows::default();
     let mut largest_coordinate = 0.0f32;
@@ -127,8 +130,8 @@ impl<'a> RunningScan<'a> {
         }
     }
 
-    /// Adds the next frames, which are all frames of `source`. `cameras` lists for each of them the cameras that see
-    /// it.
+    /// Adds all frames of `source` to the scan; they follow the frames that were added before. `cameras` lists for each
+    /// of these frames the cameras that see it.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

@@ -10,8 +10,8 @@ use crate::recipe::{MotionParams, ScanParams};
 /// step. Time stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5 frames; real gaps are far larger.
 const EVEN_TOLERANCE: f64 = 1e-2;
 
-/// Shortest accepted time step, as a fraction of the mean step. The curvature κ divides differences of positions by two
-/// steps, and is then squared, which must not overflow.
+/// Shortest accepted time step, as a fraction of the mean step. The curvature κ is a difference of positions divided by
+/// two steps; its square must not overflow.
 const LEAST_STEP: f64 = 1e-50;
 
 /// Number of bits of the largest contribution that a Gaussian can have in one (frame, view) pair, as a fixed-point
@@ -86,8 +86,8 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan for frames that have not arrived yet, and assumes that they are evenly spaced. If they turn out
-    /// to be, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
+    /// Creates the plan for a stream whose frames have not arrived yet. The plan assumes that the frames are evenly
+    /// spaced. If this proves true, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
@@ -100,7 +100,8 @@ impl ScanPlan {
         }
     }
 
-    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`.
+    /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`: whether
+    /// the plans differ at most in the numbers of frames and of (frame, view) pairs.
     pub fn can_finish(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pair_count: arriving.pair_count, ..self.clone() }
     }
@@ -127,8 +128,8 @@ impl ScanPlan {
     }
 }
 
-/// Returns the durations of the time steps, divided by their mean; entry 0 is unused. Returns an empty list if all
-/// count as 1.
+/// Returns the durations of the steps between the frames at `times`, divided by their mean. Entry t is the step into
+/// frame t; entry 0 is unused. Returns an empty list if all steps count as equal.
 fn uneven_steps(times: &[f64]) -> Vec<f64> {
     let [first, .., last] = times else { return Vec::new() };
     let mean = (last - first) / (times.len() - 1) as f64;

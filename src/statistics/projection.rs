@@ -25,9 +25,9 @@ const JACOBIAN_CLAMP: f64 = 1.3;
 const DILATION_PX2: f64 = 0.3;
 /// Half the side of a projected Gaussian's bounding box, in standard deviations.
 const REACH: f64 = 3.0;
-/// Number of Gaussians that pass through one step of the projection before the next step. In a single loop over all
-/// steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap two
-/// iterations.
+/// Number of Gaussians for which one step of the projection is computed before the next step begins. In a single loop
+/// over all steps, each iteration would be a dependency chain of about 150 cycles, too long for a processor to overlap
+/// two iterations.
 const BLOCK_LANES: usize = 32;
 /// Constant 2⁵². Adding it to x in [0, 2⁵²) leaves x, rounded to an integer, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;
@@ -53,7 +53,8 @@ pub struct CoverageSums<'a> {
     pub touched: &'a mut [u32],
 }
 
-/// Fixed-point scale of contributions to the sums, and the opacity threshold.
+/// Settings of the sums: the fixed-point scale in which contributions are added, and the minimum opacity at which a
+/// Gaussian is alive.
 #[derive(Debug, Clone, Copy)]
 pub struct CoverageScale {
     /// Exponent of the fixed-point scale: contributions are rounded to multiples of 2^−exponent px. The number of
@@ -82,7 +83,7 @@ pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageSca
     project_planes(&view, planes, scale, sums);
 }
 
-/// Adds coverage like [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
+/// Does the same as [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
@@ -211,7 +212,8 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// Adds the covered area inside the image, times the opacity, of each Gaussian to the sums.
+    /// Adds the covered area inside the image (pixels) times the opacity of each Gaussian to `coverage`, in fixed
+    /// point. Counts in `touched` the Gaussians that are alive and whose bounding box overlaps the image.
     #[inline(always)]
     fn accumulate(
         &self,
@@ -241,13 +243,15 @@ impl<const N: usize> ProjectedBlock<N> {
 }
 
 /// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate with respect to
-/// the position: f/z·(w − slope·w₂), with the camera axis w of this coordinate and the viewing axis w₂.
+/// the position: f/z·(w − slope·w₂). `focal_over_depth` is f/z, `w` the camera axis of this coordinate, `w2` the
+/// viewing axis.
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))
 }
 
-/// Returns the length of [center − reach, center + reach] inside [0, size]; not positive if the interval lies outside.
+/// Returns the length of the part of the interval [center − reach, center + reach] that lies inside [0, size]. Returns
+/// 0 or less if the interval lies outside.
 #[inline(always)]
 fn overlap(center: f64, reach: f64, size: f64) -> f64 {
     let (low, high) = (center - reach, center + reach);

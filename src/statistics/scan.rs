@@ -17,8 +17,8 @@ pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
     + 2 * size_of::<u32>();
 
-/// Opacity (2⁻⁵³) below which a Gaussian adds nothing to a sum of contributions: its contribution to a view, less than
-/// 2⁵² fixed-point units times the opacity, rounds to 0.
+/// Opacity (2⁻⁵³) below which a Gaussian adds nothing to a sum of contributions: its contribution to a view, at most
+/// 2⁵¹ fixed-point units times the opacity, rounds to 0.
 const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 
 /// Number of low bits that remain in a sum of contributions when its high bits are moved to a separate u32. After 2³²
@@ -59,11 +59,11 @@ pub struct BlockStatistics {
     /// Id of the block's first Gaussian.
     pub first_id: usize,
     /// Statistics, one row per Gaussian. The anisotropy `e` is 0 until [`super::fill_anisotropy`]; the trajectory
-    /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a Gaussian with
-    /// [`Flags::NON_FINITE`] are 0.
+    /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a
+    /// Gaussian with [`Flags::NON_FINITE`] are 0.
     pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has not
-    /// returned. Gaussians with NaN values are included.
+    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has
+    /// not returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
@@ -88,9 +88,9 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Adds frame `t` and the cameras that see it. `changed` names the attributes that may differ from the previous
-    /// frame; in frame 0 all attributes but SH count as changed. SH is only checked for non-finite values, and only if
-    /// `changed` contains it.
+    /// Adds frame `t`, in which the block has the attributes `gaussians`, and the cameras that see it. `changed` names
+    /// the attributes that may differ from the previous frame; in frame 0 all attributes but SH count as changed. SH is
+    /// only checked for non-finite values, and only if `changed` contains it.
     ///
     /// # Panics
     /// Panics if frames are not added in order, or if an attribute does not have one value for each Gaussian of the
@@ -142,8 +142,9 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Updates the decoded attributes, the life spans and the motion sums with frame `t`. The compiler inlines this
-    /// function and the loops it calls into the copy for each instruction set.
+    /// Updates the decoded attributes, the life spans and the motion sums with frame `t`, in which the attributes
+    /// `changed` of `gaussians` may differ from the previous frame. The compiler inlines this function and the loops it
+    /// calls into the copy for each instruction set.
     #[inline(always)]
     fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);
@@ -197,8 +198,8 @@ impl<'a> BlockScan<'a> {
     /// sequence.
     ///
     /// # Panics
-    /// Panics if frames are missing, or if `plan` differs from the plan with which this scan began in more than the
-    /// frames that were not known then.
+    /// Panics if frames are missing, or if `plan` does not belong to this scan: only the number of frames and of
+    /// (frame, view) pairs may differ from the plan with which the scan began.
     pub fn finish_with_plan(mut self, plan: &ScanPlan) -> BlockStatistics {
         self.life.count_repeats();
         self.motion.count_steady_frames();

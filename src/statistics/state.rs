@@ -42,9 +42,9 @@ impl BlockState {
         }
     }
 
-    /// Takes over the attributes `changed` of the next frame, and flags non-finite values and zero quaternions in them.
-    /// The axes (rotation times scales) are needed only for projection. [`BlockState::update_axes`] computes them
-    /// later.
+    /// Takes over the attributes `changed` of the next frame, `gaussians`, and flags non-finite values and zero
+    /// quaternions in them. The axes (rotation times scales) are needed only for projection.
+    /// [`BlockState::update_axes`] computes them later.
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
@@ -89,7 +89,8 @@ impl BlockState {
         }
     }
 
-    /// Computes the axes of the Gaussians of a chunk again if they are outdated.
+    /// Computes the axes (rotation times scales) of the Gaussians `chunk` again if they are outdated. `gaussians` holds
+    /// the attributes at the current frame.
     pub(super) fn update_axes(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
         if !std::mem::take(&mut self.axes_outdated[chunk.start / CHUNK]) {
             return;
@@ -116,8 +117,9 @@ impl BlockState {
     }
 }
 
-/// Returns the largest |x| of `values`, or a non-finite number if any value is not finite. Without their signs, floats
-/// order as their bits do, with infinity and NaN last; integers are compared many at a time.
+/// Returns the largest |x| of `values`, or a non-finite number if any value is not finite. Compares the bits as
+/// integers, many at a time: without the sign, the bits of floats have the order of their values, with infinity and NaN
+/// last.
 #[inline(always)]
 fn largest_magnitude(values: &[f32]) -> f32 {
     f32::from_bits(values.iter().fold(0, |largest, x| largest.max(x.abs().to_bits())))

@@ -276,8 +276,8 @@ fn zero_quaternion_is_flagged_and_counts_as_identity() {
     assert_eq!((got.c, got.flags), (expected.c, vec![Flags::ZERO_ROTATION, Flags::empty()]));
 }
 
-/// Returns the area and the visibility of one Gaussian in one view, then its area as the slow reference (oracle)
-/// computes it.
+/// Returns three values of one Gaussian in one view: the area that it covers (pixels) and its visibility, both from the
+/// scan; and the area from the slow reference (oracle).
 fn one_view(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
     let schedule = schedule(1, 1);
     let mut g = Gaussians::zeros(1, 0);
@@ -461,7 +461,7 @@ proptest! {
     }
 }
 
-/// Returns the Gaussians of `from` in `range`.
+/// Returns the Gaussians of `from` with the indices in `range`.
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
     for column in Attributes::all().iter() {

@@ -79,7 +79,8 @@ impl ComparedAppearance {
     }
 
     /// Returns the difference in appearance A: the sum of the squared differences in size, shape, opacity and color,
-    /// each in the unit that costs 1 ([`SIZE_UNIT`] and the like). A is symmetric.
+    /// each divided by the difference that adds 1 to A ([`SIZE_UNIT`], [`SHAPE_UNIT`], [`OPACITY_UNIT`],
+    /// [`COLOR_UNIT`]). A is symmetric.
     pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.difference_without_opacity(other) + opacity * opacity
@@ -102,7 +103,7 @@ impl ComparedAppearance {
     }
 
     /// Returns the difference in appearance without opacity: the sum of the squared differences in size, shape and
-    /// color, each in the unit that costs 1.
+    /// color, each divided by the difference that adds 1 to the sum ([`SIZE_UNIT`], [`SHAPE_UNIT`], [`COLOR_UNIT`]).
     fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size

@@ -6,8 +6,8 @@ use super::track::{Candidates, NONE, OpenTrack, Round};
 
 /// Largest accepted fraction of a frame's links that is expected to be wrong.
 pub(super) const MAX_WRONG: f64 = 0.005;
-/// Cost that is added to the numerator and to the denominator of each ratio of link costs. Two costs whose difference
-/// is smaller then count as equal.
+/// Cost that is added to the numerator and to the denominator of each ratio of link costs. As a result, two costs that
+/// differ by less than this count as equal.
 const COST_TOLERANCE: f32 = 1e-6;
 /// Assumed probability that a track's own Gaussian is absent from a frame, although an unrelated one lies within reach.
 const ABSENCE_PROBABILITY: f32 = 0.25;
@@ -19,9 +19,8 @@ pub(super) struct LinkConfidence {
     /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
     /// For every track the largest ratio R over all rivals of its link; 0 without a rival. A rival is another track or
-    /// another Gaussian with which one end of the link could be linked instead. R is the cost of the present links of
-    /// the tracks concerned, divided by the cost after they exchange their Gaussians. The larger R is, the more likely
-    /// the link is wrong.
+    /// another Gaussian that could take one end of the link. R is the cost of the present links, divided by their cost
+    /// after the link and its rival are exchanged. The larger R is, the more likely the link is wrong.
     ratios: Vec<f32>,
 }
 
@@ -30,8 +29,9 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Adds to the estimates the links that one round of linking made. `candidates_by_track` holds, for each track that
-    /// took part in the round, the Gaussians that might have continued it. Costs of links are those of `round`.
+    /// Updates the estimates with the links that one round of linking made. `candidates_by_track` holds, for each track
+    /// that took part in the round, the Gaussians that might have continued it. Costs of links follow from the
+    /// parameters of `round`.
     pub(super) fn add_round(
         &mut self,
         links: &Links,

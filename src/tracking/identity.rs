@@ -11,8 +11,8 @@ const MAX_PART_OF_UNRELATED: f64 = 0.5;
 /// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
 /// Difference up to which two Gaussians count as equal (difference 0), because it may come from rounding by the program
-/// that wrote the frames. Applies to distances in sizes of a Gaussian, and to differences in appearance in the units of
-/// link costs.
+/// that wrote the frames. Applies to distances, as multiples of a Gaussian's size, and to differences in appearance
+/// (`ComparedAppearance::difference`).
 const NEGLIGIBLE: f64 = 1e-3;
 
 /// Differences between the Gaussians of two frames at the same index, and between unrelated ones. All are medians.
@@ -23,19 +23,20 @@ pub struct OrderDifference {
     /// Distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the second), in
     /// units of the smaller Gaussian's size.
     pub apart: f64,
-    /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between Gaussians at
-    /// the same index.
+    /// Difference in appearance between Gaussians at the same index: sum of the squared differences in size, shape,
+    /// opacity and base color, each divided by the difference that adds 1 to the cost of a link.
     pub appearance_difference: f64,
-    /// Difference in appearance (size, shape, opacity and base color, in the units of link costs) between unrelated
-    /// Gaussians, paired as for `apart`.
+    /// Difference in appearance, computed as `appearance_difference`, between unrelated Gaussians, which are paired as
+    /// for `apart`.
     pub unrelated_pairs: f64,
     /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is
     /// at most half of `apart`, and `appearance_difference` is at most half of `unrelated_pairs`.
     pub is_common: bool,
 }
 
-/// Compares two frames with equally many Gaussians, index by index, at up to 4096 indices. The order always holds if
-/// there are fewer than 16 Gaussians, or if Gaussians at the same index differ by no more than rounding.
+/// Compares the frames `before` and `after`, which have equally many Gaussians, index by index, at up to 4096 indices.
+/// The frames always count as being in the same order if there are fewer than 16 Gaussians, or if Gaussians at the same
+/// index differ by no more than rounding.
 pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let (before, after) = (ComparedAppearance::all_from_state(before), ComparedAppearance::all_from_state(after));
     let count = before.len().min(after.len());
@@ -56,7 +57,7 @@ pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     }
 }
 
-/// Returns the distance between the positions of two Gaussians, divided by the smaller of their sizes.
+/// Returns the distance between the positions of `a` and `b`, divided by the smaller of their sizes.
 fn distance(a: &ComparedAppearance, b: &ComparedAppearance) -> f64 {
     let squared: f64 = (0..3).map(|c| f64::from(a.position[c] - b.position[c]).powi(2)).sum();
     squared.sqrt() / f64::from(a.size.min(b.size))

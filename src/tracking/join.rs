@@ -12,8 +12,8 @@ use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round
 use crate::model::{AttributeValues, Gaussians};
 
 /// Rules for joining two tracks: `ALIKE` for tracks that may be one Gaussian; `CLOSE`, which is stricter, for tracks
-/// that look the same. `reach` scales the distance and `strictness` the difference in appearance in the cost of a pair
-/// of tracks, which may be at most 1.
+/// that look the same. Two tracks may be joined if the cost of their pair is at most 1. In this cost, `reach` scales
+/// the distance and `strictness` the difference in appearance.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, includes_missing: true };
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, includes_missing: true };
 /// Largest ratio of the sizes of joined tracks, as a natural log: ln √2. The grid that finds similar Gaussians finds no
@@ -27,8 +27,8 @@ const MAX_SHARED_FRAMES: u8 = 4;
 /// Rules by which tracks are joined. Tracks that satisfy the second rule also satisfy the first.
 const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
-/// Finds the tracks that belong to one Gaussian, by the rule `ALIKE` and by the rule `CLOSE`. It is shown every frame
-/// after the [`Linker`] has linked it.
+/// Joiner of tracks that belong to the same Gaussian. It joins once by the rule `ALIKE` and once by the rule `CLOSE`.
+/// Every frame is passed to it after the [`Linker`] has linked the frame.
 pub struct Joiner([JoinedTracks; 2]);
 
 /// Pairs of tracks that are or may be joined by one of the two [`RULES`].
@@ -133,8 +133,9 @@ impl Joiner {
         }
     }
 
-    /// Ends the joining; to be called after the last frame. Returns a pair for each rule (`ALIKE` first): for every
-    /// track, in the order in which tracks began, the index of its joined track; and the number of joined tracks.
+    /// Ends the joining; to be called after the last frame. Returns two values for each rule (`ALIKE` first): a list
+    /// that holds, for every track in the order in which tracks began, the index of its joined track; and the number of
+    /// joined tracks. `linker` is the linker of the last frame.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
     }

@@ -21,7 +21,7 @@ const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
 const MIN_FOR_CUT: usize = 16;
 
-/// Links the Gaussians of successive frames into tracks. Takes the frames one by one in time order.
+/// Linker of the Gaussians of successive frames into tracks. It takes the frames one by one in time order.
 #[derive(Default)]
 pub struct Linker {
     /// Tracks that may still continue, in the order of their numbers.
@@ -94,9 +94,10 @@ impl Linker {
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. Each Gaussian without
-    /// a link begins a track. `in_doubt` lists the Gaussians whose link was removed because it was probably wrong; the
-    /// tracks that they begin are marked ([`OpenTrack::is_in_doubt`]).
+    /// Advances the open tracks by a frame, whose Gaussians have the given `appearances` and `links` to tracks. Returns
+    /// the number of the track of every Gaussian. Each Gaussian without a link begins a track. `in_doubt` lists the
+    /// Gaussians whose link was removed because it was probably wrong; the tracks that they begin are marked
+    /// ([`OpenTrack::is_in_doubt`]).
     fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
@@ -124,8 +125,9 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the indices in `tracks` of the tracks that are missing for the first time although a Gaussian at their
-    /// expected position looks like them.
+    /// Returns the indices in `tracks` of the tracks whose place another Gaussian has taken. `links` leaves such a
+    /// track without a Gaussian for the first time, although a similar Gaussian is at the track's expected position.
+    /// `appearances` has the Gaussians of the frame.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

@@ -38,7 +38,7 @@ impl Links {
     }
 
     /// Links each track to the first Gaussian, among those not linked yet, that equals the track's last Gaussian bit by
-    /// bit. Goes through tracks and Gaussians in order.
+    /// bit. Goes through `tracks` and the Gaussians (`appearances`) in order.
     pub(super) fn add_repeats(&mut self, tracks: &[OpenTrack], appearances: &[ComparedAppearance]) {
         let buckets = (2 * appearances.len()).next_power_of_two();
         let bucket = |appearance: &ComparedAppearance| appearance.bits as usize & (buckets - 1);
@@ -97,8 +97,8 @@ impl Links {
     }
 
     /// Exchanges the Gaussians of two tracks wherever that lowers the total cost of their links. Goes through the
-    /// tracks in order. `cost` returns the cost of the link between a track and a Gaussian. Returns whether any
-    /// exchange was made.
+    /// tracks and their candidates (Gaussians that could continue them) in the order of `candidates_by_track`. `cost`
+    /// returns the cost of the link between a track and a Gaussian. Returns whether any exchange was made.
     fn exchange(&mut self, candidates_by_track: &[(u32, Candidates)], cost: impl Fn(u32, u32) -> f32) -> bool {
         let mut any = false;
         for (track, candidates) in candidates_by_track {

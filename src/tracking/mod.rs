@@ -33,9 +33,10 @@
 //!    models whose links are known. Near-duplicates are no rivals: |x_b − x_a|² / (¼·min(s_a, s_b))² + 4·A ≤ 1, where A
 //!    excludes opacity. They cannot be told apart, and if one fades out while the other fades in they are one Gaussian.
 //!    *Unrelated Gaussians:* ¼·k·C^{3/2}, at most ½, for a link of cost C, where k is the mean number of surplus
-//!    candidates of the linked tracks of the round: as many unrelated, evenly spread Gaussians have a cost as low. The
-//!    least certain links are dropped and their Gaussians begin new tracks, until at most one of 200 remaining links is
-//!    expected to be wrong ([`FrameLinks::doubtful`]).
+//!    candidates of the linked tracks of the round. Of unrelated, evenly spread Gaussians, k·C^{3/2} are expected to
+//!    have a cost of at most C; ¼ is the assumed probability that the track's own Gaussian is absent. The least certain
+//!    links are dropped and their Gaussians begin new tracks, until at most one of 200 remaining links is expected to
+//!    be wrong ([`FrameLinks::doubtful`]).
 //! 5. *Cuts.* If fewer than a quarter of the Gaussians are linked, of at least 16, everything has moved at once. This
 //!    is a cut, at which all tracks end.
 //! 6. *Joined tracks* ([`Joiner`]). Two tracks may be parts of one Gaussian that fades out as one and fades in as the

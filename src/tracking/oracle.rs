@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::MAX_GAP_FRAMES;
 use crate::model::{Gaussians, SH_C0, opacity};
 
-/// Returns the size of Gaussian `i`: the root mean square of its three scales, scene units.
+/// Returns the size of Gaussian `i` of `state`: the root mean square of its three scales, scene units.
 pub(super) fn rms_size(state: &Gaussians, i: usize) -> f64 {
     let squares = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
     (squares.iter().sum::<f64>() / 3.0).sqrt()
@@ -72,7 +72,8 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     }
 }
 
-/// Returns the difference in size, shape and color between two Gaussians, in the units of link costs.
+/// Returns the difference in size, shape and color between two Gaussians: the part of A in the module documentation
+/// without opacity.
 fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
     let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
@@ -100,8 +101,15 @@ impl SlowTrack {
 }
 
 impl SlowLinker {
-    /// Returns, for every track that a round has linked, the probability that its link is wrong. `candidates` holds all
-    /// possible links of the round as (cost, track, Gaussian).
+    /// Returns the pair (probability that the link is wrong, track) for every track that a round has linked.
+    ///
+    /// - `candidates`: all possible links of the round as (cost, track, Gaussian).
+    /// - `gaussian_of`: the Gaussian of every linked track.
+    /// - `taken`: the track of every linked Gaussian.
+    /// - `cost`: returns the cost of a link between a track and a Gaussian.
+    /// - `are_duplicates`: gets the track and the Gaussian of a candidate, then the Gaussian that the track is linked
+    ///   to and the track that the Gaussian is linked to, if any. Returns whether the candidate is no rival because of
+    ///   near-duplicates.
     fn probabilities(
         candidates: &[(f64, usize, usize)],
         gaussian_of: &BTreeMap<usize, usize>,
@@ -261,14 +269,18 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
     (std::array::from_fn(|c| at.position[c] + (frame - last) as f64 * v[c]), frame - last)
 }
 
-/// Pairs of tracks. Key: the later track and the bits of the pair's cost. Value: the earlier track, the number of
-/// frames in which both were present, whether the two are close, and whether the earlier track has ended.
+/// Pairs of a track and an earlier track. Key: number of the later track, and bits of the cost of the pair. Value:
+/// number of the earlier track, number of frames in which both tracks were present, whether both tracks are close, and
+/// whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks of one Gaussian (one track ends where and when a similar one begins), and returns for every track the
-/// number of its joined track. `r` scales the distance and `q` the difference in appearance in the cost of a pair.
-/// `in_doubt` are tracks that began because a link was probably wrong. `succeeded` holds (frame, track) for every track
-/// that is missing in the frame although a Gaussian like it is in its place.
+/// Joins tracks that belong to the same Gaussian: one track ends where and when a similar one begins. Returns for every
+/// track the number of its joined track.
+///
+/// - `in_doubt`: tracks that began because a link was probably wrong.
+/// - `succeeded`: (frame, track) of every track that is missing in the frame although a similar Gaussian is in its
+///   place.
+/// - `r` and `q`: in the cost of a pair, `r` scales the distance and `q` the difference in appearance.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,
@@ -346,7 +358,8 @@ pub(super) fn slow_joined_tracks(
     joined
 }
 
-/// Joins the later track of each cheapest pair to the earlier track if that one has ended, until nothing changes.
+/// Finds the cheapest pair of each later track in `pairs`. Joins the two tracks of this pair if the earlier one has
+/// ended, and repeats this until nothing changes. `predecessor` and `has_successor` record the joins of each track.
 fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
     loop {
         let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();

@@ -25,8 +25,8 @@ impl UniformNumbers {
     }
 }
 
-/// Returns `count` Gaussians in a cube of side 1, sized so that about `crowd` of them lie within the largest scale of
-/// each.
+/// Returns `count` Gaussians in a cube of side 1. Their scales vary around half the side of a cube that holds about
+/// `crowd` of these Gaussians.
 fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;
@@ -40,8 +40,8 @@ fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     state
 }
 
-/// Returns the Gaussians of `cloud` as they are `t` frames later. Each half of them moves on a circle, and every
-/// coordinate jitters by up to `noise` times the size of the Gaussian.
+/// Returns the Gaussians of `cloud` as they are `t` frames later. Each half of the Gaussians moves on a circle, and
+/// every coordinate jitters by up to `noise` times the size of the Gaussian.
 fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = cloud.clone();
     for i in 0..cloud.len() {
@@ -267,8 +267,8 @@ fn kept_order_is_told_from_shuffled_order() {
 }
 
 /// Returns frames of `cloud`, with the index of each Gaussian. Gaussians are alive for `shortest` to `shortest` + 4
-/// frames at a time, and fade over `overlap` of them. Colors vary by `tint` between these periods. After one period in
-/// seven there is a gap.
+/// frames at a time, and fade over `overlap` of these frames. Colors vary by `tint` between these periods. After one
+/// period in seven there is a gap.
 fn fading_frames(
     cloud: &Gaussians,
     frames: usize,

@@ -5,8 +5,8 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track.
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Largest amount by which the speed of a track lengthens the unit of distance in the cost of its links, in sizes of
-/// its Gaussian.
+/// Maximum amount that the speed of a track adds to the unit of distance in the cost of its links, as a multiple of the
+/// size of its Gaussian.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
@@ -19,9 +19,9 @@ pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round of linking: `reach` scales the distance and `strictness` the difference in appearance in the
-/// cost of a link, which may be at most 1. `includes_missing` states whether tracks without a Gaussian in the previous
-/// frame take part.
+/// Parameters of a round of linking. A link is possible if its cost is at most 1; in this cost, `reach` scales the
+/// distance and `strictness` the difference in appearance. `includes_missing` states whether tracks without a Gaussian
+/// in the previous frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
@@ -33,15 +33,17 @@ pub(super) struct Round {
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
-    /// Number of frames from the track's last Gaussian to the next frame: 1 if it had a Gaussian in the previous frame.
+    /// Number of frames from the last frame in which the track had a Gaussian to the frame that is linked next: 1 if no
+    /// frame lies between them.
     pub(super) frames_since_seen: u32,
     /// Velocity, scene units per frame; `None` until the track has a second Gaussian.
     pub(super) velocity: Option<[f32; 3]>,
     pub(super) appearance: ComparedAppearance,
     /// Whether the track began with a Gaussian whose link to another track was dropped as probably wrong.
     pub(super) is_in_doubt: bool,
-    /// Whether, when the track was missing for the first time, a Gaussian at its expected position looked like it. The
-    /// track then continues only with a Gaussian that equals its last one bit by bit.
+    /// Whether another Gaussian took the place of the track's Gaussian: in the first frame without a Gaussian of this
+    /// track, a similar Gaussian was at its expected position. The track then continues only with a Gaussian that
+    /// equals its last one bit by bit.
     pub(super) is_succeeded: bool,
 }
 
@@ -71,8 +73,8 @@ impl OpenTrack {
         self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// Returns the cost of linking the track to a Gaussian of this appearance; if it is above 1, a link is impossible.
-    /// If the distance term alone exceeds 1, returns only this term.
+    /// Returns the cost, by the rules of `round`, of linking the track to a Gaussian of this appearance; if it is above
+    /// 1, a link is impossible. If the distance term alone exceeds 1, returns only this term.
     pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
@@ -91,7 +93,8 @@ impl OpenTrack {
         std::array::from_fn(|c| self.appearance.position[c] + (self.frames_since_seen - 1) as f32 * velocity[c])
     }
 
-    /// Continues the track with a Gaussian of the next frame, and updates the track's velocity.
+    /// Continues the track with a Gaussian of the next frame, which has the appearance `appearance`, and updates the
+    /// track's velocity.
     pub(super) fn extend(&mut self, appearance: ComparedAppearance) {
         let step: [f32; 3] = std::array::from_fn(|c| {
             (appearance.position[c] - self.appearance.position[c]) / self.frames_since_seen as f32
@@ -127,8 +130,8 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds the Gaussian to the candidates if its cost is at most 1 and among the [`MAX_CANDIDATES`] lowest costs so
-    /// far.
+    /// Adds the Gaussian with the number `gaussian` to the candidates if its cost is at most 1 and among the
+    /// [`MAX_CANDIDATES`] lowest costs so far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

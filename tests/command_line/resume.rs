@@ -205,7 +205,8 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
     }
 }
 
-/// The cache lies on a small file system of its own, which is full, if the system allows tests to mount one.
+/// Puts the cache on a small file system that becomes full during the run. Needs a system that allows tests to mount
+/// one.
 #[test]
 #[ignore = "needs namespaces of process ids"]
 fn full_cache_disk_is_named_and_a_larger_one_resumes() {

@@ -1,5 +1,5 @@
-//! Tests of what a run states about itself: its recipe repeats it, its summary can be read back, its planned number of
-//! reads holds, and a dry run states what the run states.
+//! Tests of what a run states about itself: a run with its recipe writes the same files, its summary can be read back,
+//! its planned number of reads holds, and a dry run states the same as the run.
 
 use crate::scene::{Run, Workplace, lasting_files, shared};
 use serde_json::Value;

@@ -462,8 +462,9 @@ fn unlinkable_frames_are_refused_by_name() {
     workplace.done("info alone --link always");
 }
 
-/// Shuffles the Gaussians in the frames of a model, adds noise of `noise` times the size of a Gaussian to positions,
-/// and links the frames. Returns the fractions of links that are right, wrong and missing.
+/// Shuffles the Gaussians in the frames of a model, adds noise to their positions, and links the frames. `noise` is the
+/// standard deviation of the noise, relative to the size of a Gaussian. Returns the fractions of links that are right,
+/// wrong and missing.
 fn link_fractions(model: PathBuf, noise: f32) -> [f64; 3] {
     let options = InputOptions { path: model.clone(), cameras: Some(model.clone()), ..InputOptions::default() };
     let scene = open_scene(&options).unwrap();

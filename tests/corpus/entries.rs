@@ -267,8 +267,9 @@ fn archive(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(unpacked?)
 }
 
-/// Reads the sections of an archive before they are compressed. `bytes` has three lengths, then the sections table,
-/// point cloud, field and blobs. Most changes of a compressed table would only fail to decompress.
+/// Reads an archive whose sections this function compresses. `bytes` has three lengths, then the sections table, point
+/// cloud, field and blobs, table and blobs without compression: most changes of compressed bytes would only make
+/// decompression fail.
 fn archive_sections(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let mut rest = bytes.get(12..).unwrap_or_default();
     let mut sections: [&[u8]; 4] = [&[]; 4];

@@ -1,5 +1,5 @@
 //! Tests of binary inputs that announce more content than they have: PLY files, frame streams, containers, archives and
-//! arrays. Also of devices and other special files in place of regular files.
+//! arrays. Other tests give devices and other special files in place of regular files.
 //!
 //! Large inputs are sparse files: they take no space on disk and no memory of the test process.
 

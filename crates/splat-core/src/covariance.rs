@@ -1,8 +1,8 @@
-//! Scales and rotation of a covariance matrix that is not given by scales and a rotation.
+//! Scales and rotation that are computed from a covariance matrix.
 //!
-//! Some model formats define a covariance Σ by a formula other than R S Sᵀ Rᵀ of stored scales S and rotation R: with a
-//! quaternion that is not of unit length, or as a slice through a four-dimensional Gaussian. Renderers and statistics
-//! need scales and a rotation.
+//! Most model formats store scales S and a rotation R, which define the covariance Σ = R S Sᵀ Rᵀ. Some formats define Σ
+//! in another way: with a quaternion that is not of unit length, or as a slice through a four-dimensional Gaussian.
+//! Renderers and statistics need scales and a rotation for these formats too.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -15,12 +15,16 @@ const MAX_SWEEPS: usize = 12;
 /// Computes the scales s and the unit quaternion (wxyz) of a rotation R with Σ = R diag(s)² Rᵀ. `sigma` holds the
 /// entries xx, xy, xz, yy, yz, zz of the covariance Σ in squared scene units; the scales are in scene units.
 ///
-/// Order and directions of the axes of R are chosen close to the axes of the quaternion `like` (wxyz, of any length; 0
-/// counts as the identity). Of the six orders of the axes, the one closest to the axes of `like` is taken. Each axis
-/// points in the direction of the corresponding axis of `like`. If the three axes would then form a reflection, the one
-/// furthest from the corresponding axis is reversed. Of the two quaternions of R, the one nearer to `like` is returned.
-/// If eigenvalues coincide, the axes are not unique, and those of `like` are taken if they are valid. The result
-/// depends on `sigma` and `like` only, so a Gaussian has one scale and rotation at each time.
+/// The order and the directions of the axes of R are not unique. They are chosen close to the axes of the quaternion
+/// `like` (wxyz, of any length; 0 counts as the identity):
+/// - Of the six orders of the axes, the one closest to the axes of `like` is taken.
+/// - Each axis points in the direction of the corresponding axis of `like`. If the three axes would then form a
+///   reflection, the one furthest from its corresponding axis is reversed.
+/// - Of the two quaternions of R, the one nearer to `like` is returned.
+/// - If eigenvalues coincide, the axes of `like` are taken if they are valid.
+///
+/// The result depends only on `sigma` and `like`, so a Gaussian always gets the same scales and rotation at the same
+/// time.
 ///
 /// Method: Jacobi iteration in f64, started at the axes of `like`. The result reproduces Σ to about 1e-15 of its
 /// largest entry. Eigenvalues below 1e-14, such as those that rounding made negative, are raised to 1e-14. An entry of

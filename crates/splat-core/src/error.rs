@@ -23,7 +23,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 /// | 2 | [`MemoryLimit`](ErrorKind::MemoryLimit) | The request needs more memory than `--memory` allows. |
 /// | 128 + signal | [`Interrupted`](ErrorKind::Interrupted) | A signal ended the run. |
 ///
-/// A panic is also a bug; the Rust runtime ends it with exit code 101.
+/// A panic is also a bug. The Rust runtime then ends the process with exit code 101.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file has malformed content. The user should repair or replace the file.
@@ -95,8 +95,8 @@ impl ErrorKind {
         }
     }
 
-    /// Returns the kind of failure of a failed system call: an input or an output error, depending on the verb with
-    /// which `action` begins.
+    /// Returns the kind of failure of a failed system call. It is an input error if `action` begins with a verb of
+    /// reading, such as "open" or "list". Otherwise, and for the action "read back", it is an output error.
     fn from_action(action: &str) -> ErrorKind {
         const READING: [&str; 7] = ["open", "read", "list", "find", "map", "examine", "decompress"];
         let verb = action.split(' ').next().unwrap_or_default();

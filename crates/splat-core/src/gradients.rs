@@ -13,13 +13,14 @@ use super::{AttributeValues, Attributes, Gaussians};
 pub struct Gradients {
     len: usize,
     columns: Attributes,
-    /// Derivatives. Attributes that are not differentiated have planes of length 0.
+    /// Derivatives of the loss, in the layout of [`Gaussians`]. The planes of attributes that are not differentiated
+    /// have length 0.
     sums: Gaussians,
 }
 
 impl Gradients {
-    /// Creates zero derivatives for the attributes `columns` of `len` Gaussians, with SH coefficients up to
-    /// `sh_degree`.
+    /// Creates derivatives that are all 0, for the attributes `columns` of `len` Gaussians, with SH coefficients up to
+    /// degree `sh_degree`.
     pub fn new(len: usize, columns: Attributes, sh_degree: usize) -> Self {
         let mut sums = Gaussians::zeros(0, sh_degree);
         sums.columns_mut(columns).for_each(|column| column.resize(len));
@@ -41,7 +42,8 @@ impl Gradients {
         self.columns
     }
 
-    /// Returns the derivatives for the single attribute `which`. They are empty if the attribute is not differentiated.
+    /// Returns the derivatives of the loss with respect to the single attribute `which`. Their planes have length 0 if
+    /// the attribute is not differentiated.
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
@@ -49,7 +51,7 @@ impl Gradients {
         self.sums.column(which)
     }
 
-    /// Returns the derivatives for the single attribute `which` for writing.
+    /// Returns the derivatives of the loss with respect to the single attribute `which` for writing.
     ///
     /// # Panics
     /// Panics if `which` is not exactly one attribute.
@@ -97,13 +99,14 @@ impl Gradients {
     }
 }
 
-/// Derivatives of consecutive Gaussians, for one thread to add to.
+/// Part of [`Gradients`] to which one thread adds: the derivatives of the loss with respect to the attributes of
+/// consecutive Gaussians.
 #[derive(Debug)]
 pub struct GradientSpan<'a> {
     ids: Range<usize>,
     columns: Attributes,
-    /// Derivatives by attribute, in the order of [`Attributes::all`], with one plane per component. Attributes that are
-    /// not differentiated have no planes.
+    /// Derivatives of the loss with respect to each attribute, in the order of [`Attributes::all`]: one plane per
+    /// component, and no planes for an attribute that is not differentiated.
     planes: [Vec<&'a mut [f32]>; 5],
 }
 
@@ -118,8 +121,8 @@ impl<'a> GradientSpan<'a> {
         self.columns
     }
 
-    /// Returns the derivatives for a single attribute, one plane per component. Returns no planes if the attribute is
-    /// not differentiated.
+    /// Returns the derivatives of the loss with respect to the single attribute `column`, one plane per component.
+    /// Returns no planes if the attribute is not differentiated.
     pub fn planes(&mut self, column: Attributes) -> &mut [&'a mut [f32]] {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }

@@ -1,5 +1,5 @@
-//! Fixed hash of Gaussian ids. It breaks ties without preferring a place in the file, and serves instead of random
-//! numbers.
+//! Fixed hash of Gaussian ids. Ties between Gaussians are broken by this hash, so that their order in the file has no
+//! influence. The hash is also used in place of random numbers.
 
 /// Returns a hash of `id`: the SplitMix64 finalizer (Steele, Lea and Flood 2014), applied to `id + 1` times the
 /// constant of that generator (the golden gamma).

@@ -23,28 +23,28 @@ impl Jacobian {
     /// for each other attribute.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
-    /// Returns the derivative of the single attribute `which`. It has no planes (width 0) if state and stored values
-    /// change by the same amount.
+    /// Returns the derivative ∂state/∂stored of the single attribute `which`. It has no planes (width 0) if it is the
+    /// identity.
     pub fn column(&self, which: Attributes) -> &AttributeValues {
         &self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivative of the single attribute `which` for writing.
+    /// Returns the derivative ∂state/∂stored of the single attribute `which` for writing.
     pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         &mut self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivatives of all attributes, in the order of [`Attributes::all`].
+    /// Returns the derivative ∂state/∂stored of each attribute, in the order of [`Attributes::all`].
     pub fn columns(&self) -> &[AttributeValues; 5] {
         &self.columns
     }
 
-    /// Returns the derivatives of all attributes for writing.
+    /// Returns the derivative ∂state/∂stored of each attribute for writing, in the order of [`Attributes::all`].
     pub fn columns_mut(&mut self) -> &mut [AttributeValues; 5] {
         &mut self.columns
     }
 
-    /// Returns the derivatives of the Gaussians with the indices `rows`, in the order of `rows`.
+    /// Returns the derivatives ∂state/∂stored of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> Jacobian {
         let picked =
             |column: &AttributeValues| if column.width() > 0 { column.pick(rows) } else { AttributeValues::default() };

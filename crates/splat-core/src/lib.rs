@@ -57,7 +57,8 @@ pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Returns the value of one color channel from its SH coefficient of degree 0, which is equal from all directions.
+/// Returns the value of one color channel from its SH coefficient of degree 0. This part of the color is the same from
+/// all directions.
 pub fn color_from_sh(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }

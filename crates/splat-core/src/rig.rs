@@ -49,8 +49,8 @@ pub struct Rig {
     pub origin: String,
 }
 
-/// Maximum difference between the time of a view and the time of its frame, as a fraction of the time span of the
-/// sequence. Allows for times that a file rounded, and still distinguishes a million frames.
+/// Maximum allowed difference between the time of a view and the time of its frame, as a fraction of the time span of
+/// the sequence. Large enough for times that were rounded in a file, and small enough to distinguish a million frames.
 const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
@@ -58,9 +58,9 @@ impl Rig {
     /// the camera file is read.
     pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
-    /// Bytes of memory per view, without its camera and the text of its file name: a [`Shot`], its entries in two
-    /// tables while the camera file is read, and three times its entry of 40 bytes in a [`ViewSchedule`], whose vectors
-    /// double when they grow.
+    /// Bytes of memory per view, without its camera and the text of its file name: a [`Shot`], 32 bytes for its entries
+    /// in two tables while the camera file is read, and three times its entry of 40 bytes in a [`ViewSchedule`]. The
+    /// factor is three because a vector that grows needs its old memory and twice as much new memory.
     pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
     /// Bytes of memory per file name in addition to its text: the overhead of the allocator.
@@ -91,8 +91,9 @@ impl Rig {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
-    /// Returns the maximum difference between the time of a view and the time of its frame, in the unit of the times.
-    /// The sequence is assumed to cover the same time span as the views.
+    /// Returns the maximum allowed difference between the time of a view and the time of its frame, in the unit of the
+    /// times: 1e-6 times the time span of the views, or 1e-6 if they have fewer than two distinct times. The sequence
+    /// is assumed to cover the same time span as the views.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }

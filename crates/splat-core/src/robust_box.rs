@@ -1,4 +1,4 @@
-//! Extent of a scene without outliers, in which relative lengths are measured.
+//! Extent of a scene without outliers. It is the unit of lengths that are given relative to the size of the scene.
 
 use glam::DVec3;
 

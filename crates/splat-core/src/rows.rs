@@ -144,7 +144,7 @@ impl Statistic {
         self.declaration().meaning
     }
 
-    /// Returns the property of a Gaussian that this statistic measures.
+    /// Returns a short text that names the property of a Gaussian that this statistic measures, such as "motion".
     pub fn measured_property(self) -> &'static str {
         self.declaration().property
     }
@@ -172,16 +172,16 @@ pub struct Rows {
     pub kappa: Vec<f64>,
     /// Variance V of the opacity over the life span (the frames in which the opacity reaches a threshold).
     pub v: Vec<f64>,
-    /// Number of frames of the life span, in which the opacity reaches a threshold.
+    /// Number of frames in which the opacity reaches a threshold: the length of the life span.
     pub life: Vec<u32>,
-    /// Contribution C to a render, mean over the views, in pixels: projected area times opacity, or the sum of alpha ·
-    /// transmittance over the pixels.
+    /// Contribution C to a render in pixels, mean over the views. The parameter `coverage` of the recipe selects the
+    /// sum of alpha · transmittance over the pixels (`visible`), or the opacity times the projected area (`projected`).
     pub c: Vec<f64>,
-    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if C is computed from projected
-    /// areas.
+    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if the contribution [`Rows::c`]
+    /// is computed from projected areas.
     pub w: Vec<f64>,
-    /// Anisotropy E of the canonical (time-independent) scales: the ratio of the largest to the smallest, or in the
-    /// logarithmic form ln(largest/middle).
+    /// Anisotropy E of the canonical (time-independent) scales. The parameter `anisotropy` of the recipe selects the
+    /// ratio of the largest scale to the smallest (`ratio`), or ln(largest scale / middle scale) (`log`).
     pub e: Vec<f64>,
     /// Fraction of (frame, view) pairs in which the opacity of the Gaussian reaches a threshold and the Gaussian
     /// touches the image.
@@ -211,7 +211,7 @@ impl Rows {
         self.d.is_empty()
     }
 
-    /// Appends the statistics in `next`, those of the following block of Gaussians, and leaves `next` empty.
+    /// Appends the statistics in `next`, which belong to the following block of Gaussians. Leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
             match statistic.accessors() {

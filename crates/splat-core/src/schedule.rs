@@ -10,7 +10,7 @@ use super::camera::Camera;
 /// grows with the number of images that the camera file names, not with the number of frames.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewSchedule {
-    /// Distinct cameras.
+    /// Distinct cameras, to which the camera indices of the views refer. Some may have no view.
     pub cameras: Vec<Camera>,
     runs: Vec<ViewRun>,
     /// Views of all runs, one run after the other, as pairs (view number, camera index).
@@ -39,8 +39,7 @@ pub struct FrameView {
 }
 
 impl FrameView {
-    /// Returns the name `tNNN_vNN` of the view, made of frame index and view number, with more digits for larger
-    /// numbers.
+    /// Returns the name of the view, such as `t012_v03` for frame 12 and view 3. Larger numbers have more digits.
     pub fn name(&self) -> String {
         format!("t{:03}_v{:02}", self.frame, self.view)
     }
@@ -92,7 +91,7 @@ impl ViewSchedule {
         (0..self.runs.len()).map(|run| self.run_length(run) * self.views_of_run(run).len()).sum()
     }
 
-    /// Returns the largest number of views that a frame has.
+    /// Returns the largest number of views that a frame has, or 0 if there are no frames.
     pub fn max_views_per_frame(&self) -> usize {
         (0..self.runs.len()).map(|run| self.views_of_run(run).len()).max().unwrap_or(0)
     }

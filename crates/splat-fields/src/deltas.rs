@@ -32,8 +32,8 @@ impl Deltas {
         }
     }
 
-    /// Prepares for the deltas of `rows` Gaussians: resizes the deltas of the `active` attributes and stores the other
-    /// arguments.
+    /// Resizes the deltas of the `active` attributes to `rows` Gaussians, so that new deltas can be written. Sets the
+    /// fields [`Deltas::active`] and [`Deltas::multiply_rotation`] to the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);
@@ -97,8 +97,8 @@ impl Deltas {
     /// Computes the stored attributes `raw` that these deltas and masks turn into `state`, for the attributes `want`.
     /// This is the inverse of [`Deltas::apply`].
     ///
-    /// The result is exact up to rounding, and for rotations up to the length of the quaternion. If a mask or a
-    /// rotation delta is zero, no stored value leads to `state`, and the result is not finite.
+    /// The result is exact up to rounding, except for the length of quaternions. If a mask or a rotation delta is zero,
+    /// no stored value leads to `state`, and the result is not finite.
     pub fn invert(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);

@@ -3,9 +3,9 @@
 //!
 //! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
 //! and a mask that multiplies its stored attributes. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared
-//! Gaussian, and per reader about 4·LANES·(features + trunk + heads) bytes of buffers, where the sum is of the widths
-//! of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
-//! behavior of its public renderer.
+//! Gaussian, and about 4·LANES·(features + trunk + heads) bytes of buffers per reader of frames; each name in this sum
+//! stands for the width of its layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene
+//! Rendering", 2024, and the behavior of its public renderer.
 
 use std::path::Path;
 
@@ -43,9 +43,9 @@ pub struct FieldConfig {
 pub(super) enum Mask {
     /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
     None,
-    /// The last head of the field computes the mask, which varies with time.
+    /// The last head of the field computes the mask, which varies with time (option `static_mlp`).
     Head,
-    /// A voxel grid contains the mask, which is constant in time.
+    /// A voxel grid contains the mask, which is constant in time (option `empty_voxel`).
     Voxel(VoxelMask),
 }
 
@@ -71,7 +71,7 @@ pub struct Field {
     pub(super) mask: Mask,
 }
 
-/// Results for one block of Gaussians that do not depend on time: the first part of evaluating a field.
+/// Results of the first part of evaluating a field, which does not depend on time, for one block of Gaussians.
 #[derive(Debug, Clone)]
 pub struct PreparedPositions {
     rows: usize,
@@ -80,7 +80,7 @@ pub struct PreparedPositions {
     voxel: Option<Vec<f32>>,
 }
 
-/// The part of the input of the trunk (first MLP) that does not depend on time: plane features, or positions.
+/// Time-independent part of the input of the trunk (first MLP): plane features, or positions.
 #[derive(Debug, Clone)]
 enum PreparedInput {
     Planes(PreparedPlanes),

@@ -14,7 +14,7 @@ use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
-/// Outputs of all layers, and derivatives, for one group of Gaussians.
+/// Outputs of all layers for one group of Gaussians, and the derivatives that the backward pass computes from them.
 #[derive(Default)]
 struct JacobianGroup {
     features: Vec<CacheLine>,
@@ -160,8 +160,8 @@ impl JacobianGroup {
         head.hidden.activate::<FMA>(input, &mut self.hidden);
     }
 
-    /// Returns the derivative with respect to the position along `axis`, from the derivatives with respect to the plane
-    /// features in `gradient`.
+    /// Returns the derivative of a position component with respect to the position along `axis`, by the chain rule: the
+    /// sum over the plane features of `gradient` times `slopes`.
     #[inline(always)]
     fn axis_derivative(&self, axis: usize) -> CacheLine {
         let mut sums = CacheLine([0.0; LANES]);

@@ -1,10 +1,9 @@
 //! Fully connected layers, evaluated for [`LANES`] Gaussians side by side.
 //!
-//! Weights are stored in panels of four outputs each; this order is made once, on loading. The sums of a panel take
-//! eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. In the inner loop, one input
-//! value of each Gaussian is multiplied by one weight, so layers with few outputs are not slower per output. A matrix
-//! library that reorders its operands in every call would spend a seventh of its time on this reordering, because these
-//! matrices are small.
+//! On loading, weights are reordered into panels of four outputs each. The sums of a panel take eight of the sixteen
+//! AVX2 registers, enough to hide the latency of the multiply-adds. In the inner loop, one input value of each Gaussian
+//! is multiplied by one weight, so layers with few outputs are not slower per output. A matrix library that reorders
+//! its operands in every call would spend a seventh of its time on this reordering, because these matrices are small.
 
 use splat_core::error::Result;
 
@@ -34,7 +33,8 @@ pub(super) struct Linear {
 
 impl Linear {
     /// Reads the layer from the tensors `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`. If `outputs`
-    /// is `None`, any number of outputs is accepted. Messages about malformed tensors show `why`.
+    /// is `None`, any number of outputs is accepted. Errors show `why`, the reason why the tensors are expected with
+    /// these shapes.
     pub(super) fn load(
         lookup: Lookup<'_>,
         name: &str,
@@ -87,8 +87,9 @@ impl Linear {
     /// Computes into `out` the derivatives of a value with respect to the inputs of the layer, from its derivatives
     /// with respect to the outputs (`output_gradient`).
     ///
-    /// Both arrays are filled up with zeros to whole panels ([`PANEL`] values). `activations` are the inputs of the
-    /// layer if they come out of a ReLU; where they are not positive, the derivative is set to 0.
+    /// Both arrays are filled up with zeros to whole panels ([`PANEL`] values). If the inputs of the layer come out of
+    /// a ReLU, they are passed as `activations`: where they are not positive, the derivative is set to 0. Otherwise
+    /// `activations` is `None`.
     #[inline(always)]
     pub(super) fn backward<const FMA: bool>(
         &self,

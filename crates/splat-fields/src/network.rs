@@ -42,15 +42,18 @@ pub struct Network {
 #[derive(Debug, Clone)]
 struct NetworkLayer {
     linear: Linear,
-    /// Whether the layer reads the encodings of position and time before the output of the previous layer.
+    /// Whether the layer has a skip connection: its input is then the encodings of position and time, followed by the
+    /// output of the previous layer.
     has_skip: bool,
 }
 
-/// Linear output layer (head) that computes the offset of one attribute, or of three of its components.
+/// Linear output layer (head) that computes the offset of one attribute. For screw motions there are two heads for the
+/// position: one computes the rotation part w, the other the translation part v.
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Attributes,
-    /// First component of the attribute that the layer computes.
+    /// Index of the first plane of the attribute in [`PredictedMotion`] that the layer computes: 3 for the translation
+    /// part v of a screw motion, otherwise 0.
     plane: usize,
     output: Linear,
 }
@@ -64,8 +67,8 @@ pub struct EncodedPositions {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians: the outputs of its heads. Attributes for which the
-/// network has no head, or that were not requested, are empty.
+/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute stays empty if the
+/// network has no head for it, or until [`Network::motion`] is asked for it.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
     /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
@@ -81,11 +84,11 @@ pub struct PredictedMotion {
     pub color: AttributeValues,
 }
 
-/// Inputs and outputs of layers for one group of Gaussians.
+/// Buffers for the inputs and outputs of the layers, for one group of [`LANES`] Gaussians.
 #[derive(Default)]
 struct NetworkScratch {
-    /// Encodings of position and time, the input of the first layer. For a layer with a skip connection the output of
-    /// the layer before it follows.
+    /// Input of the first layer: the encodings of position and time. For a layer with a skip connection, the output of
+    /// the previous layer is appended.
     input: Vec<CacheLine>,
     /// Output of the layer that is evaluated now.
     last: Vec<CacheLine>,
@@ -94,7 +97,7 @@ struct NetworkScratch {
 }
 
 impl PredictedMotion {
-    /// Returns the motion of the attribute `which` for writing.
+    /// Returns a mutable reference to the predicted motion of the attribute `which`.
     fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
             Attributes::POSITION => &mut self.warp,
@@ -216,9 +219,9 @@ impl Network {
 
     /// Computes the encoding of the stored positions `position` (`[3, N]`).
     ///
-    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. The values for k = 0 are computed in f64. The
-    /// values for k + 1 follow from those for k by the double-angle formulas. Each doubling doubles the error, from
-    /// 1e-16 at first to 1e-13 at the last octave.
+    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32 precision. The values for k = 0 are computed in
+    /// f64. The values for k + 1 follow from those for k by the double-angle formulas. Each doubling doubles the error,
+    /// from 1e-16 at first to 1e-13 at the last octave.
     pub fn encode(&self, position: &AttributeValues) -> EncodedPositions {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
@@ -440,8 +443,8 @@ fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
     }
 }
 
-/// Returns the derivative with respect to the position along `axis`, from the derivatives `gradient` with respect to
-/// the encoded position.
+/// Returns the derivative of a network output with respect to the position along `axis`, from its derivatives
+/// `gradient` with respect to the encoded position.
 #[inline(always)]
 fn axis_derivative(axis: usize, position_encoding: &[CacheLine], gradient: &[CacheLine]) -> CacheLine {
     let mut sum = gradient[axis];

@@ -81,7 +81,7 @@ pub(super) struct Planes {
     pub(super) levels: Vec<Level>,
 }
 
-/// Linear interpolation at a coordinate between the two nearest texels along one axis.
+/// Two neighboring texels along one axis, and their weights for linear interpolation at a coordinate between them.
 #[derive(Debug, Clone, Copy)]
 pub struct Tap {
     /// Index of the texel at or below the coordinate.
@@ -92,18 +92,19 @@ pub struct Tap {
     pub fraction: f32,
 }
 
-/// The part of the HexPlane features of a block of Gaussians that does not depend on time.
+/// Time-independent part of the HexPlane features of a block of Gaussians.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
     /// Products of the samples of the three planes without time, `[rows, width]` with one row per Gaussian.
     product: Vec<f32>,
-    /// Positions for interpolation on the lines of the three planes with time, `[rows, levels, 3]` with one row per
-    /// Gaussian and the axes x, y, z.
+    /// Texels and weights for interpolation along x, y and z in the three planes with time: `[rows, levels, 3]` with
+    /// one row per Gaussian.
     taps: Vec<Tap>,
 }
 
 impl FeaturePlane {
-    /// Reads a plane from the tensor `name`. Returns the plane and its number of channels.
+    /// Reads a plane from the tensor `name`. Returns the plane and its number of channels. If `channels` is `None`, any
+    /// number of channels is accepted.
     fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
         let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
         let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
@@ -152,11 +153,11 @@ pub fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// Returns the number of leading rows of a plane over an axis and time that no time ≥ 0 reads, so that they need not be
-/// stored.
+/// Returns the number of rows at the start of a feature plane that are not read at any time ≥ 0, so that they need not
+/// be stored. Returns 0 for tensors that are not planes over an axis and time.
 ///
-/// `name` and `shape` are those of the tensor; rows are its third extent. Returns 0 for tensors that are not planes
-/// with time. Rows span the times −1 to 1, but models use times from 0 on, so about half of each plane is never read.
+/// `name` and `shape` are those of the tensor of the plane; its third extent is the number of rows. Rows span the times
+/// −1 to 1, but models use times from 0 on, so about half of each plane is never read.
 pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
@@ -237,7 +238,7 @@ impl Planes {
         prepared
     }
 
-    /// Interpolates the planes with time at `time`. Returns one line per axis for every level.
+    /// Interpolates the planes with time at `time`. Returns, for every level, one line for each of the axes x, y and z.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
@@ -248,9 +249,9 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// Writes the features of `lanes` Gaussians of the prepared block, beginning with Gaussian `start`, into `out`
-    /// `[width, LANES]`. `lines` are the planes with time, interpolated at the wanted time. Values of unused lanes are
-    /// 0.
+    /// Writes the features at one time of `lanes` Gaussians of the prepared block, from index `start` on, into `out`
+    /// `[width, LANES]`. `lines` are the planes with time, interpolated at this time ([`Planes::lines`]). Values of
+    /// unused lanes are 0.
     #[inline(always)]
     pub(super) fn features(
         &self,

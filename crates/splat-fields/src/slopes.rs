@@ -1,9 +1,10 @@
 //! HexPlane features (products of samples of six feature planes) and their derivatives with respect to position.
 //!
 //! Input: stored positions of a group of Gaussians, and the planes with time, interpolated at one time. Output:
-//! features `[Σ channels, LANES]`, and for each axis as many derivatives. A feature is a product of six samples, so
-//! each derivative multiplies the derivative of one sample by the other five. Coordinates outside the box are clamped,
-//! so their derivative is 0. Allocates nothing beyond the output.
+//! features `[Σ channels, LANES]`, and for each of the axes x, y and z as many derivatives. The derivative of a feature
+//! along an axis is a sum of three terms, one for each plane with this axis: the derivative of the sample of this plane
+//! times the other five samples. Coordinates outside the box are clamped, so their derivative is 0. Allocates nothing
+//! beyond the output.
 
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, tap, texels};
@@ -56,8 +57,9 @@ impl<'a> BilinearPatch<'a> {
         }
     }
 
-    /// Returns the bilinearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
-    /// with respect to the normalized coordinate along a, then those along b.
+    /// Returns three lists of [`CHANNEL_CHUNK`] channels, from channel `first` on: the bilinearly interpolated values,
+    /// their derivatives along the first axis of the plane, and those along its second axis. Derivatives are with
+    /// respect to normalized coordinates.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 3] {
         let [ll, hl] = [channel_chunk(self.corners[0], first), channel_chunk(self.corners[1], first)];
@@ -83,8 +85,8 @@ struct TimeLineSegment<'a> {
 }
 
 impl TimeLineSegment<'_> {
-    /// Returns the linearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
-    /// with respect to the normalized coordinate.
+    /// Returns two lists of [`CHANNEL_CHUNK`] channels, from channel `first` on: the linearly interpolated values, and
+    /// their derivatives with respect to the normalized coordinate.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 2] {
         let [low, high] = [channel_chunk(self.ends[0], first), channel_chunk(self.ends[1], first)];
@@ -98,9 +100,9 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
-    /// Computes the features of up to [`LANES`] Gaussians at the positions `x`, `y`, `z` (scene units) into `features`,
-    /// and their derivatives with respect to x, y and z into `slopes`. `lines` are the planes with time, interpolated
-    /// at the wanted time. Values of unused lanes are unspecified.
+    /// Computes the features of up to [`LANES`] Gaussians at the positions `x`, `y`, `z` (scene units) and one time
+    /// into `features`, and their derivatives with respect to x, y and z into `slopes`. `lines` are the planes with
+    /// time, interpolated at this time ([`Planes::lines`]). Values of unused lanes are unspecified.
     #[inline(always)]
     pub(super) fn features_with_slopes(
         &self,

@@ -5,8 +5,8 @@ pub mod deep;
 use crate::{FieldConfig, Tensor, Tensors};
 use splat_core::Attributes;
 
-/// Generator of pseudo-random values in [−1, 1), which are the upper bits of a linear congruential generator. Its state
-/// is the field of this type.
+/// Generator of pseudo-random values in [−1, 1): the upper bits of a linear congruential generator. The number in this
+/// type is the state of the generator.
 pub struct Noise(pub u64);
 
 impl Noise {
@@ -18,8 +18,8 @@ impl Noise {
     }
 }
 
-/// Number of outputs of the hidden layers. Deliberately not a multiple of the number of outputs that a layer sums
-/// together.
+/// Number of outputs of the hidden layers. Deliberately not a multiple of 4, the number of outputs that a layer
+/// computes together.
 const WIDTH: usize = 22;
 /// Number of channels of each feature plane.
 const CHANNELS: usize = 5;

@@ -25,8 +25,8 @@ pub(super) struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    /// Returns the tensor `name`. Fails if the tensor is missing or a value is not finite. `why` says in errors what
-    /// the tensor is used for.
+    /// Returns the tensor `name`. Fails if the tensor is missing or a value is not finite. Errors show `why`, the
+    /// reason why the tensor is expected.
     pub(super) fn get(&self, name: &str, why: &str) -> Result<&'a Tensor> {
         let tensor = self.tensors.get(name).ok_or_else(|| {
             Error::input(self.path, format!("tensor {name}"), format!("a tensor of this name ({why})"), "none")
@@ -39,7 +39,8 @@ impl<'a> Lookup<'a> {
     }
 
     /// Returns the tensor `name`. Fails if the tensor is missing, a value is not finite, or its shape differs from
-    /// `shape`, in which `None` accepts any extent. `why` says in errors what the tensor is used for.
+    /// `shape`, in which `None` accepts any extent. Errors show `why`, the reason why the tensor is expected with this
+    /// shape.
     pub(super) fn get_shaped(&self, name: &str, shape: &[Option<usize>], why: &str) -> Result<&'a Tensor> {
         let tensor = self.get(name, why)?;
         let fits = tensor.shape.len() == shape.len()
@@ -51,8 +52,8 @@ impl<'a> Lookup<'a> {
         Err(self.mismatch(name, format!("shape [{}] ({why})", want.join(", ")), format!("{:?}", tensor.shape)))
     }
 
-    /// Returns the numbers of outputs (rows) and inputs (columns) of the weight matrix `name`. `why` says in errors
-    /// what the matrix is used for.
+    /// Returns the numbers of outputs (rows) and inputs (columns) of the weight matrix `name`. Errors show `why`, the
+    /// reason why the matrix is expected.
     pub(super) fn matrix(&self, name: &str, why: &str) -> Result<[usize; 2]> {
         let shape = &self.get_shaped(name, &[None, None], why)?.shape;
         Ok([shape[0], shape[1]])

@@ -312,8 +312,8 @@ fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients)
     pulled
 }
 
-/// Asserts that the derivatives of each attribute at a time with respect to its own stored values match finite
-/// differences of the f64 reference (oracle), for the attributes `columns`.
+/// Asserts, for each of the attributes `columns`, that derivatives with respect to its stored values match finite
+/// differences of the f64 reference (oracle). `what` names the tested case in failures.
 fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Attributes) {
     let tensors = random_tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };

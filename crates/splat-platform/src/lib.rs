@@ -136,7 +136,7 @@ pub enum FileKind {
 }
 
 impl FileKind {
-    /// Returns the kind of entry that the file type `found` of the standard library stands for.
+    /// Converts the file type `found` of the standard library to the kind of entry.
     pub fn from_type(found: FileType) -> FileKind {
         match found {
             found if found.is_file() => FileKind::File,

@@ -1,4 +1,5 @@
-//! Implementation for macOS: memory limits, and functions that can do nothing there. Type-checked only.
+//! Implementation for macOS: memory limits, and functions that have no effect because macOS does not support them. The
+//! code is type-checked but not tested.
 
 use std::fs::File;
 use std::mem::{MaybeUninit, size_of};
@@ -7,7 +8,7 @@ use rustix::process::{Resource, getrlimit};
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits, TruncatedMapMessage};
 
-/// Returns `None`: macOS gives no answer to whether reading the byte at `offset` needs disk access.
+/// Returns `None`, because macOS does not tell whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
     None
 }

@@ -1,8 +1,8 @@
 //! Assignment of splats (image footprints of Gaussians) to tiles, in the order from front to back.
 //!
 //! One radix sort orders all splats of a render by depth. A counting sort then lists the splats of each tile in this
-//! order. The lists, of (splat, tile) pairs, are in memory only for one strip of tiles at a time, so their memory is
-//! limited in every view. Memory: 16 bytes per splat, and 4 bytes per pair of the strip.
+//! order. The lists consist of (splat, tile) pairs. Only the pairs of one strip of tiles are in memory at a time, so
+//! their memory is limited in every view. Memory: 16 bytes per splat, and 4 bytes per pair of the strip.
 
 use std::ops::Range;
 
@@ -12,7 +12,7 @@ use super::project::{Splats, TileRect};
 /// pairs is a strip by itself.
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
 
-/// Number of splats whose tile rectangles are read together, so that the reads wait for memory at the same time.
+/// Number of splats whose tile rectangles are read together, so that their waits for memory overlap.
 const PREFETCHED: usize = 64;
 
 /// Lists of the splats of each tile, nearest splat first.
@@ -34,8 +34,8 @@ pub(super) struct Bins {
     strip: Range<usize>,
     /// Splat of every (splat, tile) pair of the strip, tile after tile.
     pairs: Vec<u32>,
-    /// For each tile of the strip, the index in `pairs` at which its next splat is written; at the end, the number of
-    /// all pairs.
+    /// For each tile of the strip, the index in `pairs` at which the next splat of the tile is written. One more entry
+    /// after those of the tiles holds the number of all pairs.
     next_slots: Vec<u32>,
 }
 
@@ -70,8 +70,8 @@ impl Bins {
         self.next_tile = 0;
     }
 
-    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are kept in
-    /// memory.
+    /// Makes [`Bins::next_strip`] start again at the first tile. If one strip held all tiles, its pairs are in memory
+    /// already and are not computed again.
     pub(super) fn rewind(&mut self) {
         self.next_tile = 0;
     }
@@ -79,8 +79,9 @@ impl Bins {
     /// Computes the (splat, tile) pairs of the next strip of tiles. Returns the tiles of the strip, or `None` after the
     /// last tile.
     ///
-    /// A strip is as many whole rows of tiles as have at most `max_pairs` pairs; if one row has more, it is a part of a
-    /// row, and at least one tile. `splats` must be those given to [`Bins::begin`].
+    /// A strip consists of as many whole rows of tiles as possible with at most `max_pairs` pairs in total. If a single
+    /// row has more pairs, the strip is a part of this row. If a single tile has more pairs, the strip is this tile.
+    /// `splats` must be those given to [`Bins::begin`].
     pub(super) fn next_strip(&mut self, splats: &Splats, max_pairs: usize) -> Option<Range<usize>> {
         if self.is_last_strip() {
             return None;
@@ -121,9 +122,9 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Returns the first tiles of the non-empty range `tiles`: as many as have at most `max_pairs` (splat, tile) pairs
-    /// in total and end with a row of tiles or with `tiles`. If even the first row has more pairs, the result ends
-    /// within this row. At least one tile is returned.
+    /// Returns the longest beginning of the non-empty range `tiles` that has at most `max_pairs` (splat, tile) pairs in
+    /// total and ends at the end of a row of tiles or of `tiles`. If the first row alone has more pairs, the result
+    /// ends within this row. The result has at least one tile.
     fn first_part(&self, tiles: Range<usize>, max_pairs: usize) -> Range<usize> {
         let Range { start: first, end: last } = tiles;
         let before = self.start(first);

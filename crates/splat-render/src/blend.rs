@@ -72,8 +72,8 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means
-    /// ended) for others.
+    /// Returns the transmittance of each pixel before any splat is blended: 1 for pixels of the render, and a negative
+    /// value for the others, which marks them as ended.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -81,7 +81,7 @@ impl SampledPixels {
     }
 }
 
-/// Values of one splat at the pixels of one vector.
+/// Values of one splat at neighboring pixels, one pixel per vector lane.
 #[derive(Clone, Copy)]
 pub(super) struct Fragment<V: Lanes> {
     /// Alpha (opacity of the splat at the pixel), at most 0.99.
@@ -90,7 +90,7 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) blended: V::Mask,
     /// Weight of the splat in the pixel, alpha · transmittance; 0 where the splat is not blended.
     pub(super) weight: V,
-    /// Transmittance behind the splat, never 0. May be negative where the weight is 0.
+    /// Transmittance behind the splat, never 0. Negative in pixels that have ended, where the weight is 0.
     pub(super) transmittance_after: V,
     /// Offset along x of the pixel from the largest alpha of the splat in this row, pixels: dx − shear·dy of [`Splat`].
     pub(super) offset_x: V,
@@ -104,19 +104,20 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the accumulator with which the blending of `splat` begins.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a
-    /// group covers the groups after it as well.
+    /// Adds `fragment`, the values of the splat at the [`LANES`] pixels of group `group`, to the accumulator, and
+    /// returns the accumulator. A vector that is wider than a group also has the pixels of the following groups.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether a splat is blended first in all groups of pixels with even index and then in the groups with odd index.
-    /// [`BlendSink::swap_even_odd`] is called after each half.
+    /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index, if a vector
+    /// holds one group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the sums over even and over odd groups in the accumulator. Called after the even groups and after the odd
-    /// groups if a vector holds only one group of eight pixels.
+    /// Returns `accumulator` with its sums over even and over odd groups swapped, if a vector holds one group of eight
+    /// pixels. Called twice per splat: after the groups with even index, and after the groups with odd index. Returns
+    /// `accumulator` unchanged by default.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -125,7 +126,8 @@ pub(super) trait BlendSink {
     fn end<V: Lanes>(&mut self, accumulator: Self::Accumulator<V>, pair: usize);
 }
 
-/// Receiver of weights that accumulates the colors of the pixels of a tile, one plane per color channel.
+/// Receiver of weights (alpha · transmittance of each splat) that accumulates the colors of the pixels of a tile, one
+/// plane per color channel.
 pub(super) struct ColorSink {
     pub(super) planes: [TilePlane; 3],
 }
@@ -150,14 +152,15 @@ impl BlendSink for ColorSink {
 /// Weights alpha · transmittance of one splat in one tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Weight {
-    /// Sum of the weights over the sampled pixels: at most 256 terms, added in f32 in a fixed order.
+    /// Sum of the weights alpha · transmittance of the splat over the sampled pixels: at most 256 terms, added in f32
+    /// in a fixed order.
     pub(super) sum: f32,
     /// Largest weight alpha · transmittance of the splat in any sampled pixel.
     pub(super) max: f32,
 }
 
-/// Receiver of weights that stores, in `pairs`, the sum and the largest value of the weights of each splat of the tile.
-/// Every entry of `pairs` must be zero at the start.
+/// Receiver of weights (alpha · transmittance of each splat) that stores, in `pairs`, the sum and the largest value of
+/// the weights of each splat of the tile. Every entry of `pairs` must be zero at the start.
 pub(super) struct WeightSink<'a> {
     pub(super) pairs: &'a mut [Weight],
 }
@@ -179,7 +182,7 @@ impl BlendSink for WeightSink<'_> {
     }
 }
 
-/// Instruction set with which tiles are blended. All of them give the same bits.
+/// Instruction set with which tiles are blended. All variants give results with the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BlendKernel {
     Portable,
@@ -268,27 +271,28 @@ impl BlendKernel {
 
 /// Number of splats whose footprints in the tile are computed together, before any of them is blended.
 ///
-/// The footprint of a splat tells which groups of pixels the splat touches. If a footprint were computed directly
-/// before its splat is blended, every mispredicted end of the loop over groups would wait for this computation and for
-/// the memory that it reads.
+/// The footprint of a splat tells which groups of pixels the splat touches, and thus how often the loop over groups
+/// runs. The processor often mispredicts the end of this loop. If a footprint were computed directly before its splat
+/// is blended, the processor would notice each misprediction only after this computation and its reads from memory.
 const LOOKAHEAD: usize = 16;
 
-/// Footprint of one splat in the rows of a tile. In each row, alpha is the opacity times 2 to the power of `level −
-/// falloff_x·(x − middle)²`.
+/// Footprint of one splat in the rows of a tile. In a row, alpha at the column x is the opacity times 2 to the power of
+/// `level − falloff_x·(x − middle)²`, with `level` and `middle` of this row.
 #[derive(Clone, Copy, Default)]
 struct TileFootprint {
     /// Index of the splat in the list of splats of the tile.
     pair: usize,
     /// Set of the groups of pixels in which the splat may be visible, one bit per group.
     groups: u32,
-    /// Position of the center of the splat along y, relative to the upper edge of the tile, pixels.
+    /// Position of the center of the splat along y, relative to the first row of the tile, in pixels of the image.
     v: f32,
-    /// Position of the largest alpha along x in each row, relative to the left edge of the tile, pixels.
+    /// For each row, the position along x at which alpha is largest, relative to the first column of the tile, in
+    /// pixels of the image: `middle` in the formula of [`TileFootprint`].
     middles: TileLine,
-    /// Exponent (of 2) of the largest alpha in each row.
+    /// For each row, the exponent (of 2) of alpha where it is largest: `level` in the formula of [`TileFootprint`].
     levels: TileLine,
-    /// First and last column in which the splat is drawn, as offsets from the left edge of the tile in pixels; `None`
-    /// if no column of the tile is excluded.
+    /// First and last column in which the splat is drawn, as offsets from the first column of the tile in pixels of the
+    /// image; `None` if no column of the tile is excluded.
     drawn_columns: Option<[f32; 2]>,
 }
 
@@ -346,7 +350,7 @@ impl TileFootprint {
     }
 }
 
-/// Exponent (of 2) of the alpha in a row in which a splat is not drawn: it makes alpha 0.
+/// Value of [`TileFootprint::levels`] in a row in which a splat is not drawn: it makes alpha 0.
 const EXCLUDED_LEVEL: f32 = -1e9;
 
 /// Blends splats over a tile like [`BlendKernel::tile`], with vectors of type `V`.
@@ -434,10 +438,11 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     transmittance
 }
 
-/// Returns the set `live` of vectors of pixels without the vectors `ended`, in which all pixels have ended.
+/// Returns the set `live` of vectors of pixels without the vectors in `ended`, whose pixels have all ended. Each bit
+/// stands for one vector.
 ///
-/// This is a separate cold function, so that the processor predicts a branch around it. If the difference were computed
-/// for every splat, the groups of the next splat would wait for the pixels of this one.
+/// The function is cold and not inlined, so that its call is a branch, which the processor predicts. If the set were
+/// instead computed for every splat, the next splat could not begin before all pixels of this one are blended.
 #[cold]
 #[inline(never)]
 fn remove_ended(live: u32, ended: u32) -> u32 {

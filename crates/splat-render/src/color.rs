@@ -114,7 +114,8 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     ]
 }
 
-/// Returns the derivatives of the SH basis functions (see [`basis`]), as polynomials, with respect to x, y and z.
+/// Returns the derivatives with respect to x, y and z of the polynomials that are the SH basis functions (see
+/// [`basis`]).
 #[inline(always)]
 pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);

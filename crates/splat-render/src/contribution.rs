@@ -59,8 +59,8 @@ impl Contribution {
         }
     }
 
-    /// Adds the contribution of Gaussian `i` in one tile: the `sum` of its weights over the pixels, and their largest,
-    /// `max`.
+    /// Adds the contribution of Gaussian `i` in one tile: the sum of its weights over the pixels, `sum`, and its
+    /// largest weight in a pixel, `max`.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
         let units = (f64::from(sum) * (1.0 / Self::SUM_UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);

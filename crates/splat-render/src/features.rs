@@ -45,8 +45,8 @@ pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera:
     blended
 }
 
-/// Returns the smallest finite value, and the difference between the largest and the smallest finite value (1 if they
-/// are equal or there are none).
+/// Returns the smallest finite value in `values`, and the difference between the largest and the smallest finite value
+/// (1 if they are equal or if no value is finite).
 fn span(values: &[f32]) -> [f64; 2] {
     let finite = || values.iter().copied().filter(|x| x.is_finite()).map(f64::from);
     let (least, most) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));

@@ -5,7 +5,7 @@ use std::num::NonZeroU32;
 use super::convention::TILE;
 use splat_core::Camera;
 
-/// Grid of pixels of an image: those whose column and row have given remainders modulo the stride.
+/// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the stride.
 ///
 /// A render of a grid has the same values as the render of all pixels at these pixels: footprints are those of the full
 /// image.
@@ -20,12 +20,13 @@ impl PixelGrid {
     /// Grid of all pixels.
     pub const ALL: PixelGrid = PixelGrid { stride: 1, phase: [0; 2] };
 
-    /// Creates the grid of the pixels whose column is `phase[0]` and whose row is `phase[1]` modulo `stride`.
+    /// Creates the grid of the pixels whose column and row have the remainders `phase[0]` and `phase[1]` when divided
+    /// by `stride`.
     pub fn new(stride: NonZeroU32, phase: [u32; 2]) -> PixelGrid {
         PixelGrid { stride: stride.get(), phase: phase.map(|phase| phase % stride) }
     }
 
-    /// Creates the grid of the pixels whose column and row are `stride / 2` modulo `stride`.
+    /// Creates the grid of the pixels whose column and row have the remainder `stride / 2` when divided by `stride`.
     pub fn centered(stride: NonZeroU32) -> PixelGrid {
         PixelGrid::new(stride, [stride.get() / 2; 2])
     }
@@ -68,8 +69,9 @@ impl PixelGrid {
         [first_tile, if first < end { (end / tile).ceil() } else { first_tile }]
     }
 
-    /// Returns the number of columns (`axis` 0) or rows (`axis` 1) of the grid before column or row `pixel` of the image.
-    /// `pixel` is an integer; the result is exact below 2⁵².
+    /// Returns the number of columns of the grid to the left of column `pixel` of the image (`axis` 0), or the number
+    /// of rows of the grid above row `pixel` of the image (`axis` 1). `pixel` is an integer; the result is exact below
+    /// 2⁵².
     #[inline(always)]
     fn count_before(self, axis: usize, pixel: f64) -> f64 {
         ((pixel - f64::from(self.phase[axis])) / f64::from(self.stride)).ceil().max(0.0)

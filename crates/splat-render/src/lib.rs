@@ -7,8 +7,8 @@
 //! [`Gradients`](splat_core::Gradients) of a loss.
 //!
 //! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for pairs of a Gaussian and a tile
-//! that it can change. Tiles are processed in strips whose pairs fit into these bytes. Only if a single tile has more
-//! pairs, they take more: 12 bytes per pair.
+//! that it can change. Tiles are processed in strips whose pairs fit into these bytes. Only a single tile whose pairs
+//! do not fit takes more memory: 12 bytes per pair.
 //!
 //! All conventions are those of the original CUDA rasterizer (Kerbl et al., "3D Gaussian Splatting", 2023), in every
 //! detail, because each deviation lowers the PSNR against its renders by tens of dB. Gaussians are skipped where their

@@ -53,8 +53,8 @@ pub(super) struct CameraTerms {
     pub(super) size: [u32; 2],
     /// Numbers of tiles (16×16 pixels of `grid`) across and down the render.
     pub(super) tiles: [u32; 2],
-    /// Near limit in scene units: Gaussians at this depth or closer to the camera are not drawn. Rounded to f32 as in the
-    /// original CUDA rasterizer.
+    /// Near limit in scene units: Gaussians at this depth or closer to the camera are not drawn. Rounded to f32 as in
+    /// the original CUDA rasterizer.
     near: f64,
 }
 
@@ -107,8 +107,8 @@ pub(super) struct Splat {
     pub(super) shear: f32,
     /// Coefficient of dy² in the exponent of alpha, 1/pixels², where dy is the offset of a pixel row from the center.
     pub(super) falloff_y: f32,
-    /// Limit of the exponent (of 2) in the formula of alpha: pixels at which the exponent is below `−cutoff` are
-    /// skipped, because alpha is below 1/255 there.
+    /// Range of the exponent (of 2) in the formula of alpha: pixels whose exponent is below `−cutoff` are skipped,
+    /// because their alpha is below 1/255.
     pub(super) cutoff: f32,
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
@@ -120,15 +120,15 @@ pub(super) struct Splat {
     pub(super) color: [f32; 3],
     /// Index of the Gaussian in the frame.
     pub(super) id: u32,
-    /// Tiles of the full image in which the splat is drawn: first and end column, then first and end row (both ends
-    /// exclusive). The splat is not drawn outside of them, although its alpha may exceed 1/255 there.
-    /// [`Splat::UNBOUNDED`] if no pixel is excluded this way. Used only in renders of a grid of pixels, whose tiles are
+    /// Tiles of the full image in which the splat is drawn, as `[x0, x1, y0, y1]`: columns from x0 to below x1, rows
+    /// from y0 to below y1. Pixels outside these tiles are excluded, although alpha may exceed 1/255 there.
+    /// [`Splat::UNBOUNDED`] if no pixel has to be excluded. Used only in renders of a grid of pixels, whose tiles are
     /// larger than those of the image.
     pub(super) drawn_tiles: [u16; 4],
 }
 
 impl Splat {
-    /// Value of [`Splat::drawn_tiles`] of a splat without limits.
+    /// Value of [`Splat::drawn_tiles`] of a splat without excluded pixels.
     pub(super) const UNBOUNDED: [u16; 4] = [0, u16::MAX, 0, u16::MAX];
 }
 
@@ -240,7 +240,8 @@ struct ProjectedSplats {
     sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Coefficients of the exponent of alpha: the fields of these names in [`Splat`].
+    /// Coefficients of the exponent of alpha, one per Gaussian of the block, as in the fields of [`Splat`] with the
+    /// same names.
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
@@ -462,8 +463,8 @@ fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> [f64; 2] {
 
 /// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
 ///
-/// The bits of a float, read as an integer and scaled by 2⁻⁵², are its biased logarithm except for the mantissa m, for
-/// which log₂(1 + m) ≤ m + 0.0861.
+/// For x = 2ⁿ·(1 + m) with 0 ≤ m < 1, the bits of x, read as an integer and scaled by 2⁻⁵², are 1023 + n + m. The bound
+/// uses log₂(1 + m) ≤ m + 0.0861.
 #[inline(always)]
 fn log2_bound(x: f64) -> f64 {
     x.to_bits() as i64 as f64 * (1.0 / (1u64 << 52) as f64) - (1023.0 - 0.0861)

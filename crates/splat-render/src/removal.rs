@@ -25,8 +25,8 @@ pub struct RemovalError {
     /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed
     /// per 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
-    /// Floor: color difference (norm over red, green, blue) whose square is added to the squared difference between a
-    /// Gaussian and what is behind it.
+    /// Floor: color difference (norm over red, green, blue) whose square is added to the squared color difference
+    /// between a Gaussian and what is behind it.
     pub contrast_floor: f32,
 }
 
@@ -87,7 +87,8 @@ impl RemovalError {
     }
 }
 
-/// Receiver of weights that computes the removal error of every splat of a tile while the tile is blended.
+/// Receiver of weights (alpha · transmittance of each splat) that computes the removal error of every splat of a tile
+/// while the tile is blended.
 pub(super) struct RemovalSink<'a> {
     /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
     /// them times the transmittance.

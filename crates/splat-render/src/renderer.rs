@@ -23,7 +23,8 @@ const SPAN: usize = 32 * BLOCK;
 /// Bytes of memory per visible Gaussian during a render: footprint, tile rectangle, and two copies of the depth sort
 /// key.
 pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + 2 * size_of::<u64>();
-/// Bytes of memory for the (Gaussian, tile) pairs of a strip of tiles during a render, and for the sums of each pair.
+/// Bytes of memory during a render for the (Gaussian, tile) pairs of a strip of tiles, and for the sum and the largest
+/// value of the weights of each pair.
 pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
 /// Image with red, green and blue per pixel, row by row from the top. White is 1. Values are not clamped.
@@ -200,8 +201,8 @@ impl Renderer {
         }
     }
 
-    /// Adds the removal error of each Gaussian in `view` (the error of a render without this Gaussian) to `errors`, on the
-    /// calling thread. Errors are sums over the pixels of the grid of `view`.
+    /// Adds the removal error of each Gaussian in `view` (the error of a render without this Gaussian) to `errors`, on
+    /// the calling thread. Errors are sums over the pixels of the grid of `view`.
     ///
     /// # Panics
     /// Panics if `errors` has another number of Gaussians, or if the attributes of `gaussians` have different lengths.
@@ -254,9 +255,11 @@ impl Renderer {
     }
 }
 
-/// Computes one value for each (splat, tile) pair of `tiles`, which must lie in the strip in memory. Resizes `sums` to
-/// default values, then calls `fill_tile` for each tile with its column and row, its splats, and their part of `sums`.
-/// Tiles run in parallel if `parallel`.
+/// Computes one value, such as a removal error, for each (splat, tile) pair of `tiles` into `sums`. The tiles must lie
+/// in the strip in memory.
+///
+/// Sets all values to the default, then calls `fill_tile` for each tile with its column and row, its splats, and the
+/// values of its pairs. Rows of tiles are processed in parallel if `parallel`.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,
@@ -314,7 +317,8 @@ mod tests {
     use super::*;
     use splat_core::{Attributes, Gradients};
 
-    /// Returns 3000 Gaussians of many sizes, and a camera among them. The image does not end at a tile edge.
+    /// Returns 3000 Gaussians of many sizes, and a camera that looks at them. Width and height of the image are not
+    /// multiples of the tile side.
     fn scene() -> (Gaussians, Camera) {
         let mut scene = Gaussians::zeros(3000, 0);
         for i in 0..scene.len() {
@@ -389,7 +393,7 @@ mod tests {
         }
     }
 
-    /// Returns the grids with strides from 2 to 5 of all phases along x, and of several along y.
+    /// Returns grids with strides from 2 to 5, with all phases along x and several along y.
     fn grids() -> impl Iterator<Item = PixelGrid> {
         (2..6).flat_map(|stride| {
             (0..stride).map(move |phase| PixelGrid::new(NonZeroU32::new(stride).unwrap(), [phase, 3 * phase + 1]))

@@ -26,14 +26,14 @@ pub struct TileFrames {
     counted: Counted,
 }
 
-/// Part of a raw tile (plain f32) that has been counted as read.
+/// Part of a raw tile (plain f32) that has been counted as read, so that it is not counted twice.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
 enum Counted {
     #[default]
     Nothing,
-    /// The frame that was read last has been counted. Contains the number of the frame.
+    /// Only the frame that was read last has been counted. Contains the number of this frame.
     Frame(usize),
-    /// The whole tile has been counted, when its checksum was checked.
+    /// The whole tile has been counted, because all of it was read to check its checksum.
     Tile,
 }
 
@@ -48,13 +48,14 @@ pub struct TouchedPages {
 impl Reader {
     /// Loads the tile `at` into `frames`, which then returns its frames. Decompresses a compressed tile; checks the
     /// checksum of a raw tile (plain f32) if this was not done before. `buffer` is used while loading and holds no
-    /// values of the tile afterwards.
+    /// values of the tile afterwards. Fails if there is no such tile, if its bytes are damaged, or if they cannot be
+    /// read.
     ///
-    /// With `touched`, stored bytes are read in place from the memory map, under the conditions of [`Reader::tile`],
-    /// and their range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released
-    /// after this call, those of a raw tile after its last frame was read. Without `touched`, bytes are read by system
-    /// calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is read before its pages are
-    /// released.
+    /// If `touched` is given, stored bytes are read in place from the memory map, under the conditions of
+    /// [`Reader::tile`]. Their range is added to `touched`, so that [`Reader::release`] can release their pages: those
+    /// of a compressed tile after this call, those of a raw tile after its last frame was read. If `touched` is `None`,
+    /// bytes are read by system calls as in [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is
+    /// read before its pages are released.
     pub fn load(
         &self,
         at: TileId,
@@ -106,7 +107,8 @@ impl Reader {
     }
 
     /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`. Of a raw tile only
-    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place.
+    /// this frame is read from the file, or copied from the memory map if the tile was loaded in place. Fails if the
+    /// file has become too short.
     ///
     /// # Panics
     /// Panics if `out` has another size, if no tile was loaded into `frames` by this reader, or if the tile has no such
@@ -133,7 +135,7 @@ impl Reader {
     }
 
     /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the memory map
-    /// if the tile is raw and was loaded in place, otherwise in `buffer`.
+    /// if the tile is raw and was loaded in place, otherwise in `buffer`. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if no tile was loaded into `frames` by this reader, or if the tile has no such frame.
@@ -153,7 +155,7 @@ impl Reader {
     }
 
     /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; only one frame if all
-    /// frames of the tile are equal.
+    /// frames of the tile are equal. Fails if the file has become too short.
     ///
     /// # Panics
     /// Panics if `out` has another size, or no tile was loaded.
@@ -180,8 +182,8 @@ impl Reader {
         self.file.release(merged);
     }
 
-    /// Returns the loaded tile and the number of the stored frame that holds its frame `frame`: 0 if all frames are
-    /// equal.
+    /// Returns the loaded tile, and the index of its frame `frame` among its stored frames. This is `frame`, but 0 if
+    /// all frames are equal, because only one is stored then.
     fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
         let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
         assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
@@ -196,8 +198,8 @@ impl Reader {
         }
     }
 
-    /// Checks the checksum of a raw tile, which is read in chunks into the buffer `chunk`, unless this was done before.
-    /// Returns whether it was checked now.
+    /// Checks the checksum of a raw tile (plain f32), which is read in chunks into the buffer `chunk`, unless an
+    /// earlier call has checked it. Returns whether this call checked it.
     fn verify_raw(&self, index: usize, tile: &TileRecord, chunk: &mut Vec<u8>) -> Result<bool> {
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(false);
@@ -226,7 +228,8 @@ impl TileFrames {
 }
 
 impl TouchedPages {
-    /// Returns the number of bytes in the memory map that were read in place and have not been released.
+    /// Returns the number of bytes of tiles that were read in place from the memory map and whose pages have not been
+    /// released yet.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }

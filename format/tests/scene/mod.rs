@@ -117,8 +117,8 @@ impl Scene {
         (self, back)
     }
 
-    /// Writes the time stamps block by block, each followed by its tiles in the order set by `shuffle`. Returns the
-    /// digest.
+    /// Writes the scene to the container `path`: the time stamps of each block of frames, followed by its tiles in the
+    /// order set by `shuffle`. Returns the digest of the content.
     pub(crate) fn write(&self, path: &Path, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) -> u64 {
         let mut writer = Writer::create(path, self.layout.clone()).unwrap();
         self.fill(&mut writer, compression, shuffle);

@@ -1,4 +1,4 @@
-//! The bodies of the test scene: where each Gaussian is at rest, and how it moves.
+//! Bodies (objects) of the test scene: the attributes of each of their Gaussians at rest, and its motion.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::ops::Range;
@@ -12,33 +12,36 @@ use super::motion::{
 /// Body of the test scene: a group of Gaussians that form one object and share one property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DemoBody {
-    /// Floor and three walls with a checkered texture. Still; each tile has one color, so its Gaussians can merge.
+    /// Floor and three walls with a checkered texture, without motion. Each square of the texture has one color, so its
+    /// Gaussians can be merged.
     Wall,
-    /// Near-duplicates of wall Gaussians, shifted by a tenth of their size, a little smaller, of the same color. Still;
-    /// the first to merge.
+    /// Near-duplicates of Gaussians of the walls: shifted by up to a tenth of their size, a little smaller and less
+    /// opaque, of the same color. Without motion. Merging is expected to merge these Gaussians first.
     Double,
-    /// Opaque Gaussians behind the back wall, invisible to every camera. Still; pruned first by visibility, but not by
-    /// opacity or size.
+    /// Opaque Gaussians behind the back wall, invisible to every camera. Without motion. A ranking by visibility prunes
+    /// them first, a ranking by opacity or size does not.
     Buried,
-    /// Tiny faint Gaussians all over the room. Still; pruned first by coverage.
+    /// Tiny faint Gaussians all over the room, without motion. A ranking by contribution (projected area times opacity)
+    /// prunes them first.
     Dust,
-    /// Egg that circles and spins: strong but rigid motion, so merging within it keeps the motion.
+    /// Egg that runs along an ellipse and spins: strong but rigid motion, so that merging Gaussians of the egg with
+    /// each other keeps the motion.
     Egg,
-    /// Cloth held at its left edge and waving at the right: neighbors move differently.
+    /// Cloth that is held at its left edge and waves at its right edge: neighboring Gaussians move differently.
     Cloth,
-    /// Cloud whose opacity falls from full to 0 or rises. Still; only the variance of the opacity and the life span
-    /// differ from a wall.
+    /// Cloud without motion, whose Gaussians each fade from opaque to invisible or from invisible to opaque. Of the
+    /// statistics, only the variance of the opacity and the life span differ from those of a wall.
     Fading,
-    /// Sparks that fly, each visible for an eighth of the sequence at its own time: disjoint life spans, no motion
-    /// outside of them.
+    /// Flying sparks, each visible for an eighth of the sequence around its own time. The life spans of many sparks do
+    /// not overlap. A spark does not move outside of its life span.
     Spark,
-    /// Hanging wires, each a row of needle-shaped Gaussians that are 25 times longer than thick. Without motion; small
-    /// in area but visible.
+    /// Hanging wires, each a row of needle-shaped Gaussians that are 25 times longer than thick. Without motion; they
+    /// cover little area in a render, but are visible.
     Wire,
 }
 
 impl DemoBody {
-    /// Every body, in the order of their Gaussians.
+    /// List of the bodies, in the order of the ids of their Gaussians.
     pub const ALL: [DemoBody; 9] = [
         DemoBody::Wall,
         DemoBody::Double,
@@ -51,7 +54,7 @@ impl DemoBody {
         DemoBody::Wire,
     ];
 
-    /// Returns the name for tables.
+    /// Returns the name of this body in tables.
     pub const fn name(self) -> &'static str {
         match self {
             DemoBody::Wall => "wall",
@@ -66,7 +69,7 @@ impl DemoBody {
         }
     }
 
-    /// Returns the body's share of a thousand Gaussians.
+    /// Returns the share of this body in the Gaussians of the scene, in thousandths.
     const fn share(self) -> usize {
         match self {
             DemoBody::Wall => 400,
@@ -82,7 +85,8 @@ impl DemoBody {
 /// Ids of the Gaussians of each body (object of the test scene).
 #[derive(Debug, Clone)]
 pub(super) struct BodyLayout {
-    /// First id of each body's Gaussians, then the number of Gaussians of the scene.
+    /// First id of the Gaussians of each body, in the order of [`DemoBody::ALL`]. The last entry is the number of
+    /// Gaussians of the scene.
     starts: [usize; DemoBody::ALL.len() + 1],
 }
 
@@ -102,7 +106,8 @@ impl BodyLayout {
         self.starts[at]..self.starts[at + 1]
     }
 
-    /// Returns the constants and the motion of Gaussian `id`, which must be less than the number of Gaussians.
+    /// Returns the attributes at rest and the motion of the Gaussian with the id `id`, which must be less than the
+    /// number of Gaussians of the scene.
     pub(super) fn part(&self, id: usize) -> DemoGaussian {
         let body = DemoBody::ALL[self.starts.partition_point(|&start| start <= id) - 1];
         let members = self.members(body);
@@ -135,9 +140,11 @@ impl BodyLayout {
 }
 
 fn wall(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
-    /// Height of the walls and width of the room in scene units, and area of one wall in square scene units.
+    /// Height of the walls, scene units.
     const HIGH: f64 = 2.5;
+    /// Width and depth of the room, scene units.
     const WIDE: f64 = 4.0;
+    /// Area of one wall, square scene units.
     const WALL: f64 = HIGH * WIDE;
     const FLOOR: f64 = WIDE * WIDE;
     const ALL: f64 = FLOOR + 3.0 * WALL;

@@ -1,11 +1,11 @@
-//! Two generated dynamic scenes: [`Playground`] for `splatsieve demo`, and [`DemoScene`] for tests.
+//! Two generated dynamic scenes: [`Playground`] for `splatsieve demo`, and [`DemoScene`] (the test scene) for tests.
 //!
-//! The test scene has one [`DemoBody`] for each property of trained scenes that the program handles, with motion in
-//! closed form: a room with needless Gaussians, rigid and non-rigid motion, fading and flashing, thin structures.
-//! Every value is a function of the Gaussian's number, the scene's size and the time, so nothing is stored and any
-//! block can be read on its own.
+//! The test scene is a room. It has one [`DemoBody`] for each property of trained scenes that the program handles:
+//! needless Gaussians, rigid and non-rigid motion, fading and flashing, thin structures. The motion of each Gaussian is
+//! a closed formula of the time. In both scenes, every value is a function of the id of the Gaussian, the number of
+//! Gaussians and the time. So nothing is stored, and any block of Gaussians can be read on its own.
 //!
-//! Memory: at most 192 bytes per Gaussian of an open block.
+//! Memory: at most 192 bytes per Gaussian of a block that is open for reading.
 
 mod bodies;
 mod motion;
@@ -27,18 +27,20 @@ use motion::DemoGaussian;
 pub use bodies::DemoBody;
 pub use playground::Playground;
 
-/// SH degree of both scenes: enough view dependence to exercise the code, few enough coefficients to keep the scenes small.
+/// SH degree of both scenes. Degree 1 gives enough dependence on the view direction to exercise the code, with so few
+/// coefficients that the scenes stay small.
 const SH_DEGREE: usize = 1;
 
 /// Number of cameras of [`DemoScene::rig`].
 const CAMERAS: u32 = 6;
-/// Index of the camera whose view is the test view. It is an inner one, so that its view lies between training views.
+/// Index of the camera that takes the test view. The camera is neither the first nor the last of the row, so that the
+/// test view lies between training views.
 const HELD_OUT: u32 = 2;
 
-/// The test scene: a room 4 units wide, 4 deep and 2.5 high, z up, open toward −y.
+/// Test scene: a room 4 units wide, 4 deep and 2.5 high, z up, whose side toward −y is open.
 ///
-/// With more Gaussians the surfaces consist of smaller ones, with more frames the same motion is
-/// sampled more finely. A Gaussian's values depend on the scene's count.
+/// A scene of more Gaussians has the same surfaces, made of smaller Gaussians. A scene of more frames samples the same
+/// motion more finely. The values of a Gaussian depend on the number of Gaussians of the scene.
 ///
 /// ```
 /// use splatsieve::diagnostics::demo_scene::{DemoBody, DemoScene};
@@ -60,7 +62,8 @@ impl DemoScene {
     /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
-    /// Returns the scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.
+    /// Creates the scene with `count` Gaussians and `frames` frames at evenly spaced times from 0 to 1. Every value of
+    /// `count` and `frames` is valid, including 0.
     pub fn new(count: usize, frames: usize) -> DemoScene {
         let last = frames.saturating_sub(1).max(1) as f64;
         let info = SequenceInfo {
@@ -72,13 +75,14 @@ impl DemoScene {
         DemoScene { layout: BodyLayout::new(count), info }
     }
 
-    /// Returns the ids of a body's Gaussians. Bodies follow one another in the order of [`DemoBody::ALL`].
+    /// Returns the ids of the Gaussians of `body`. The Gaussians of the bodies follow one another in the order of
+    /// [`DemoBody::ALL`].
     pub fn body_ids(&self, body: DemoBody) -> Range<usize> {
         self.layout.members(body)
     }
 
-    /// Returns six cameras in front of the open side of the room, 256×192 pixels, each at every frame; the third is
-    /// for testing.
+    /// Returns the cameras: six in front of the open side of the room, with images of 256×192 pixels. Every camera sees
+    /// every frame. The third camera takes test views, the other five take training views.
     pub fn rig(&self) -> Rig {
         let camera = |view: u32| {
             let eye = DVec3::new(-1.7 + 0.68 * f64::from(view), -4.2, 1.2 + 0.4 * f64::from(view % 2));
@@ -110,17 +114,18 @@ impl FrameSource for DemoScene {
     }
 }
 
-/// Reader of consecutive or listed Gaussians of a generated scene.
+/// Reader of those Gaussians of a generated scene that a range or a list of ids selects.
 struct Reader<'a> {
     times: &'a [f64],
     parts: Vec<DemoGaussian>,
 }
 
 impl<'a> Reader<'a> {
-    /// Opens the Gaussians `ids` of a scene with the description `info`. `part`: returns the Gaussian with an id.
+    /// Opens a reader of the Gaussians `ids` of the scene that `info` describes. `part` returns the Gaussian with a
+    /// given id.
     ///
     /// # Errors
-    /// Fails if an id is too large.
+    /// Fails if an id is not less than the number of Gaussians in `info`.
     fn open(
         info: &'a SequenceInfo,
         ids: Ids<'_>,
@@ -165,7 +170,8 @@ impl BlockReader for Reader<'_> {
     }
 }
 
-/// Returns the cameras of `rig` as a `cameras.json` of 3DGS: camera-to-world rotations, every camera at every frame.
+/// Returns the cameras of `rig` as JSON text in the format of the file `cameras.json` of 3DGS, with rotations from
+/// camera axes to world axes. The format has no times: every camera sees every frame.
 pub fn cameras_json(rig: &Rig) -> String {
     let camera = |(id, camera): (usize, &Camera)| {
         let to_world = camera.rotation.transpose();

@@ -1,5 +1,4 @@
-//! One Gaussian of a generated scene: its constants, its motion in closed form, and the random numbers that belong to
-//! it.
+//! One Gaussian of a generated scene: its attributes at rest, the formula of its motion, and its pseudo-random numbers.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -8,7 +7,7 @@ use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use crate::model::SH_C0;
 
-/// Constants and motion of one Gaussian.
+/// One Gaussian of a generated scene: its attributes at rest, and the motion that changes them over time.
 #[derive(Debug, Clone)]
 pub(super) struct DemoGaussian {
     pub(super) position: DVec3,
@@ -19,60 +18,68 @@ pub(super) struct DemoGaussian {
     pub(super) sh: [f32; 12],
 }
 
-/// Attributes of one Gaussian that vary over time, at one time.
+/// Position, rotation and opacity logit of one Gaussian at one time. Its other attributes do not vary over time.
 pub(super) struct Moved {
     pub(super) position: DVec3,
     pub(super) rotation: DQuat,
     pub(super) opacity_logit: f64,
 }
 
-/// Motion of a Gaussian. Times run from 0 to 1.
+/// Motion of a Gaussian as a function of the time, which runs from 0 to 1 over the sequence.
 #[derive(Debug, Clone)]
 pub(super) enum DemoMotion {
     /// No motion.
     Still,
-    /// Circles and spins with the egg. `position` and `rotation` are relative to the egg.
+    /// Motion of the Gaussians of the egg, which runs along three quarters of an ellipse and spins once. `position` and
+    /// `rotation` of the Gaussian are relative to the egg.
     Egg,
-    /// Displacement along y by a wave; `along` is 0 at the edge where the cloth is held and 1 at its free edge.
+    /// Displacement along y by a wave that runs through a cloth or flag. `along` is the place of the Gaussian on the
+    /// cloth: 0 at the edge where it is held, 1 at its free edge.
     Wave { along: f64 },
-    /// The opacity logit changes at this rate per unit of time.
+    /// No motion, but a linear change of the opacity logit, by `rate` per unit of time.
     Fade { rate: f64 },
-    /// Visible within `half_life` of `peak`, flying at `velocity` meanwhile.
+    /// Flight of a spark, which is visible from the time `peak - half_life` to the time `peak + half_life`. In this
+    /// time it falls under gravity, starting with `velocity`, in scene units per unit of time.
     Spark { peak: f64, half_life: f64, velocity: DVec3 },
-    /// Turns around y through `pivot`, by `angle` radians in the sequence.
+    /// Rotation by `angle` radians over the sequence about the axis through `pivot` that is parallel to y.
     Turn { pivot: DVec3, angle: f64 },
-    /// Bounces and rolls with the ball. `position` and `rotation` are relative to the ball's center.
+    /// Motion of the Gaussians of the ball, which bounces and rolls. `position` and `rotation` of the Gaussian are
+    /// relative to the center of the ball.
     Bounce,
-    /// Walks with the figure, whose feet stand at the origin and which faces x. The limb swings around y through
-    /// `joint` by at most `swing` radians, with the sign of its first swing.
+    /// Motion of a limb of the walking figure. `position` and `rotation` of the Gaussian, and `joint`, are relative to
+    /// the figure, whose feet stand at the origin and which faces +x. The limb swings about the axis through `joint`
+    /// that is parallel to y, by at most |`swing`| radians; the sign of `swing` gives the direction of the first swing.
     Walk { joint: DVec3, swing: f64 },
 }
 
-/// Width of the cloth along x, scene units.
+/// Width of the cloth and of the flag along x, scene units.
 pub(super) const CLOTH_WIDTH: f64 = 1.2;
 /// Amplitude of the wave at the free edge of the cloth, scene units.
 const SWING: f64 = 0.18;
-/// Number of wavelengths along the cloth.
+/// Width of the cloth, in wavelengths of its wave.
 const WAVES: f64 = 1.5;
-/// Number of periods of the cloth's wave in the sequence.
+/// Number of periods that the wave of the cloth makes during the sequence.
 const PASSES: f64 = 2.0;
-/// Opacity logit at which a spark or a fading Gaussian counts as invisible; 0.01, the usual alpha_min, is −4.6.
+/// Opacity logit at which a spark or a fading Gaussian counts as invisible. It lies below −4.6, the logit of 0.01,
+/// which is the usual alpha_min (minimum opacity at which a Gaussian is alive).
 pub(super) const GONE: f64 = -6.0;
-/// Opacity logit of the sparks at their peak.
+/// Opacity logit of a spark at its peak, and of a fading Gaussian when it is most opaque.
 pub(super) const BRIGHT: f64 = 3.0;
-/// Half life span of a spark, as a fraction of the sequence. With 1/16 it is visible for an eighth of the sequence.
+/// Half the time in which a spark is visible, as a fraction of the sequence. With 1/16, a spark is visible for an
+/// eighth of the sequence.
 pub(super) const HALF_LIFE: f64 = 1.0 / 16.0;
 const GRAVITY: f64 = 12.0;
-/// Radius of the ball, and how far its center rises in a bounce, scene units.
+/// Radius of the ball, scene units.
 pub(super) const BALL_RADIUS: f64 = 0.34;
+/// Height by which the center of the ball rises in a bounce, scene units.
 const BOUNCE: f64 = 0.9;
 /// Number of bounces of the ball in the sequence.
 const BOUNCES: f64 = 3.0;
-/// Number of double steps (one with each leg) of the figure in the sequence.
+/// Number of double steps (one step with each leg) that the figure takes during the sequence.
 const STEPS: f64 = 6.0;
 
 impl DemoGaussian {
-    /// Returns the attributes that vary over time, at `time` in [0, 1].
+    /// Returns position, rotation and opacity logit of this Gaussian at `time`, from 0 to 1.
     pub(super) fn at(&self, time: f64) -> Moved {
         let DemoGaussian { mut position, mut rotation, mut opacity_logit, .. } = *self;
         match self.motion {
@@ -122,34 +129,39 @@ impl DemoGaussian {
     }
 }
 
-/// Random numbers of one Gaussian, hashed from its id, so that they do not depend on the order of reading.
+/// Pseudo-random numbers of one Gaussian; the field is the id of the Gaussian. Each number is a hash of this id and of
+/// the index of the number, which is called channel. So the numbers do not depend on the order in which Gaussians are
+/// read.
 #[derive(Clone, Copy)]
 pub(super) struct GaussianRandom(pub(super) u64);
 
 impl GaussianRandom {
-    /// Returns the Gaussian's random number with the index `channel`, in [0, 1].
+    /// Returns random number `channel` of the Gaussian, in [0, 1).
     pub(super) fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
         (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
     }
 
-    /// Returns the Gaussian's random number with the index `channel`, in [−1, 1].
+    /// Returns random number `channel` of the Gaussian, in [−1, 1).
     pub(super) fn signed(self, channel: u64) -> f64 {
         2.0 * self.unit(channel) - 1.0
     }
 
-    /// Returns the Gaussian's random number with the index `channel`, in [`low`, `high`].
+    /// Returns random number `channel` of the Gaussian, in [`low`, `high`].
     pub(super) fn between(self, channel: u64, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit(channel)
     }
 }
 
-/// First of the channels (indices of random numbers in [`GaussianRandom`]) that the Gaussians of all bodies use. The
-/// channels of a single body start at 0.
+/// Channel (index of a random number in [`GaussianRandom`]) of the random brightness of a Gaussian's color. Used for
+/// Gaussians of every object; the channels that a single object uses start at 0.
 const TINT: u64 = 100;
+/// First of the channels (indices of random numbers in [`GaussianRandom`]) of the random view dependence of a
+/// Gaussian's color. Used for Gaussians of every object.
 const SHEEN: u64 = 200;
 
-/// Returns a Gaussian that does not move.
+/// Returns a Gaussian without motion that has the given attributes. `scale`: standard deviations along its axes, scene
+/// units.
 pub(super) fn still(
     position: DVec3,
     rotation: DQuat,
@@ -161,7 +173,8 @@ pub(super) fn still(
     DemoGaussian { position, rotation, opacity_logit, motion: DemoMotion::Still, log_scale, sh }
 }
 
-/// Returns SH coefficients for a color in [0, 1], with a tint of its own and a slight change with direction.
+/// Returns SH coefficients of degree 1 for the color `rgb`, whose components are in [0, 1]. Random numbers of the
+/// Gaussian, from `dice`, change its brightness a little and add a slight dependence on the view direction.
 pub(super) fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
     std::array::from_fn(|at| match at {
         0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,
@@ -169,15 +182,16 @@ pub(super) fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
     })
 }
 
-/// Returns point `k` of a sequence that fills the unit square evenly for any number of points (R2: Roberts,
-/// "The unreasonable effectiveness of quasirandom sequences", 2018).
+/// Returns point `k` of a sequence in the unit square whose first n points are spread evenly for every n (sequence R2
+/// of Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
 pub(super) fn spread(k: usize) -> DVec2 {
     const PLASTIC: f64 = 1.324_717_957_244_746;
     let k = k as f64;
     DVec2::new((0.5 + k / PLASTIC).fract(), (0.5 + k / (PLASTIC * PLASTIC)).fract())
 }
 
-/// Returns the rotation that turns z, the thin axis of a flat Gaussian, to −y, so that the Gaussian faces along y.
+/// Returns the rotation that turns the z axis to −y. A flat Gaussian is thin along its z axis, so its flat side then
+/// faces along y.
 pub(super) fn facing_y() -> DQuat {
     DQuat::from_rotation_x(FRAC_PI_2)
 }

@@ -1,7 +1,7 @@
-//! The scene of `splatsieve demo`: a meadow with a windmill, a flag, a bouncing ball and a walking figure.
+//! Scene of `splatsieve demo`: a meadow with a windmill, a flag, a bouncing ball and a walking figure.
 //!
-//! Every value is a function of the Gaussian's number, the scene's size and the time, so nothing is stored. All motions
-//! end where they began, so that a film of the scene can be repeated without a jump.
+//! Every value is a function of the id of the Gaussian, the number of Gaussians and the time, so nothing is stored.
+//! Every motion ends where it began, so that a film of the scene can be repeated without a jump.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -17,28 +17,32 @@ use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Number of cameras of [`Playground::rig`].
 const CAMERAS: u32 = 12;
-/// Indices of the views that are used only for testing. None is at an end of the arc, so each lies between training
-/// views.
+/// Indices of the views that are used only for testing. No test view is at an end of the arc of cameras, so each lies
+/// between training views.
 const TEST_VIEWS: [u32; 3] = [2, 5, 9];
-/// Width and height of the renders, pixels.
+/// Width and height of the images of the cameras, pixels.
 const RENDER: (u32, u32) = (320, 240);
-/// Radius of the ground and of the sky, scene units. The cameras are inside.
+/// Radius of the round ground and of the half sphere of the sky, scene units. The cameras are inside.
 const HORIZON: f64 = 8.0;
-/// Length of a side of a tile of the checkerboard, and half the length of a side of the board, scene units.
+/// Side length of one square of the checkerboard on the ground, scene units.
 const TILE: f64 = 0.8;
+/// Half the side length of the checkerboard on the ground, scene units.
 const BOARD: f64 = 3.2;
-/// Place of the windmill's tower and its height, scene units.
+/// Position of the foot of the windmill's tower, scene units.
 const MILL: DVec3 = DVec3::new(-1.4, 1.0, 0.0);
+/// Height of the windmill's tower, scene units.
 const TOWER_HEIGHT: f64 = 1.8;
-/// Point that the windmill's sails turn around.
+/// Position of the hub around which the windmill's sails turn, scene units.
 const HUB: DVec3 = DVec3::new(MILL.x, MILL.y - 0.52, TOWER_HEIGHT);
-/// Length of a sail, scene units.
+/// Length of one sail of the windmill, scene units.
 const SAIL: f64 = 1.15;
-/// Foot of the flagpole, and the pole's height, scene units.
+/// Position of the foot of the flagpole, scene units.
 const POLE: DVec3 = DVec3::new(0.75, 1.1, 0.0);
+/// Height of the flagpole, scene units.
 const POLE_HEIGHT: f64 = 2.5;
 
-/// Objects of the scene in the order of their Gaussians, each with its share in thousandths of all Gaussians.
+/// Objects of the scene in the order of the ids of their Gaussians, each with its share in thousandths of all
+/// Gaussians.
 const SHARES: [(PlaygroundObject, usize); 11] = [
     (PlaygroundObject::Sky, 40),
     (PlaygroundObject::Ground, 330),
@@ -53,7 +57,7 @@ const SHARES: [(PlaygroundObject, usize); 11] = [
     (PlaygroundObject::Figure, 80),
 ];
 
-/// An object of the scene.
+/// Object of the demo scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PlaygroundObject {
     Sky,
@@ -69,9 +73,11 @@ enum PlaygroundObject {
     Figure,
 }
 
-/// Generated scene of a playground, z up, with its cameras on the side of −y.
+/// Scene of `splatsieve demo`: a generated meadow with moving objects. z points up; the cameras stand on the side of
+/// −y.
 ///
-/// With more Gaussians the surfaces consist of smaller ones; with more frames the same motion is sampled more finely.
+/// A scene of more Gaussians has the same surfaces, made of smaller Gaussians. A scene of more frames samples the same
+/// motion more finely.
 ///
 /// ```
 /// use splatsieve::diagnostics::demo_scene::Playground;
@@ -92,7 +98,8 @@ impl Playground {
     /// Default number of frames of the generated scene.
     pub const FRAMES: usize = 48;
 
-    /// Returns the scene as `count` Gaussians at `frames` times from 0 up to, but without, 1.
+    /// Creates the scene with `count` Gaussians and `frames` frames at evenly spaced times from 0 (included) to 1
+    /// (excluded).
     pub fn new(count: usize, frames: usize) -> Playground {
         let info = SequenceInfo {
             count,
@@ -103,7 +110,8 @@ impl Playground {
         Playground { info }
     }
 
-    /// Returns twelve cameras on an arc in front of the scene, each at every frame; three of them are for testing.
+    /// Returns the cameras: twelve on an arc in front of the scene. Every camera sees every frame. Three of them take
+    /// test views, the others take training views.
     pub fn rig(&self) -> Rig {
         let camera = |view: u32| {
             let angle = (-66.0 + 12.0 * f64::from(view)).to_radians();
@@ -120,7 +128,8 @@ impl Playground {
         }
     }
 
-    /// Returns the constants and the motion of Gaussian `id`, which must be less than the number of Gaussians.
+    /// Returns the attributes at rest and the motion of the Gaussian with the id `id`, which must be less than the
+    /// number of Gaussians of the scene.
     fn part(&self, id: usize) -> DemoGaussian {
         let dice = GaussianRandom(id as u64);
         let (mut start, mut share) = (0, 0);
@@ -146,7 +155,7 @@ impl FrameSource for Playground {
     }
 }
 
-/// Point of a surface at which a Gaussian is placed.
+/// Point on the surface of an object at which a Gaussian is placed, with the properties of the surface there.
 struct SurfacePoint {
     position: DVec3,
     normal: DVec3,
@@ -156,7 +165,7 @@ struct SurfacePoint {
     motion: DemoMotion,
 }
 
-/// Returns Gaussian `k` of the `n` Gaussians of `object`. `dice` is the source of its random numbers.
+/// Returns the `k`-th of the `n` Gaussians of `object`. `dice` is the source of the random numbers of this Gaussian.
 fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     let point = match object {
         PlaygroundObject::Sky => sky(k, n),
@@ -183,8 +192,8 @@ fn gaussian(object: PlaygroundObject, k: usize, n: usize, dice: GaussianRandom) 
     DemoGaussian { motion: point.motion, ..made }
 }
 
-/// Returns point `k` of a sequence of points that are evenly spread on the unit sphere; each of n points stands for the
-/// area 2τ/n.
+/// Returns point `k` of a sequence on the unit sphere whose first n points are spread evenly for every n. So each of n
+/// points represents an area of 4π/n on the sphere.
 fn on_sphere(k: usize) -> DVec3 {
     let DVec2 { x: turn, y: height } = spread(k);
     let z = 2.0 * height - 1.0;
@@ -204,8 +213,9 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
 }
 
 fn ground(k: usize, n: usize) -> SurfacePoint {
-    /// Exponent by which a uniform number in [0, 1] becomes a distance from the center. 0.5 spreads the Gaussians
-    /// evenly; a larger exponent places fewer and larger ones outside.
+    /// Exponent p of the distance from the center, `HORIZON` · u^p, where u is spread evenly over [0, 1]. With p = 0.5
+    /// the Gaussians are spread evenly over the ground; a larger exponent places fewer and larger Gaussians far from
+    /// the center.
     const DENSITY: f64 = 0.8;
     let DVec2 { x: turn, y: part } = spread(k);
     let radius = HORIZON * part.powf(DENSITY);
@@ -222,8 +232,8 @@ fn ground(k: usize, n: usize) -> SurfacePoint {
     SurfacePoint { position, normal: DVec3::Z, rgb, area, motion: DemoMotion::Still }
 }
 
-/// Returns point `k` of `n` on the side of a cone without its end faces, standing on `foot`. Its radius changes from
-/// `low` at the foot to `high` at the top.
+/// Returns point `k` of `n` on the side of a truncated cone, without its end faces. The cone stands on the point `foot`
+/// and has the height `height`; its radius changes from `low` at the foot to `high` at the top (scene units).
 fn cone(k: usize, n: usize, foot: DVec3, [low, high]: [f64; 2], height: f64) -> SurfacePoint {
     let DVec2 { x: turn, y: up } = spread(k);
     let (sin, cos) = (TAU * turn).sin_cos();
@@ -237,7 +247,7 @@ fn cone(k: usize, n: usize, foot: DVec3, [low, high]: [f64; 2], height: f64) -> 
     }
 }
 
-/// Positions of the feet of the trees, scene units.
+/// Positions at which the trunks of the trees stand on the ground, scene units.
 const TREES: [DVec3; 2] = [DVec3::new(2.7, 1.6, 0.0), DVec3::new(-3.0, 2.2, 0.0)];
 
 fn trunk(k: usize, n: usize) -> SurfacePoint {
@@ -287,7 +297,7 @@ fn cap(k: usize, n: usize) -> SurfacePoint {
     }
 }
 
-/// Returns point `k` of `n` on the four sails, which turn once in the sequence.
+/// Returns point `k` of `n` on the four sails of the windmill, which turn once during the sequence.
 fn sails(k: usize, n: usize) -> SurfacePoint {
     const WIDTH: f64 = 0.3;
     let (sail, k, n) = (k % 4, k / 4, n.div_ceil(4));
@@ -348,18 +358,19 @@ fn ball(k: usize, n: usize) -> SurfacePoint {
     }
 }
 
-/// A part of the figure: an ellipsoid that swings around a joint.
+/// Part of the walking figure: an ellipsoid that swings around a joint.
 struct Limb {
     center: DVec3,
     axes: DVec3,
     joint: DVec3,
     swing: f64,
     rgb: [f64; 3],
-    /// Share of the Gaussians of the figure in hundredths.
+    /// Share of this part in the Gaussians of the figure, in hundredths.
     share: usize,
 }
 
-/// Returns the parts of the figure, whose feet stand at the origin and which faces x.
+/// Returns the parts of the figure (head, trunk, legs and arms). The feet of the figure stand at the origin, and it
+/// faces +x.
 fn limbs() -> [Limb; 6] {
     let still = |center, axes, rgb, share| Limb { center, axes, joint: DVec3::ZERO, swing: 0.0, rgb, share };
     let swinging = |side: f64, height: f64, length: f64, thick: f64, swing: f64, rgb, share| Limb {
@@ -389,7 +400,7 @@ fn figure(k: usize, n: usize) -> SurfacePoint {
         let end = n * share / 100;
         if k < end {
             let at = on_sphere(k - start);
-            // Of an ellipsoid, by the formula of Thomsen, to 1%.
+            // Surface area of the ellipsoid by Thomsen's formula, which is accurate to 1%.
             let [a, b, c] = limb.axes.to_array().map(|axis| axis.powf(1.6));
             let area = 2.0 * TAU * ((a * b + a * c + b * c) / 3.0).powf(1.0 / 1.6);
             return SurfacePoint {

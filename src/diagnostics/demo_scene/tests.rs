@@ -1,4 +1,4 @@
-//! Properties of the bodies of the test scene.
+//! Tests of the properties of the bodies (objects) of the test scene.
 
 use super::*;
 use crate::model::AttributeValues;
@@ -11,7 +11,7 @@ fn frame(scene: &DemoScene, ids: Ids<'_>, frame: usize) -> Gaussians {
     out
 }
 
-/// Returns the Gaussians of a body (object of the scene) at every frame.
+/// Returns the Gaussians of `body` (an object of the scene), one entry per frame.
 fn film(scene: &DemoScene, body: DemoBody) -> Vec<Gaussians> {
     let members = scene.body_ids(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()

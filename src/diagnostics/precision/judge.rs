@@ -1,5 +1,5 @@
-//! Quality of a selection of Gaussians, compared with renders of the whole model from views that were not used for
-//! ranking or fitting.
+//! Quality of a selection of Gaussians: their renders are compared with renders of the whole model from views that were
+//! not used for ranking or fitting, if there are such views.
 
 use rayon::prelude::*;
 
@@ -23,18 +23,18 @@ pub(super) struct Judge {
     originals: Vec<Image>,
 }
 
-/// Quality of a selection of Gaussians, compared with the whole model.
+/// Quality of renders of a selection of Gaussians, compared with renders of the whole model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct JudgedQuality {
-    /// Root mean square error over all pixels, channels and views; colors are from 0 to 1.
+    /// Root mean square error over all pixels, color channels and views; color values are from 0 to 1.
     pub(super) error: f64,
     /// Mean PSNR over the views, in dB.
     pub(super) psnr: f64,
 }
 
 impl Judge {
-    /// Renders the held-out (test) views of `scene`, or an even selection of them if they are many. If no views are
-    /// held out, renders an even selection of all views.
+    /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`PICTURES`]
+    /// views, renders an evenly spaced selection of [`PICTURES`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
@@ -47,7 +47,7 @@ impl Judge {
         Ok(Judge { pictures, originals })
     }
 
-    /// Returns the bytes of memory for the renders if a view has `pixels` pixels.
+    /// Returns the bytes of memory that the renders of a [`Judge`] take if each view has `pixels` pixels.
     pub(super) fn bytes(pixels: u64) -> u64 {
         12 * pixels * PICTURES as u64
     }
@@ -57,7 +57,8 @@ impl Judge {
         self.pictures.len()
     }
 
-    /// Renders only the Gaussians `kept` of `scene` and returns their quality, compared with the whole model.
+    /// Renders the Gaussians of `scene` whose ids are in `kept`, and no others, and returns the quality of these
+    /// renders compared with renders of the whole model.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -73,7 +74,7 @@ impl Judge {
 }
 
 impl JudgedQuality {
-    /// Computes the quality from the PSNR of each view; all views must have the same size.
+    /// Computes the quality from the PSNR of each view, in dB. All views must have the same number of pixels.
     pub(super) fn from_psnr(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;
@@ -81,7 +82,8 @@ impl JudgedQuality {
     }
 }
 
-/// Renders `subject` in the views `pictures` and passes the images to `take`, in order.
+/// Renders `subject`, a model or some of its Gaussians, in the views `pictures` and passes the images to `take`, in
+/// order.
 fn render_views(
     scene: &Scene,
     subject: RenderedSource<'_>,

@@ -1,14 +1,16 @@
-//! Diagrams of work against precision: time, memory and error of the program for several values of each parameter, on a
-//! given model.
+//! Diagrams of work against precision: time, memory and error of the program for several values of each parameter, on
+//! one given model.
 //!
-//! Errors have three sources, which are measured separately. *Discretization*: only some views, pixels, frames, pruning
-//! rounds and histogram buckets are used. The error of each setting is measured against the finest setting of its kind,
-//! with equal numbers of kept Gaussians. *Rounding*: sums in f32 and in f64 are compared with more accurate ones; the
-//! number of threads and the memory limit must change nothing. *Model*: fewer Gaussians, merged or refined, replace
-//! more.
+//! Errors have three sources, which are measured separately:
+//! - *Discretization*: the program uses only some views, pixels, frames, pruning rounds and histogram buckets. The
+//!   result of each setting is compared with that of the finest setting of the same parameter, with equal numbers of
+//!   kept Gaussians.
+//! - *Rounding*: sums in f32 and in f64 are compared with more accurate sums. The number of threads and the memory
+//!   limit must not change any result.
+//! - *Model*: fewer Gaussians, which may be merged or refined, replace those of the model.
 //!
-//! Memory: that of `compress`, the scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every pixel of the views
-//! on which quality is measured. Runs of the whole program get the rest of the memory limit.
+//! Memory: that of `compress`, that of the open scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every pixel
+//! of the views on which quality is measured. Complete runs of the program get the rest of the memory limit.
 
 mod judge;
 mod ranking;
@@ -42,29 +44,30 @@ use crate::statistics::score::Scores;
 use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
 use judge::Judge;
 
-/// Group of settings that a diagram varies, called a knob.
+/// Knob: parameter, or group of parameters, of which the command `precision` tries several values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Knob {
-    /// Settings of the first ranking by renders, before the pruning rounds: the number of views, and the strides of
-    /// pixels, views and frames.
+    /// Parameters of the first ranking by renders, before the pruning rounds: the number of views, and the strides of
+    /// pixels, views and frames (with a stride of n, every n-th is used).
     FirstRanking,
-    /// Settings of the pruning rounds (rank, remove the lowest, repeat): views per round, and the fraction of the
-    /// Gaussians that a round keeps.
+    /// Parameters of the pruning rounds (rank, remove the lowest, repeat): the number of views per round, and the
+    /// fraction of the Gaussians that a round keeps.
     Rounds,
-    /// Precision of percentiles that are found in one pass over the values: mantissa bits of the histogram.
+    /// Number of mantissa bits of the histogram with which percentiles are found in one pass over the values. More bits
+    /// mean more precise percentiles.
     Percentiles,
-    /// Arithmetic of the sums of the scan: f32, f32 with compensation, or f64.
+    /// Arithmetic of the sums that the scan accumulates over frames: f32, f32 with compensation, or f64.
     Sums,
-    /// Settings of merging: radius, and number of merging passes.
+    /// Parameters of merging: the radius, and the number of merging passes.
     Merging,
-    /// Settings of refinement: numbers of optimization steps and of target views.
+    /// Parameters of refinement: the numbers of optimization steps and of target views.
     Refining,
-    /// Number of threads and memory limit, which must not change a result.
+    /// Number of threads, and memory limit. They must not change a result.
     Machine,
 }
 
 impl Knob {
-    /// Every knob (group of settings), in the order of the pipeline.
+    /// List of the knobs (parameters, or groups of parameters), in the order of the pipeline.
     pub const ALL: [Knob; 7] =
         [Knob::FirstRanking, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
 
@@ -81,7 +84,7 @@ impl Knob {
         }
     }
 
-    /// Returns the reason why a scene or recipe has no settings for this knob, if it has none.
+    /// Returns the reason, as text for the user, why a scene or recipe can have no settings for this knob.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
@@ -90,54 +93,56 @@ impl Knob {
         }
     }
 
-    /// Returns whether every setting of this knob needs a complete run of the program.
+    /// Returns whether every setting of this knob is measured by a complete run of the program.
     fn needs_whole_runs(self) -> bool {
         matches!(self, Knob::Merging | Knob::Refining | Knob::Machine)
     }
 }
 
-/// Options of a diagram of work against precision.
+/// Options of the command `precision`, which measures run time and error for several values of each parameter.
 #[derive(Debug, Clone)]
 pub struct PrecisionOptions {
-    /// Input and cameras. The requested split into training and test views is ignored.
+    /// Input and cameras. The split that these options request is ignored: Gaussians are ranked by the training views.
     pub input: InputOptions,
-    /// Recipe that every setting starts from; a setting changes one of its parameters.
+    /// Recipe from which every setting is derived, by changing one parameter.
     pub recipe: Recipe,
-    /// Knobs (groups of settings) to vary. `None`: all; those that need complete runs only if the model is small
-    /// enough.
+    /// Knobs (parameters, or groups of parameters) to vary. `None`: every knob; for a large model only the knobs that
+    /// need no complete runs of the program.
     pub knobs: Option<Vec<Knob>>,
     /// Number or fraction of Gaussians that every setting keeps.
     pub target: Target,
     /// Maximum number of frames whose views are used for ranking, evenly spaced from the first frame to the last.
     pub max_frames: usize,
-    /// Maximum number of runs of every setting, at least 1. The median time is reported.
+    /// Maximum number of times that each setting is run, at least 1. The median time is reported.
     pub runs: usize,
-    /// Folder that gets `precision.json`, `precision.csv` and the page with the diagrams.
+    /// Path of the output folder, for `precision.json`, `precision.csv` and the page with the diagrams.
     pub output: PathBuf,
-    /// Policy if the output folder already exists.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
-/// Total time of a setting's runs, in seconds, after which the setting is not run again.
+/// Total time of the runs of one setting, in seconds, after which the setting is not run again.
 const MAX_SETTING_SECONDS: f64 = 10.0;
 
-/// Largest size of a model, as Gaussians × frames, for which complete runs are included by default.
+/// Largest size of a model, as Gaussians × frames, for which knobs that need complete runs of the program are varied by
+/// default.
 const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
-/// Bytes of memory of the histogram for percentiles with the largest number of bits.
+/// Bytes of memory of the histogram for percentiles with [`MAX_MANTISSA_BITS`] mantissa bits.
 const SKETCH_BYTES: u64 = 4 << (9 + MAX_MANTISSA_BITS);
 
-/// Bytes per Gaussian that are kept in memory between settings: statistics twice, two contributions and two scores, and
-/// sets of kept Gaussians.
+/// Bytes of memory per Gaussian that are held from one setting to the next: two copies of the statistics, two of the
+/// contributions, two of the scores, and twelve lists of ids of kept Gaussians.
 const HELD_BYTES: u64 =
     (2 * Rows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
-/// Scene and measurements that all settings share.
+/// Data that the measurements of all settings share: the scene, the recipe, the statistics of the scan, and the
+/// conditions of measurement.
 struct Bench<'a> {
-    /// Scene with the training cameras, at some of its frames.
+    /// Scene, with the training views of at most [`PrecisionOptions::max_frames`] of its frames.
     scene: &'a Scene,
     input: &'a InputOptions,
-    /// Size of the input, with all views, for estimates of time and memory.
+    /// Size of the input, with all views, from which time and memory are estimated.
     work: Workload,
     recipe: &'a Recipe,
     scanned: ScanResult,
@@ -145,8 +150,9 @@ struct Bench<'a> {
     /// Number of Gaussians that every setting keeps.
     kept: usize,
     repeats: RepeatLimits,
-    /// Path of the folder for the results of complete runs; `name` is the file name of a result in it.
+    /// Path of the folder to which complete runs write their results.
     scratch: &'a Path,
+    /// File name of the result of a complete run, in the folder `scratch`.
     name: &'a str,
     progress: Progress,
 }
@@ -158,7 +164,7 @@ impl Bench<'_> {
     }
 }
 
-/// Measures all settings of the chosen knobs on a model and writes the results to the output folder.
+/// Measures all settings of the requested knobs on a model and writes the results to the output folder.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe, the options or the output are invalid, or if a run fails. No files
@@ -269,8 +275,8 @@ fn open_with_cameras(input: &InputOptions) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Returns the knobs to vary: those requested, else all. For a large model, knobs that need complete runs are left out,
-/// and `notes` gets a message about this.
+/// Returns the knobs to vary: those that `options` requests, or all if it requests none. If it requests none and the
+/// model is large, knobs that need complete runs of the program are left out, and `notes` gets a message about this.
 fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Knob> {
     let mut knobs = Knob::ALL.to_vec();
     knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
@@ -285,7 +291,7 @@ fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, not
     chosen
 }
 
-/// Writes the tables and the page of the diagrams `found` to `folder`.
+/// Writes the results `found` to `folder`: a CSV table, a JSON file, and the page with the diagrams.
 fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
     let write = |name: &str, text: String| {
         let path = folder.join(name);
@@ -299,7 +305,7 @@ fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
 }
 
 impl Bench<'_> {
-    /// Measures all settings of `knob`; returns `None` if the scene or the recipe has none.
+    /// Measures all settings of `knob`. Returns `None` if the scene or the recipe has no settings for it.
     fn measure_knob(&self, knob: Knob) -> Result<Option<PrecisionKnob>> {
         match knob {
             Knob::FirstRanking => self.look(),
@@ -313,8 +319,8 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the schedule (list of views per frame) with the views of some frames only: at most `most` (at least one) of
-/// those that have views, evenly spaced from first to last.
+/// Returns the schedule (list of views per frame) with the views of at most `most` frames, evenly spaced over the
+/// frames that have views. The other frames keep no views. A `most` of 0 counts as 1.
 fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let most = most.max(1);
@@ -332,8 +338,9 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     thinned
 }
 
-/// Returns the bytes of memory of a schedule made by [`thin_frames`]: one range for each frame kept, and one for the
-/// frames up to the next.
+/// Returns the bytes of memory of a schedule that [`thin_frames`] makes for at most `most` frames. The schedule has two
+/// entries for each frame that keeps its views: one for this frame, and one for the frames without views that follow.
+/// Returns 0 if `thin_frames` makes no new schedule, because the input has at most `most` frames.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }

@@ -1,4 +1,5 @@
-//! Settings of ranking: views of the first ranking by renders, pruning rounds, and percentiles of the scores.
+//! Measurements of the settings of ranking: views of the first ranking by renders, pruning rounds, and percentiles of
+//! the scores.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
@@ -21,30 +22,32 @@ use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
 use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_with_passes};
 
-/// Numbers of views that are tried, in the first ranking and in a pruning round. Numbers above that of the existing
-/// views are skipped.
+/// Numbers of views that are tried for the first ranking and for a pruning round. Numbers that exceed the number of
+/// views of the scene are skipped.
 const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
-/// Maximum number of views that is tried in a pruning round.
+/// Maximum number of views per pruning round that is tried.
 const MOST_IN_ROUNDS: usize = 400;
-/// Strides of pixels, views and frames that are tried.
+/// Strides of pixels, views and frames that are tried. With a stride of n, every n-th is used.
 const STRIDES: [u32; 4] = [16, 8, 4, 2];
-/// Fractions of the Gaussians kept by a pruning round that are tried.
+/// Values that are tried for the fraction of the Gaussians that a pruning round keeps.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
-/// Numbers of mantissa bits in the histogram for percentiles that are tried.
+/// Values that are tried for the number of mantissa bits of the histogram from which percentiles are found.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MAX_MANTISSA_BITS];
 
-/// Ranking by one setting: its errors, its cost, and the Gaussians that it keeps.
+/// Result of a ranking with one setting: value and step size h of the varied parameter, cost, errors, and ids of the
+/// kept Gaussians. An error of order p is proportional to h^p.
 struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
-    /// Errors that can be computed without the ranking of the finest setting.
+    /// Errors by name, without the errors of the kept Gaussians against those of the finest setting. [`Bench::curve`]
+    /// adds these.
     errors: BTreeMap<String, f64>,
     kept: Vec<u32>,
 }
 
-/// Recipe of one setting. `value` is the value of the varied parameter, `step` its step size h (errors grow with a
-/// power of h).
+/// Recipe of one setting to measure. `value`: value of the varied parameter. `step`: step size h of this value; an
+/// error of order p is proportional to h^p.
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -52,8 +55,8 @@ struct RankingVariant {
 }
 
 impl Bench<'_> {
-    /// Varies the first ranking by renders: the number of views, and the strides of pixels, views and frames. Returns
-    /// `None` if the recipe does not rank by renders.
+    /// Measures settings of the first ranking by renders: several numbers of views, and several strides of pixels,
+    /// views and frames. Returns `None` if the recipe does not rank by renders.
     pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
         let all = self.scene.schedule.pair_count();
         let variant = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
@@ -98,8 +101,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Measures the contributions of all Gaussians to the views, with the settings of `recipe`. Returns `None` if the
-    /// recipe does not rank by renders.
+    /// Renders the views that `recipe` selects and returns the contributions of all Gaussians to them. Returns `None`
+    /// if the recipe does not rank by renders.
     fn contributions(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
         let measure = MeasureStages::new(recipe, self.scene.has_cameras, UserOverrides::default());
         let look =
@@ -107,14 +110,15 @@ impl Bench<'_> {
         measure.visible.as_ref().map(look).transpose()
     }
 
-    /// Returns the result of `contributions`, and the time and memory it took.
+    /// Returns the result of [`Bench::contributions`] for `recipe`, and the time and memory of computing it.
     fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
         self.repeats.measure_cost(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// Measures the rankings of `variants` as one curve, which ends at the finest setting. `finest`: value and step
-    /// size of the finest setting, the contributions measured with it, and their cost. `own`: value of the parameter in
-    /// the recipe.
+    /// Ranks the Gaussians with each of `variants` and with the finest setting. Returns the measurements as the curve
+    /// of the parameter `name`, the finest setting last. The third argument belongs to the finest setting: value and
+    /// step size, contributions measured with this setting, and cost of measuring them. `own`: value of the parameter
+    /// in the recipe.
     fn pass_curve(
         &self,
         name: &str,
@@ -145,14 +149,15 @@ impl Bench<'_> {
         self.curve(name, "all pixels of all these views", tried, own, &[])
     }
 
-    /// Computes scores and a selection from the statistics of the scan and from `contributions`.
+    /// Computes the scores of all Gaussians from the statistics of the scan and from `contributions`, and selects the
+    /// Gaussians to keep.
     fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
         let measure = MeasureStages::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())
     }
 
-    /// Varies the pruning rounds: views per round, and the fraction of the Gaussians that a round keeps. Returns `None`
-    /// if the recipe does not rank by renders.
+    /// Measures settings of the pruning rounds: several numbers of views per round, and several fractions of the
+    /// Gaussians that a round keeps. Returns `None` if the recipe does not rank by renders.
     pub(super) fn rounds(&self) -> Result<Option<PrecisionKnob>> {
         let Some(contributions) = self.contributions(self.recipe)? else { return Ok(None) };
         let scored = self.scored(Some(contributions))?;
@@ -187,8 +192,9 @@ impl Bench<'_> {
         }))
     }
 
-    /// Ranks the Gaussians in pruning rounds with the settings `select`, and measures the cost. `value` is the value of
-    /// the varied parameter, `step` its step size h (errors grow with a power of h).
+    /// Ranks the Gaussians in pruning rounds with the parameters `select`, starting from the scores `scored`. Returns
+    /// the kept Gaussians and the cost. `value`: value of the varied parameter. `step`: step size h of this value; an
+    /// error of order p is proportional to h^p.
     fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
@@ -204,8 +210,8 @@ impl Bench<'_> {
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
-    /// Compares percentiles found in one pass over the values, by histograms with several numbers of mantissa bits,
-    /// with exact percentiles.
+    /// Measures the errors of percentiles that are found in one pass over the values, by histograms with several
+    /// numbers of mantissa bits. The reference is exact percentiles.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
@@ -242,7 +248,10 @@ impl Bench<'_> {
         })
     }
 
-    /// Returns the rankings `tried` as one curve. The last ranking is the finest, with which all others are compared.
+    /// Compares the Gaussians that each ranking in `tried` keeps with those that the last ranking keeps, which is the
+    /// finest setting, and adds the errors. Returns the rankings as the curve of the parameter `name`. `against`:
+    /// description of the finest setting. `own`: value of the parameter in the recipe. `expected`: orders of
+    /// convergence that theory predicts, by name of the error.
     fn curve(
         &self,
         name: &str,
@@ -281,13 +290,14 @@ fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     counts
 }
 
-/// Returns the relative error of the number `count`, where `expected` is correct.
+/// Returns the relative error |count / expected − 1| of `count`, whose correct value is `expected`.
 fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// Returns the largest relative error of the percentiles by which the terms of the scores are normalized. Percentiles
-/// of combined scores are skipped, because the values themselves differ there.
+/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized. The
+/// correct percentiles are those in `exact`. Leaves out the percentiles of the combined scores (static and dynamic):
+/// `scores` and `exact` have different combined scores, so their percentiles are not comparable.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
     let pairs = pairs.filter(|(term, _)| !matches!(term.of, ScoredQuantity::Static | ScoredQuantity::Dynamic));

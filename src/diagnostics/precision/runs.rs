@@ -1,5 +1,5 @@
-//! Settings that need complete runs of the program: the effect of merging and of refinement at a given number of
-//! Gaussians, and the effect of threads and memory.
+//! Measurements of settings by complete runs of the program: the effect of merging and of refinement at a given number
+//! of Gaussians, and the effect of the number of threads and of the memory limit.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,21 +23,22 @@ use crate::scene::{InputOptions, open_input};
 const RADII: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
 /// Numbers of merging passes that are tried.
 const PASSES: [usize; 3] = [1, 2, 3];
-/// Numbers of refinement steps that are tried.
+/// Numbers of optimization steps of refinement that are tried.
 const STEPS: [u32; 6] = [100, 250, 500, 1000, 1500, 3000];
 /// Numbers of target views of refinement that are tried.
 const PICTURES_REFINED_BY: [usize; 5] = [32, 65, 130, 260, 520];
-/// Memory limits that are tried, as multiples of the smallest possible one.
+/// Memory limits that are tried, as multiples of the smallest limit with which the program can run.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 
 /// Maximum number of frames at which the results of complete runs are compared with the whole model.
 const FRAMES_COMPARED: usize = 12;
 
-/// Text for the results that says with what the results of complete runs are compared.
+/// Description, in the results, of the reference with which the results of complete runs are compared.
 const WHOLE: &str = "renders of the whole model: every held-out view of up to 12 frames";
 
 impl Bench<'_> {
-    /// Measures merging after pruning; all settings end at the same number of Gaussians.
+    /// Measures complete runs that prune and then merge, with several merging radii and several numbers of merging
+    /// passes. All runs end at the same number of Gaussians.
     pub(super) fn merging(&self) -> Result<PrecisionKnob> {
         let plain = self.recipe.without_refinement();
         let pass = plain.merge.passes.first().copied();
@@ -74,8 +75,8 @@ impl Bench<'_> {
         })
     }
 
-    /// Measures refinement; all settings end at the same number of Gaussians. Returns `None` if the recipe does not
-    /// refine.
+    /// Measures complete runs with several numbers of optimization steps and several numbers of target views of
+    /// refinement. All runs end at the same number of Gaussians. Returns `None` if the recipe does not refine.
     pub(super) fn refining(&self) -> Result<Option<PrecisionKnob>> {
         let base = &self.recipe.refine;
         if base.refine.0.is_empty() || base.refine_steps == 0 {
@@ -106,8 +107,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Measures the cost of several numbers of threads and memory limits, and checks that none changes a byte of the
-    /// result.
+    /// Measures complete runs with several numbers of threads and several memory limits, and checks that their results
+    /// are equal byte for byte.
     pub(super) fn machine(&self) -> Result<PrecisionKnob> {
         let recipe = self.recipe.without_refinement();
         let mut expected = None;
@@ -153,8 +154,9 @@ impl Bench<'_> {
         Target::Count(self.kept as u64)
     }
 
-    /// Runs the whole program with `recipe` and measures quality and cost. `value` is the value of the varied
-    /// parameter, `step` its step size h (errors grow with a power of h).
+    /// Compresses the input by `recipe` in complete runs of the program. Returns the quality of the result and the
+    /// cost. `value`: value of the varied parameter. `step`: step size h of this value; an error of order p is
+    /// proportional to h^p.
     fn measure_quality(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compare(result))?;
         let psnr: Vec<f64> = evaluation.views.iter().map(|picture| picture.loss.psnr).collect();
@@ -168,8 +170,10 @@ impl Bench<'_> {
         })
     }
 
-    /// Runs the whole program with `recipe` and compares the digest of the result with `expected`, the digest of the
-    /// first run, which is set if it is `None`. `value`: value of the varied parameter.
+    /// Compresses `input` by `recipe` in complete runs of the program, and compares the digest of the result with
+    /// `expected`, the digest of the first setting's result. The call for the first setting gets `None` and stores its
+    /// digest in `expected`. Returns the cost, and 0 as the error if the digests are equal, else 1. `value`: value of
+    /// the varied parameter.
     fn compare_bytes(
         &self,
         recipe: &Recipe,

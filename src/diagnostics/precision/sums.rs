@@ -1,7 +1,7 @@
-//! Rounding errors of the sums that a scan accumulates over frames: in f32, in f32 with compensation, and in f64 as the
-//! program uses it.
+//! Measurement of the rounding errors of the sums that the scan accumulates over frames: in f32, in f32 with
+//! compensation, and in f64 as the program uses it.
 //!
-//! Some trajectories of the scene are played forward and backward again and again, until the errors are large enough to
+//! The frames of some Gaussians are played forward and backward again and again, until the errors are large enough to
 //! be seen. The expected sums are computed in f64 with compensation.
 
 use std::collections::BTreeMap;
@@ -19,24 +19,26 @@ use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan};
 
 /// Number of Gaussians whose sums are computed, spaced evenly over all Gaussians.
 const GAUSSIANS: usize = 64;
-/// Maximum number of different frames that are played, spaced evenly over all frames of the scene.
+/// Maximum number of different frames of the scene that are played, spaced evenly over all its frames.
 const MOST_FRAMES: usize = 240;
-/// Lengths, in frames, of the sequences that playing the frames forward and backward gives.
+/// Lengths, in frames, of the sequences for which sums are computed. A sequence plays the frames of the scene forward
+/// and backward again and again.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
-/// Text for the results that says with what the sums are compared.
+/// Description, in the results, of the reference with which sums are compared.
 const AGAINST: &str = "f64, compensated";
 
-/// Sum of numbers of type `T` that are added one after the other.
+/// Running sum of numbers of type `T`, which are added one after the other.
 trait Sum<T: Float>: Default {
     fn add(&mut self, value: T);
     fn total(self) -> f64;
 }
 
-/// Plain sum, whose rounding errors are lost.
+/// Plain sum: rounding errors are not corrected.
 struct Plain<T>(T);
 
-/// Kahan's compensated sum: the second number holds what rounding removed from the first.
+/// Kahan's compensated sum: the rounded sum, and the rounding error that it contains, which is subtracted from the next
+/// value.
 struct Compensated<T>(T, T);
 
 impl<T: Float> Default for Plain<T> {
@@ -82,12 +84,12 @@ fn from_f64<T: Float>(value: f64) -> T {
     T::from(value).unwrap_or(T::nan())
 }
 
-/// Trajectory magnitude D, curvature κ and opacity variance V of every Gaussian.
+/// Trajectory magnitude D, curvature κ and opacity variance V, in this order, each as a list of one value per Gaussian.
 type SummedStatistics = [Vec<f64>; 3];
 
 impl Bench<'_> {
-    /// Measures the errors of sums over longer and longer sequences. Returns `None` for scenes of fewer than three
-    /// frames.
+    /// Measures the rounding errors of sums in each kind of arithmetic, for sequences of the lengths [`PLAYED`].
+    /// Returns `None` if the scene has fewer than three frames.
     pub(super) fn sums(&self) -> Result<Option<PrecisionKnob>> {
         let source = self.scene.source();
         let info = source.info();
@@ -134,7 +136,8 @@ impl Bench<'_> {
         }))
     }
 
-    /// Measures the sums `sums` for each length in [`PLAYED`] and returns their errors against `expected`.
+    /// Computes statistics for each length in [`PLAYED`] by `sums`. Returns, for each length, the errors of these
+    /// statistics and the cost of computing them. `expected`: correct statistics, one entry per length.
     fn measure_lengths(
         &self,
         expected: &[SummedStatistics],
@@ -155,14 +158,15 @@ impl Bench<'_> {
     }
 }
 
-/// Returns which of `count` frames is the `k`-th one if frames are played forward and backward again and again.
+/// Returns the index of the frame at place `k` of a sequence that plays `count` frames forward and backward again and
+/// again. With three frames, the sequence is 0, 1, 2, 1, 0, 1, 2 …. `count` must be at least 2.
 fn ping_pong_index(k: usize, count: usize) -> usize {
     let turn = 2 * (count - 1);
     let at = k % turn;
     at.min(turn - at)
 }
 
-/// Positions and opacities of all Gaussians at one frame, which the sums need.
+/// Positions and opacities of all Gaussians at one frame, from which [`sum_statistics`] computes.
 struct Decoded {
     position: Vec<[f32; 3]>,
     opacity: Vec<f64>,
@@ -177,8 +181,9 @@ impl Decoded {
     }
 }
 
-/// Computes trajectory magnitude D, curvature κ and opacity variance V over `frames_played` frames, for Gaussians that
-/// are always alive. Numbers have the type `T` and are added by the sum `S`.
+/// Computes trajectory magnitude D, curvature κ and opacity variance V of every Gaussian over a sequence of
+/// `frames_played` frames, which plays `states` forward and backward. Gaussians count as alive in all frames. Numbers
+/// have the type `T` and are added by the sum `S`.
 fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize) -> SummedStatistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
@@ -213,8 +218,8 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
     std::array::from_fn(|statistic| found.iter().map(|values| values[statistic]).collect())
 }
 
-/// Computes trajectory magnitude D, curvature κ and opacity variance V with the scan of the program. All Gaussians
-/// count as alive.
+/// Computes the same statistics as [`sum_statistics`], with the scan of the program. `changed`: attributes that the
+/// scan must regard as changed at every frame.
 fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = ViewSchedule::default();

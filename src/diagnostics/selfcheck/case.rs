@@ -11,7 +11,7 @@ use crate::error::Result;
 pub struct CaseResult {
     /// Short name of the self-check case.
     pub name: &'static str,
-    /// Description of the values that are compared, and of what they are compared with.
+    /// Description, for tables, of the compared values and of the reference with which they are compared.
     pub what: &'static str,
     /// Largest error that a correct program may have. Errors are relative, or in the unit that `what` names.
     pub bound: f64,
@@ -42,7 +42,8 @@ impl CaseResult {
     }
 }
 
-/// Largest error of the values compared so far. It is NaN, which exceeds every bound, until a value is compared.
+/// Largest error of the values compared so far. Before the first comparison it is NaN, with which a case fails whatever
+/// its bound is.
 #[derive(Debug)]
 pub(super) struct LargestError(pub(super) f64);
 
@@ -53,22 +54,24 @@ impl Default for LargestError {
 }
 
 impl LargestError {
-    /// Adds the error of one value; NaN counts as infinite.
+    /// Updates the largest error with `error`, the error of one value. A NaN counts as infinite.
     pub(super) fn add(&mut self, error: f64) {
         self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
     }
 
-    /// Adds the error |got − expected| / `unit`; `unit` must be positive.
+    /// Compares `got` with `expected` and updates the largest error with |got − expected| / `unit`; `unit` must be
+    /// positive.
     pub(super) fn near(&mut self, got: f64, expected: f64, unit: f64) {
         self.add((got - expected).abs() / unit);
     }
 
-    /// Adds the relative error |got − expected| / |expected|, or 0 if both are equal.
+    /// Compares `got` with `expected` and updates the largest error with |got − expected| / |expected|, or with 0 if
+    /// both are equal.
     pub(super) fn relative(&mut self, got: f64, expected: f64) {
         self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
     }
 
-    /// Adds the error 1 if `got` differs from `expected`, else 0.
+    /// Compares `got` with `expected` and updates the largest error with 1 if they differ, else with 0.
     pub(super) fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
         self.add(if got == expected { 0.0 } else { 1.0 });
     }

@@ -8,8 +8,9 @@ use crate::deform::synthetic::{Noise, plain_config, random_tensors};
 use crate::deform::{Deltas, Field, FieldConfig, LayerBuffers};
 use crate::model::{Attributes, Gaussians};
 
-/// Compares states computed by the deformation field with its definition in f64. Errors are relative to 1 + |value|;
-/// the bound allows about 60 roundings in f32.
+/// Compares the frame states that the program computes by a deformation field with the f64 definition of this field,
+/// for several configurations of the field. The error of a value is relative to 1 + |value|; the bound allows about 60
+/// roundings in f32.
 pub(super) fn states() -> CaseResult {
     CaseResult::new("deformation field", "states: planes, layers in f64", 5e-6, || {
         let mut worst = LargestError::default();
@@ -40,8 +41,10 @@ pub(super) fn states() -> CaseResult {
     })
 }
 
-/// Compares the Jacobian of the deformation field with finite differences of its f64 definition over 2e-6. Errors are
-/// relative to 1 + |value|; the bound allows for f32 derivatives of products of six samples.
+/// Compares the Jacobian (derivative of deformed positions with respect to stored positions) of the deformation field
+/// with finite differences of the field's f64 definition, taken over a distance of 2e-6. Errors are relative to 1 +
+/// |value|; the bound allows for rounding in f32 of derivatives of products of six samples, one from each feature
+/// plane.
 pub(super) fn derivative() -> CaseResult {
     CaseResult::new("field's derivative", "of positions: differences in f64", 1e-5, || {
         let (config, time, step) = (plain_config(), 0.37, 1e-6);

@@ -1,4 +1,5 @@
-//! Self-check cases for merging: what a proxy (Gaussian that replaces a cluster) must have in common with its members.
+//! Self-check cases for merging: properties that a proxy (Gaussian that replaces a cluster) must have in common with
+//! the members of its cluster.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -11,8 +12,9 @@ use crate::merging::{Survivors, run};
 use crate::model::{Attributes, Gaussians};
 use crate::recipe::{MergeParams, ProxyOpacity, ProxyPosition, Recipe};
 
-/// Compares the merged mean and covariance Σ of a mixture with Σ formed directly in f64. Errors are relative to the
-/// largest entry of Σ; a dozen Gaussians lose about 1e-15.
+/// Compares the mean and covariance Σ that the program computes for a mixture of Gaussians with those by the textbook
+/// formula in f64, which forms Σ as a matrix. Errors are relative to the largest entry of Σ. Rounding of a dozen
+/// Gaussians causes an error of about 1e-15.
 pub(super) fn mixture() -> CaseResult {
     CaseResult::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
@@ -34,8 +36,9 @@ pub(super) fn mixture() -> CaseResult {
     })
 }
 
-/// Merges a Gaussian with its copy, which must return the same Gaussian. Its scales have the ratio 1 : 1e12 and must be
-/// exact to 1e-12 each; a covariance formed in f64 would lose the smallest scale entirely.
+/// Merges a Gaussian with its exact copy, which must give the same scales again. The ratio of the smallest to the
+/// largest scale is 1 : 1e12, and each scale must be exact to 1e-12. A covariance matrix formed in f64 would lose the
+/// smallest scale entirely.
 pub(super) fn needle() -> CaseResult {
     CaseResult::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = LargestError::default();
@@ -49,8 +52,9 @@ pub(super) fn needle() -> CaseResult {
     })
 }
 
-/// Compares the mean and covariance of a proxy with those of its members, computed by a slow f64 reference as in [`mixture`].
-/// The Gaussians lie 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Its opacity must be 1 − Π(1 − α), α being the opacities of the members.
+/// Compares a proxy of five Gaussians with its members: mean and covariance as in [`mixture`], the SH coefficients with
+/// their weighted mean, and the opacity with 1 − Π(1 − α), where α are the opacities of the members. The members lie
+/// 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13.
 pub(super) fn proxy() -> CaseResult {
     CaseResult::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = random_gaussians(4, 5, 1);
@@ -82,7 +86,9 @@ pub(super) fn proxy() -> CaseResult {
     })
 }
 
-/// Merges exact copies. The proxy must have their parameters to the bit, and the opacity that the rule gives in f32.
+/// Merges eight exact copies of a Gaussian, once with each rule of [`ProxyOpacity`]; a ninth copy far away must stay
+/// alone. The proxy must have the position, scales and SH coefficients of the copies to the bit, and the opacity that
+/// the rule gives, in f32.
 pub(super) fn duplicates() -> CaseResult {
     CaseResult::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = random_gaussians(6, 1, 0);
@@ -120,7 +126,7 @@ fn recipe(opacity: ProxyOpacity) -> Result<MergeParams> {
     Ok(MergeParams { opacity, ..Recipe::preset("default")?.merge })
 }
 
-/// Returns Gaussian `i` with the weight `weight`, as a part of a mixture.
+/// Returns Gaussian `i` of `states` as a component of a mixture, with the weight `weight`.
 fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
     WeightedGaussian {
@@ -131,8 +137,9 @@ fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     }
 }
 
-/// Compares mean and covariance of `found` with those of `parts` by the textbook formula, which forms Σ. Errors are
-/// relative to the largest entry of Σ.
+/// Compares mean and covariance of `found` with those of the mixture `parts` and adds the errors to `worst`. The
+/// expected covariance Σ is formed as a matrix, by the textbook formula. Errors of the covariance are relative to the
+/// largest entry of Σ, errors of the mean to the square root of this entry.
 fn compare_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
     let covariance = |rotation: DQuat, scales: DVec3| {
         let axes = DMat3::from_quat(rotation);

@@ -5,9 +5,9 @@
 //! Memory: a few sequences of at most 3000 Gaussians; on disk one sequence at a time, in a temporary folder that is
 //! deleted.
 //!
-//! A case runs the code that `compress` runs. The expected values share no code with it: they come from a formula, from
-//! exact integer arithmetic, or from the definition written out in f64 over whole arrays ([`oracle`]). The error of a
-//! case is the largest error of all values it compares.
+//! A case runs the code that `compress` runs. The expected values come from other code: from a formula, from exact
+//! integer arithmetic, or from the definition written out in f64 over whole arrays ([`oracle`]). The error of a case is
+//! the largest error of all values that it compares.
 
 mod case;
 mod field;
@@ -29,7 +29,7 @@ use crate::error::{Error, Result};
 
 pub use case::CaseResult;
 
-/// Every case, in the order of the pipeline.
+/// List of the cases of the self-check, in the order of the pipeline. Each function runs one case.
 const CASES: [fn() -> CaseResult; 28] = [
     statistics::motion,
     statistics::motion_far_away,
@@ -118,7 +118,7 @@ impl SelfcheckReport {
     }
 }
 
-/// Formats a number in at most seven characters.
+/// Formats a number with two significant digits, such as `1.0e-13`, in at most seven characters; 0 becomes `0`.
 fn short_number(value: f64) -> String {
     match value {
         0.0 => "0".to_owned(),

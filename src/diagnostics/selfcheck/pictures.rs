@@ -14,9 +14,10 @@ use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// Compares the render of one Gaussian with color c and opacity o, scale s at distance z, with the formula α·c + (1 −
-/// α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)), r px from its center at focal length f. In f32, values of 1 have an
-/// error of 6e-8, and exponentials a little more.
+/// Compares the render of one Gaussian with the formula of its pixels, α·c + (1 − α)·background with α =
+/// o·exp(−r²/(2(f²s²/z² + 0.3))). The Gaussian has the color c, the opacity o and the scale s and lies at the distance
+/// z; the pixel is r px from its center, and the focal length is f px. In f32, values of 1 have an error of 6e-8, and
+/// exponentials a little more.
 pub(super) fn one_gaussian() -> CaseResult {
     CaseResult::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
@@ -38,8 +39,8 @@ pub(super) fn one_gaussian() -> CaseResult {
 }
 
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
-/// per pixel in f32. Pixels in which a comparison is within a fraction of 1e-4 of its threshold are skipped, because
-/// f32 may decide differently; they are few.
+/// per pixel in f32. Skips the few pixels in which alpha or transmittance of a Gaussian is so close to a threshold of
+/// the renderer (relative difference below 1e-4) that f32 may decide differently.
 pub(super) fn many_gaussians() -> CaseResult {
     CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
@@ -55,8 +56,8 @@ pub(super) fn many_gaussians() -> CaseResult {
     })
 }
 
-/// Compares sum and maximum of alpha · transmittance of each Gaussian with f64 values. Errors are relative to 1 +
-/// value; the program sums in f32 over a tile of 256 pixels.
+/// Compares the sum and the maximum of alpha · transmittance over the pixels, for each Gaussian, with values computed
+/// in f64. Errors of the sum are relative to 1 + sum. The program sums in f32 over a tile of 256 pixels.
 pub(super) fn weights() -> CaseResult {
     CaseResult::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -72,8 +73,8 @@ pub(super) fn weights() -> CaseResult {
     })
 }
 
-/// Compares removal errors with their definition Σ‖render − render without the Gaussian‖², both in f64. In the program,
-/// the color behind a Gaussian is a difference in f32.
+/// Compares the removal error of each Gaussian with its definition, Σ‖render − render without the Gaussian‖² over the
+/// pixels, where both renders are in f64. The program computes the color behind a Gaussian as a difference in f32.
 pub(super) fn removal() -> CaseResult {
     CaseResult::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -94,8 +95,9 @@ pub(super) fn removal() -> CaseResult {
     })
 }
 
-/// Compares spherical harmonics colors with K·P(cos θ)·cos mφ, the definition by angles, with the Legendre functions P
-/// by recurrence and the factor K. A color of 1 has an error of about 1e-7 in f32.
+/// Compares colors that the program computes from SH coefficients with the definition of the spherical harmonics by
+/// angles, K·P(cos θ)·cos mφ. The Legendre functions P come from a recurrence; K is the normalization. A color of 1 has
+/// an error of about 1e-7 in f32.
 pub(super) fn harmonics() -> CaseResult {
     CaseResult::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();
@@ -122,8 +124,10 @@ pub(super) fn harmonics() -> CaseResult {
     })
 }
 
-/// Compares the largest gradients of every attribute with finite differences of f64 renders over 6e-5. Errors are
-/// relative to each gradient; gradients are f32 sums of terms of both signs.
+/// Compares the 20 largest gradients of each attribute with finite differences. The gradients are those of the squared
+/// error of a render; the differences are those of the same error of f64 renders at parameter values that are 6e-5
+/// apart. Errors are relative to the expected gradient; the gradients of the program are f32 sums of terms of both
+/// signs.
 pub(super) fn gradients() -> CaseResult {
     CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
@@ -165,8 +169,8 @@ pub(super) fn gradients() -> CaseResult {
     })
 }
 
-/// Compares PSNR in dB with whole numbers, and SSIM with its definition. The f64 sums of 786,432 squares lose at most
-/// 1e-12.
+/// Compares PSNR in dB with its value from an exact sum of squared whole numbers, and SSIM with its definition. The f64
+/// sums of 786,432 squares lose at most 1e-12.
 pub(super) fn comparison() -> CaseResult {
     CaseResult::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);
@@ -185,19 +189,24 @@ pub(super) fn comparison() -> CaseResult {
     })
 }
 
-/// Seed of a scene in whose render no comparison is so close to its threshold that f32 and f64 may decide differently.
+/// Seed of a scene for [`undoubtful_scene`], in whose render no alpha or transmittance is so close to a threshold of
+/// the renderer that f32 and f64 may decide differently.
 const UNDOUBTFUL_SEED: u64 = 1;
 
-/// Returns a scene and a camera for which no comparison is so close to its threshold that f32 may decide differently
-/// from f64, and no alpha is clamped.
+/// Returns a scene and a camera in whose render no alpha or transmittance is so close to a threshold of the renderer
+/// that f32 may decide differently from f64, and no alpha is clamped.
 fn undoubtful_scene() -> (Gaussians, Camera) {
     let mut scene = random_gaussians(UNDOUBTFUL_SEED, 60, 1);
     scene.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = logit.min(2.0));
     (scene, tilted_camera(40, 33))
 }
 
-/// Returns the real spherical harmonics up to degree 3 in the direction `toward`, by angles: √2·K·P(cos θ)·cos mφ, with
-/// sin |m|φ for negative m, where P is a Legendre function and K its normalization.
+/// Returns the 16 real spherical harmonics up to degree 3 in the direction `toward`, from its angles θ and φ:
+/// - order m > 0: √2·K·P(cos θ)·cos mφ
+/// - order m < 0: √2·K·P(cos θ)·sin |m|φ
+/// - order m = 0: K·P(cos θ)
+///
+/// P is an associated Legendre function and K its normalization.
 fn basis(toward: DVec3) -> [f64; 16] {
     let (height, angle) = (toward.z, toward.y.atan2(toward.x));
     std::array::from_fn(|k| {
@@ -227,8 +236,8 @@ fn legendre(degree: usize, m: usize, x: f64) -> f64 {
     last
 }
 
-/// Computes SSIM by its definition, window by window. Windows have 11×11 values, weighted by a Gaussian of σ = 1.5;
-/// values beyond the border are zero.
+/// Computes the SSIM of two square images by its definition, window by window. Windows have 11×11 values, weighted by a
+/// Gaussian of σ = 1.5; values beyond the border are zero.
 fn reference_ssim(a: &Image, b: &Image) -> f64 {
     let size = a.width as i64;
     let bell = |d: i64| (-(d * d) as f64 / 4.5).exp();

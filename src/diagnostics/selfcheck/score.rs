@@ -6,7 +6,8 @@ use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
-/// Compares percentiles with the value at the same rank after sorting, to the bit.
+/// Compares the percentiles that the program finds by a histogram with the values of the same rank in the sorted list
+/// of all values. They must be equal to the bit.
 pub(super) fn percentiles() -> CaseResult {
     CaseResult::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -22,7 +23,8 @@ pub(super) fn percentiles() -> CaseResult {
     })
 }
 
-/// Compares the box between percentiles of positions with sorted values, to the bit.
+/// Compares the percentiles 1, 50 and 99 of the positions along each axis, which form a [`RobustBox`], with the values
+/// of the same rank in the sorted list of all positions. They must be equal to the bit.
 pub(super) fn robust_box() -> CaseResult {
     CaseResult::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -41,14 +43,16 @@ pub(super) fn robust_box() -> CaseResult {
     })
 }
 
-/// Returns the `p`-th percentile of `n` sorted values: the value at rank ⌈p·n/100⌉, at least 1.
+/// Returns the `p`-th percentile of the n numbers in `values`: the number at rank ⌈p·n/100⌉, but at least rank 1, after
+/// sorting.
 fn sorted_percentile(values: &[f64], p: usize) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted[(sorted.len() * p).div_ceil(100).max(1) - 1]
 }
 
-/// Returns `count` distinct values over 46 powers of ten with both signs, including subnormal numbers of f32.
+/// Returns `count` random numbers of both signs whose magnitudes spread over 46 powers of ten, including subnormal
+/// numbers of f32.
 fn values(count: usize) -> Vec<f64> {
     let mut random = Random(count as u64);
     let value = |_| {

@@ -14,8 +14,9 @@ use crate::statistics::{BlockScan, ScanPlan};
 
 const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
-/// Compares the statistics of motion and opacity with their definition in f64, for life spans with many gaps. Sums of
-/// 40 terms in f64 lose about 1e-15, and variances a few digits more.
+/// Compares the statistics of motion and opacity (D, κ, V and the number of frames in which a Gaussian is alive) with
+/// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, a sum of 40 terms has a rounding
+/// error of about 1e-15; a variance loses a few more digits.
 pub(super) fn motion() -> CaseResult {
     CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -35,21 +36,24 @@ pub(super) fn motion() -> CaseResult {
     })
 }
 
-/// Compares statistics of Gaussians far from the origin, whose motion is whole numbers of ulps, with exact values. The
-/// differences are exact; a sum of 2000 squares in f64 loses at most 1e-14.
+/// Compares D and κ of a Gaussian far from the origin with exact values. Each step of the Gaussian is a whole number of
+/// ulps (units in the last place) of its f32 position, so the differences are exact. A sum of 2000 squares in f64 loses
+/// at most 1e-14.
 pub(super) fn motion_far_away() -> CaseResult {
     CaseResult::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
-/// Compares as [`motion_far_away`] does, for subnormal positions and for positions whose squares overflow f32.
+/// Compares D and κ with exact values as [`motion_far_away`] does, but for subnormal positions and for positions whose
+/// squares overflow f32.
 pub(super) fn motion_of_any_size() -> CaseResult {
     CaseResult::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
         compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
     })
 }
 
-/// Compares motion at unevenly spaced frames with a formula. For x = t² at whole t with mean step m, velocities are
-/// m·(t + t') between t and t', and turns (second differences) are 2m². Sums have 40 terms in f64.
+/// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. All times t are whole numbers, and one
+/// coordinate of the Gaussian is t². With m as the mean time step, its velocity between the times t and t' is m·(t +
+/// t'), and its turns (second differences) are 2m². Sums have 40 terms in f64.
 pub(super) fn uneven_frames() -> CaseResult {
     CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -72,7 +76,7 @@ pub(super) fn uneven_frames() -> CaseResult {
     })
 }
 
-/// Compares the statistics of Gaussians that are alive in 0 to 3 frames with exact values.
+/// Compares the statistics D, κ and V of Gaussians that are alive in 0 to 3 frames with exact values.
 pub(super) fn short_lives() -> CaseResult {
     CaseResult::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
@@ -107,9 +111,9 @@ pub(super) fn short_lives() -> CaseResult {
     })
 }
 
-/// Compares the variance V of nearly constant opacities with a computation in two passes in f64. Opacities of 0.9 that
-/// differ by 1e-6 have errors of 1e-16, so V has a relative error below 1e-9. Moments about 0 would leave only 2
-/// correct digits.
+/// Compares the variance V of nearly constant opacities with a computation in two passes in f64: first the mean, then
+/// the deviations from it. Opacities of 0.9 that differ by 1e-6 have rounding errors of 1e-16, so V has a relative
+/// error below 1e-9. Moments about 0 would leave only 2 correct digits.
 pub(super) fn steady_opacity() -> CaseResult {
     CaseResult::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
@@ -135,8 +139,9 @@ pub(super) fn steady_opacity() -> CaseResult {
     })
 }
 
-/// Compares projected areas with full matrices in f64. Errors are relative to max(area, 1 px); the contribution C is
-/// summed in units of about 3e-11 px.
+/// Compares the contribution C (projected area times opacity, in pixels) and the visibility of random Gaussians with a
+/// computation by full matrices in f64. Errors of C are relative to max(C, 1 px); the program sums C in units of about
+/// 3e-11 px.
 pub(super) fn projected_area() -> CaseResult {
     CaseResult::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = random_frames(500, 3);
@@ -155,9 +160,10 @@ pub(super) fn projected_area() -> CaseResult {
     })
 }
 
-/// Compares the projected area of a needle with a formula: with variances a and b px², rotated about the line of sight,
-/// it has det Σ = (a + 0.3)(b + 0.3). Computed from the entries of Σ, no digit of the determinant would be correct.
-/// Errors are relative to max(area, 1 px), as in [`projected_area`].
+/// Compares the contribution C of a needle-shaped Gaussian with a formula for its projected area. The Gaussian has the
+/// variances a and b, in px², along its axes in the image, and these axes are rotated in the image plane. With 0.3 px²
+/// added to both variances, its projected covariance Σ has det Σ = (a + 0.3)(b + 0.3). A computation of det Σ from the
+/// entries of Σ would leave no correct digit. Errors are relative to max(C, 1 px), as in [`projected_area`].
 pub(super) fn needle_on_screen() -> CaseResult {
     CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -197,8 +203,8 @@ pub(super) fn needle_on_screen() -> CaseResult {
     })
 }
 
-/// Compares the statistics of one Gaussian that moves along x from `from` by whole numbers of `unit` with exact values,
-/// for every pair (from, unit) in `sizes`.
+/// Compares D and κ of one Gaussian with exact values, for each pair (from, unit) in `sizes`. The Gaussian moves along
+/// x from the position `from` by whole numbers of `unit`, both in scene units.
 fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {
@@ -230,7 +236,8 @@ fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     Ok(worst)
 }
 
-/// Returns one Gaussian at frame `t` that alternately moves by +3 and −3 scene units along x.
+/// Returns the state at frame `t` of one Gaussian that alternately moves by +3 and −3 scene units along x. `alive`:
+/// whether the Gaussian is opaque enough at this frame to count as alive.
 fn zigzag(t: usize, alive: bool) -> Gaussians {
     let mut frame = resting(1);
     frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);
@@ -245,8 +252,9 @@ fn resting(count: usize) -> Gaussians {
     frame
 }
 
-/// Returns `count` Gaussians at new random positions in every frame, before a camera at the origin; some are behind it.
-/// In a third of the frames they are not alive.
+/// Returns `frames` frames of `count` Gaussians with new random attributes in every frame. The Gaussians lie in front
+/// of a camera at the origin, a few of them behind it. A third of the opacities, chosen at random, are so low that the
+/// Gaussian mostly does not count as alive.
 fn random_frames(count: usize, frames: usize) -> Vec<Gaussians> {
     let mut random = Random(3);
     let mut frame = |_| {
@@ -275,14 +283,14 @@ fn without_views(frames: usize) -> ViewSchedule {
     schedule
 }
 
-/// Returns the statistics that the scan of the program computes for evenly spaced frames.
+/// Returns the statistics that the scan of the program computes for `frames` at evenly spaced times.
 fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
-/// Returns the statistics that the scan of the program computes for frames at `times`. Tells the scan when opacities
-/// are unchanged, as sources do.
+/// Returns the statistics that the scan of the program computes for `frames` at `times`. Tells the scan which frames
+/// have the same opacities as the frame before, as the program's readers of models do.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

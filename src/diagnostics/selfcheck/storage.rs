@@ -22,8 +22,8 @@ use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Compares every bit of a lossless container, including NaN and −0, and including an attribute whose last frame equals
-/// its first.
+/// Writes frames to a lossless container, reads them back, and compares every bit. The values include NaN and −0, and
+/// rotations that are the same in the last frame of a block of frames as in its first frame.
 pub(super) fn container() -> CaseResult {
     CaseResult::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
@@ -37,7 +37,8 @@ pub(super) fn container() -> CaseResult {
     })
 }
 
-/// Compares the values of a container with error bounds. The unit of the error is the requested bound.
+/// Writes frames to a container with error bounds, reads them back, and compares the values. The unit of the error is
+/// the requested bound of the attribute.
 pub(super) fn bounded_container() -> CaseResult {
     CaseResult::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
@@ -56,8 +57,8 @@ pub(super) fn bounded_container() -> CaseResult {
     })
 }
 
-/// Compares the values of an archive with the originals. The unit of the error is half a quantization step plus a
-/// rounding to f32.
+/// Encodes a model as an archive, decodes it, and compares the decoded values with the originals. The unit of the error
+/// is half a quantization step plus a rounding to f32.
 pub(super) fn archive_grid() -> CaseResult {
     CaseResult::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
@@ -80,8 +81,9 @@ pub(super) fn archive_grid() -> CaseResult {
     })
 }
 
-/// Compares the decoded Gaussians with the originals rounded to the quantization grid, and the other stored data with
-/// the originals, to the bit: prediction and entropy coding of an archive are lossless.
+/// Encodes a model as an archive, decodes it, and compares every bit, because the prediction and entropy coding of an
+/// archive are lossless. The decoded Gaussians must equal the original Gaussians after rounding to the quantization
+/// grid. The other stored data must equal the originals.
 pub(super) fn archive_codes() -> CaseResult {
     CaseResult::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
@@ -100,10 +102,11 @@ pub(super) fn archive_codes() -> CaseResult {
     })
 }
 
-/// Quantization step of a matrix, as eighths of its binary logarithm: 2^(−60/8).
+/// Quantization step of the matrix of the test model, given as its binary logarithm in eighths: the step is 2^(−60/8).
 const MATRIX_STEP: i32 = -60;
 
-/// Returns a model of 2000 Gaussians of SH degree 2 with two tensors and a file, and the quantization steps for it.
+/// Returns a test model and the quantization steps for it. The model has 2000 Gaussians of SH degree 2, two tensors, a
+/// stored file, and one extra byte per Gaussian.
 fn model() -> (ArchiveContent, QuantizationSteps) {
     let mut random = Random(12);
     let mut tensor = |shape: &[usize]| Tensor {
@@ -123,13 +126,14 @@ fn model() -> (ArchiveContent, QuantizationSteps) {
     (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
-/// Returns how many entries of [`ATTRIBUTES`] the content has: position to opacity, and one per SH degree that exists.
+/// Returns how many entries of [`ATTRIBUTES`] the Gaussians of `content` have: all entries from position to opacity,
+/// and one entry for each SH degree from 0 to the SH degree of the Gaussians.
 fn used_attributes(content: &ArchiveContent) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }
 
-/// Writes `written` to a container, reads it back, and calls `compare` with every value read, the original value, and
-/// its attribute.
+/// Writes `written` to a container and reads it back. Calls `compare` for each value with the value read, the original
+/// value, and the attribute.
 fn compare_round_trip(
     written: &MemoryFrames,
     packing: impl Into<Packing>,
@@ -153,7 +157,7 @@ fn compare_round_trip(
     Ok(())
 }
 
-/// Sequence of frames in memory.
+/// Sequence of frames that are all in memory.
 struct MemoryFrames {
     info: SequenceInfo,
     frames: Vec<Gaussians>,
@@ -161,8 +165,8 @@ struct MemoryFrames {
 
 impl MemoryFrames {
     /// Creates 1100 Gaussians (more than one block of Gaussians) at 70 frames (more than two blocks of frames).
-    /// Positions wander, opacities jump, rotations return to their first value in the last frame of a block, and scales
-    /// and colors are constant.
+    /// Positions wander and opacities jump. Rotations have the same values in the first and in the last frame of a
+    /// block, and others between. Scales and colors are constant.
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);

@@ -15,7 +15,7 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
-/// Compares the bytes of results computed with different numbers of threads; they must be equal.
+/// Compares results computed on one thread with results computed on two threads. They must be equal byte for byte.
 pub(super) fn same_bytes() -> CaseResult {
     CaseResult::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (run_on(1)?, run_on(2)?);
@@ -25,8 +25,8 @@ pub(super) fn same_bytes() -> CaseResult {
     })
 }
 
-/// Compresses the demo scene and computes the gradients of one view, on `threads` threads. Returns the compressed bytes
-/// and the gradients.
+/// Compresses a small test scene and computes the gradients of one render, on `threads` threads. Returns the bytes of
+/// the compressed file and the gradients.
 fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| Error::usage(format!("{threads} threads: {error}")))?;

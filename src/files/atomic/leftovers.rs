@@ -38,8 +38,8 @@ impl PublishLock {
     /// Waits until no other run moves a result to the name of `target`, then takes the lock.
     ///
     /// # Errors
-    /// Fails if another run holds the lock, or a folder not created by this program has its name, for a minute; also if
-    /// a system call fails.
+    /// Fails if, for a minute, another run holds the lock, or a folder that this program did not create has the name of
+    /// the lock. Also fails if a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
         let (parent, name) = split_target(target)?;
         let name = publishing_name(name);
@@ -152,8 +152,8 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     }
 }
 
-/// Completes or reverts an interrupted move of a result from the workspace `folder` to `target`. The caller holds the
-/// [`PublishLock`].
+/// Completes or reverts an interrupted move of a result from the workspace `folder`, which lies in the folder `parent`,
+/// to `target`. The caller holds the [`PublishLock`].
 ///
 /// Files listed in a journal get their final names. If the earlier result folder was moved aside, it gets its name back
 /// if that name is free. Otherwise the new folder is already in place, and entries that are not listed in the earlier
@@ -195,7 +195,9 @@ pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, t
     Ok(())
 }
 
-/// Gives their final names to the files of the journal that are still in the workspace `folder`.
+/// Moves the files of the journal that are still in the workspace `folder` to their final names in the folder `parent`.
+/// Skips names that do not begin with the name of `target`. Fails if the journal cannot be read, or if a file must not
+/// be replaced or cannot be moved.
 fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = split_target(target)?;

@@ -41,13 +41,15 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads from the summary at `path`, which may be a link, which files belong to the result.
+    /// Reads from the summary at `path`, which may be a link, which files belong to the result. Returns
+    /// [`Owner::Unknown`] if the file cannot be read or is not a summary of this program with a list of files.
     pub(super) fn read(path: &Path) -> Owner {
         // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
-    /// Reads from the open summary `file` which files belong to the result.
+    /// Reads from the open summary `file` which files belong to the result. Returns [`Owner::Unknown`] if `file` cannot
+    /// be read or is not a summary of this program with a list of files.
     pub(super) fn read_file(mut file: File) -> Owner {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;
@@ -193,7 +195,7 @@ fn is_folder(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_dir())
 }
 
-/// Splits an output path into its folder and its name. Fails if it has no name.
+/// Splits the output path `target` into its folder and its name. Fails if it has no name.
 pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
         return Err(Error::usage(format!(

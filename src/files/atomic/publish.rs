@@ -1,4 +1,4 @@
-//! Publication: moves finished outputs to their final names. For each name, one run at a time does so.
+//! Publication: moves finished outputs to their final names. Only one run at a time moves outputs to the same name.
 
 use std::ffi::OsString;
 use std::fs;
@@ -47,7 +47,8 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     Ok(())
 }
 
-/// Writes the journal of `workspace`, which lists the files to be renamed together, and syncs it to disk.
+/// Writes the journal of `workspace`, which holds `replace` and the list of the files to be renamed together, and syncs
+/// it to disk.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };

@@ -42,8 +42,8 @@ pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Opens a device or FIFO for writing. If no program has a FIFO open for reading, retries for 10 s ([`MAX_WAIT`]), then
-/// fails.
+/// Opens the device or FIFO `target` for writing. If no program has a FIFO open for reading, retries for 10 s
+/// ([`MAX_WAIT`]), then fails.
 fn open(target: &Path) -> io::Result<File> {
     let start = Instant::now();
     loop {

@@ -318,14 +318,15 @@ impl Leftover {
         if is_marked { Ok(Leftover { name: name.to_owned(), folder, lock }) } else { Err(Refusal::Foreign) }
     }
 
-    /// Removes the workspace. Entries that cannot be removed stay; they do no harm.
+    /// Removes the workspace from the folder `parent`. Entries that cannot be removed stay; they do no harm.
     pub(super) fn remove(self, parent: &FolderHandle) {
         remove_content(&self.folder, Some(self.lock));
         let _ = parent.remove_empty(&self.name);
     }
 }
 
-/// Removes the workspace at `folder` if the folder there still has the identity `identity`. `lock` is its lock file.
+/// Removes the workspace at `folder` if the folder there still has the identity `identity`. `lock` is its lock file;
+/// `None` on a file system without locks.
 fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };
@@ -336,8 +337,8 @@ fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     }
 }
 
-/// Deletes everything in a workspace. The lock file is deleted last and before its lock is released, so a run that gets
-/// the lock afterwards sees that the file is gone.
+/// Deletes everything in the workspace `folder`. `lock` is its locked lock file, if there is one. The lock file is
+/// deleted last and before its lock is released, so a run that gets the lock afterwards sees that the file is gone.
 fn remove_content(folder: &FolderHandle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);

@@ -101,7 +101,7 @@ impl Assembly {
         Ok(())
     }
 
-    /// Adds the next image of the file that was last passed to [`Assembly::begin`].
+    /// Adds the image `listed`, which belongs to the file that was last passed to [`Assembly::begin`].
     ///
     /// # Errors
     /// Fails if the camera is invalid, if only some images have a time, or if the memory limit for reading is exceeded.
@@ -169,7 +169,8 @@ impl Assembly {
         }
     }
 
-    /// Returns the rig of all images added. `origin` describes for the user where the cameras come from.
+    /// Returns the rig of all images added. `background` is the background color, if a camera file states one. `origin`
+    /// describes for the user where the cameras come from.
     ///
     /// # Errors
     /// Fails if there are no images, or if two images of one file have the same view, split and time.
@@ -302,7 +303,8 @@ pub(super) fn from_camera_to_world(
     Camera { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * center), near: Camera::NEAR }
 }
 
-/// Returns the number after `v` in an image name of the form `…tNNN_vNN…`: the view number.
+/// Returns the number after `v` in an image name of the form `…tNNN_vNN…`: the view number. Returns `None` for other
+/// names.
 pub(super) fn view_in_name(name: &str) -> Option<u32> {
     let name = name.rsplit(['/', '\\']).next()?;
     name.match_indices("_v").find_map(|(at, mark)| {

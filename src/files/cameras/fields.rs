@@ -21,7 +21,8 @@ pub(super) struct CameraFields<'a> {
 }
 
 impl<'a> CameraFields<'a> {
-    /// Returns a reader of the keys of the JSON object `value`.
+    /// Returns a reader of the keys of the JSON object `value` in the file at `path`. `frame` is the index of the
+    /// image; `None` for the top-level object.
     ///
     /// # Errors
     /// Fails if `value` is not an object.
@@ -42,7 +43,7 @@ impl<'a> CameraFields<'a> {
         Error::input(self.path, place, expected, found)
     }
 
-    /// Returns the finite number under `key`, or `None` if the key is missing or null.
+    /// Returns the finite number under `key`, or `None` if the key is missing or null. Fails for other values.
     pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -53,13 +54,13 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns the finite number under `key`.
+    /// Returns the finite number under `key`. Fails if there is none.
     pub(super) fn number(&self, key: &str) -> Result<f64> {
         self.optional_number(key)?.ok_or_else(|| self.wrong(key, "a finite number"))
     }
 
-    /// Returns the image width or height in pixels under `key`, or `None` if the key is missing. Accepts 800.0, as some
-    /// programs write it.
+    /// Returns the image width or height in pixels under `key`, or `None` if the key is missing or null. Accepts 800.0,
+    /// as some programs write it. Fails if the value is not a whole number from 1 to [`MAX_SIDE_PX`].
     pub(super) fn optional_side(&self, key: &str) -> Result<Option<u32>> {
         match self.optional_number(key)? {
             None => Ok(None),
@@ -70,12 +71,12 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns the image width or height in pixels under `key`.
+    /// Returns the image width or height in pixels under `key`. Fails if there is none.
     pub(super) fn side(&self, key: &str) -> Result<u32> {
         self.optional_side(key)?.ok_or_else(|| self.wrong(key, "a number of pixels"))
     }
 
-    /// Returns the text under `key`, or `None` if the key is missing or null.
+    /// Returns the text under `key`, or `None` if the key is missing or null. Fails for other values.
     pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -84,7 +85,8 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns the whole number under `key`, which must fit into 32 bits, or `None` if the key is missing or null.
+    /// Returns the non-negative whole number under `key`, or `None` if the key is missing or null. Fails for other
+    /// values, and for numbers that do not fit into 32 bits.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -95,7 +97,8 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns the image width and height in pixels, from the list under `key`.
+    /// Returns the image width and height in pixels, which are the two elements of the list under `key`. Fails if the
+    /// list is missing or invalid.
     pub(super) fn sides(&self, key: &str) -> Result<[u32; 2]> {
         let side = |value: f64| {
             (value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value)).then_some(value as u32)
@@ -104,7 +107,8 @@ impl<'a> CameraFields<'a> {
         found.ok_or_else(|| self.wrong(key, format!("width and height, 1 to {MAX_SIDE_PX} pixels")))
     }
 
-    /// Returns the three numbers of the list under `key`, or `None` if the key is missing or null.
+    /// Returns the three numbers of the list under `key`, or `None` if the key is missing or null. Fails for other
+    /// values.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {
             None | Some(SmallValue::Null) => Ok(None),
@@ -112,19 +116,20 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns the three numbers of the list under `key`.
+    /// Returns the three numbers of the list under `key`. Fails if there is no such list.
     pub(super) fn vector(&self, key: &str) -> Result<[f64; 3]> {
         self.optional_vector(key)?.ok_or_else(|| self.wrong(key, "3 finite numbers"))
     }
 
-    /// Returns the row-major 3 × 3 matrix under `key`.
+    /// Returns the row-major 3 × 3 matrix under `key`. Fails if there is no such matrix.
     pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
         let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| rows.len() == 3);
         rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
             .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
     }
 
-    /// Returns the rotation and translation of the pose `[R | t]` under `key`, a row-major 3 × 4 or 4 × 4 matrix.
+    /// Returns the rotation and translation of the pose `[R | t]` under `key`, a row-major 3 × 4 or 4 × 4 matrix. Fails
+    /// if there is no such matrix.
     pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
         let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| matches!(rows.len(), 3 | 4));
         let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
@@ -138,7 +143,7 @@ impl<'a> CameraFields<'a> {
         Ok((rotation, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
     }
 
-    /// Returns the number of elements of the list under `key`.
+    /// Returns the number of elements of the list under `key`. Fails if there is no list.
     pub(super) fn list_len(&self, key: &str) -> Result<usize> {
         match self.map.get(key) {
             Some(SmallValue::List(_, total)) => Ok(*total),
@@ -152,7 +157,7 @@ pub(super) fn place(frame: Option<usize>) -> String {
     frame.map_or_else(String::new, |frame| format!("frame {frame}"))
 }
 
-/// Returns the elements of `value` if it is a list of exactly `W` finite numbers.
+/// Returns the elements of `value` if it is a list of exactly `W` finite numbers; `None` for other values.
 fn numbers<const W: usize>(value: &SmallValue) -> Option<[f64; W]> {
     let elements: &[SmallValue; W] = value.elements()?.try_into().ok()?;
     let mut out = [0.0; W];

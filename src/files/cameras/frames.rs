@@ -42,9 +42,9 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Returns `images` once for each of `frames` frames. `images` are those of the first frame, whose folder is `root` =
-/// `colmap_K` with K = `first`; the images of the next frames lie in the folders with the next numbers. The first image
-/// of each frame is a test image.
+/// Returns the images of `frames` frames, each with the cameras of the first frame. `images` are the images of the
+/// first frame. Its folder `root` is called `colmap_K`, where the number K is `first`; the folders of the next frames
+/// have the next numbers. The first image of each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
     images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),

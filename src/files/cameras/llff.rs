@@ -26,7 +26,7 @@ const WIDTH: usize = 17;
 /// Default number of frames: that of the original DyNeRF scenes.
 const DEFAULT_FRAMES: usize = 300;
 
-/// Reads the cameras in `file`, each at every frame.
+/// Reads the cameras in `file`. Every camera sees every frame.
 ///
 /// # Errors
 /// Fails if the array or a camera is malformed, or if the number of cameras times the number of frames exceeds the
@@ -53,7 +53,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, origin)
 }
 
-/// Returns one image per camera and frame, ordered by frame, then by camera.
+/// Returns one image for each of `cameras` at each of `frames` frames, ordered by frame, then by camera.
 fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
     let listed_image = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),

@@ -25,7 +25,7 @@ const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_met
 /// Keys whose values are lists of lists: one list per frame, with one value per camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
-/// Returns whether the document with the keys `outline` is in this format.
+/// Returns whether the camera file with the keys `outline` is in the format of Dynamic3DGaussians.
 pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
     ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(SmallValue::List(..))))
 }

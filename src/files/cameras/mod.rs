@@ -161,8 +161,9 @@ pub fn are_timed_by_name(path: &Path) -> bool {
     locate(path).is_some_and(|file| is_colmap(&file))
 }
 
-/// Returns the camera file for `path`: `path` itself, or the first of the known file names that exists in the folder
-/// `path`.
+/// Returns the file or folder from which the cameras of the data set at `path` are read. This is `path` itself if it is
+/// a file or the folder of a COLMAP reconstruction. Otherwise it is the first of these that exists in the folder
+/// `path`: a file of [`NAMES`], a COLMAP reconstruction, a folder `colmap_K`. Returns `None` if none exists.
 fn locate(path: &Path) -> Option<PathBuf> {
     if path.is_file() {
         return Some(path.to_owned());
@@ -193,7 +194,8 @@ enum Kind {
     PerFrame,
 }
 
-/// Returns the format of a JSON camera file, recognized by the keys in its `outline` (the document without its images).
+/// Returns the format of a JSON camera file, recognized by the keys in its `outline` (the document without its images);
+/// `None` if the format is unknown.
 fn kind(outline: &SmallValue) -> Option<Kind> {
     if let SmallValue::List(_, count) = outline {
         return Some(Kind::PerCamera(*count));

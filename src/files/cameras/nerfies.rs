@@ -28,7 +28,8 @@ use crate::model::{Rig, Split};
 
 /// Keys of the camera file of an image.
 const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
-/// In a data set that names no test images, every image whose index is a multiple of this number is a training image.
+/// Interval of training images in a data set that names no test images: every image whose index is a multiple of this
+/// number is a training image.
 const TRAIN_EVERY: usize = 4;
 
 /// Reads the data set whose `dataset.json` is `file`.
@@ -92,7 +93,8 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
     Ok(names)
 }
 
-/// Reads the `warp_id` (time index) of each image in `ids`.
+/// Reads the `warp_id` (time index) of each image in `ids` from `file`, the `metadata.json` of the data set. `counter`
+/// limits the memory.
 fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
     counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
     // Give each distinct name one index, because a name may occur twice in `ids`.
@@ -119,8 +121,9 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// Returns, for every image of `ids`, the splits to which the image belongs: usually one, and an empty list for an
-/// image that is not used. `val` lists the test images and `train` the training images.
+/// Returns, for every image of `ids`, the list of the splits to which the image belongs: usually one split, none for an
+/// image that is not used. `val` lists the test images and `train` the training images. If `val` is empty, the index of
+/// an image decides (see the module documentation).
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);

@@ -64,7 +64,8 @@ fn per_image(times: &[f64]) -> Value {
     json!({"background": [1, 0.5, 0], "frames": times.iter().map(frame).collect::<Vec<_>>()})
 }
 
-/// Returns the bytes of an array file in NumPy's format 1.0.
+/// Returns the bytes of an array file in NumPy's format 1.0 with the values `rows`. The first three arguments are the
+/// values of `descr`, `fortran_order` and `shape` in its header.
 fn npy(dtype: &str, order: &str, shape: &str, rows: &[[f64; 17]]) -> Vec<u8> {
     let header = format!("{{'descr': '{dtype}', 'fortran_order': {order}, 'shape': {shape}, }}");
     let mut bytes = b"\x93NUMPY\x01\0\x76\0".to_vec();
@@ -77,7 +78,8 @@ fn write_npy(path: &Path, rows: &[[f64; 17]]) {
     fs::write(path, npy("<f8", "False", &format!("({}, 17)", rows.len()), rows)).unwrap();
 }
 
-/// Returns the row of `poses_bounds.npy` for a camera at `eye` that looks along +y of the world, with z up.
+/// Returns the row of `poses_bounds.npy` for a camera at `eye` that looks along +y of the world, with z up. The image
+/// height, the image width and the focal length are in pixels.
 fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
     let [x, y, z] = eye;
     // Columns: down −z, right +x, backward −y, position, (height, width, focal).

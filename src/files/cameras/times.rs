@@ -35,7 +35,7 @@ pub enum TimesSource {
 }
 
 impl TimesSource {
-    /// Parses the value of `--times`: `names`, `none`, or the path of a table.
+    /// Parses `text`, the value of `--times`: `names`, `none`, or the path of a table.
     pub fn parse(text: &str) -> TimesSource {
         match text {
             "names" => TimesSource::Names,
@@ -55,8 +55,8 @@ impl TimesSource {
     }
 }
 
-/// Returns the times of the images `names` listed in `file`, and a description of their source. Both are empty if there
-/// are no times.
+/// Returns two values: the time of each image in `names`, which the camera file `file` lists, and a text that describes
+/// where these times come from. Both are empty if there are no times. `times` names the source of the times.
 ///
 /// # Errors
 /// Fails if an image name contains no number although its number is needed, or if the table of times is malformed or
@@ -134,7 +134,8 @@ fn keys(name: &str) -> impl Iterator<Item = &str> {
     [name, file, stem(file)].into_iter()
 }
 
-/// Reads a CSV table of image names and times.
+/// Reads the CSV table at `path`, which maps image names to times. `counter` limits the memory. Fails if a line is
+/// malformed or a name has two different times.
 fn read_table(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<String, f64>> {
     let mut known = HashMap::new();
     let mut lines = TextLines::open(path)?;

@@ -102,7 +102,7 @@ fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<
     })
 }
 
-/// Builds an image from its own keys `own` and the keys `shared` by all images of the file.
+/// Builds an image of the split `split` from its own keys `own` and the keys `shared` by all images of the file.
 fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
@@ -124,7 +124,9 @@ fn listed_image(
     })
 }
 
-/// Returns the image width and height in pixels: from the camera file, else from the image file, else from the options.
+/// Returns the width and height of an image in pixels: from the camera file, else from the image file, else from the
+/// options. In the camera file, the keys `own` of the image take precedence over the keys `shared` by all images. Fails
+/// if no size is found.
 fn size(
     shared: CameraFields<'_>,
     own: CameraFields<'_>,
@@ -144,7 +146,9 @@ fn size(
     })
 }
 
-/// Returns the focal lengths and the principal point fx, fy, cx, cy in pixels, for an image of the given size.
+/// Returns the focal lengths and the principal point fx, fy, cx, cy in pixels, for an image of the given size. The keys
+/// `own` of the image take precedence over the keys `shared` by all images. Fails if there is no horizontal focal
+/// length.
 fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
     let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {

@@ -5,7 +5,8 @@ use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Number of cameras around a moving scene: the number of views that score the static models in docs/benchmarks.md.
+/// Number of cameras around a moving scene. The static models in docs/benchmarks.md are scored with the same number of
+/// cameras.
 const CAMERAS: u32 = 12;
 /// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
 /// image then spans 2.3 extents, so that a scene with equal sides is seen whole from every corner.
@@ -53,8 +54,8 @@ const SURROUNDING_DISTANCE: f64 = 2.2;
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
 /// Image width and height in pixels, for the cameras around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;
-/// Fraction of the total weight (visible area) of a still that defines the radius: Gaussians of this weight lie within
-/// it. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
+/// Fraction that defines the radius of a still: Gaussians with this fraction of the total weight (visible area) lie
+/// within the radius. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
 const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
 /// Returns cameras on a Fibonacci sphere around most of the visible surface of a still (model without motion), all as
@@ -62,8 +63,9 @@ const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 ///
 /// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
 /// of the weight lie. `weights` holds the visible area of each Gaussian: opacity times the product of its two larger
-/// scales. Weights above the 99th percentile are set to that percentile. The weights make floaters, which are many and
-/// thin, count little; their limit keeps a backdrop of few huge Gaussians from dominating.
+/// scales. Weights above the 99th percentile are set to that percentile. Because of the weights, floaters, which are
+/// many and thin, count little; because of the limit of the weights, a backdrop of few huge Gaussians does not
+/// dominate.
 pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     let mut all: Vec<(DVec3, f64)> = positions
         .iter()

@@ -34,7 +34,7 @@ pub(crate) struct PickledTensor {
     pub(crate) stride: Vec<usize>,
 }
 
-/// Returns a dense f32 tensor whose values are in storage number `storage`.
+/// Returns a dense f32 tensor of the shape `shape`, whose values are in storage number `storage`.
 pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> PickledTensor {
     let mut stride = vec![1; shape.len()];
     (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));

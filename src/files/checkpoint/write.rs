@@ -122,8 +122,9 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 }
 
 impl<'a> StoragePart<'a> {
-    /// Returns the part of a new storage that holds `tensor`; it begins with element `offset` of the storage. The part
-    /// has `kept` rows, or all rows of the tensor if `rows` is `None`. Computes its shape and strides.
+    /// Creates the part of a rewritten storage (block of tensor values) that holds `tensor`, and computes the shape and
+    /// strides of this part. It has `kept` rows, or all rows of the tensor if `rows` is `None`. `offset` is the index
+    /// of its first element in the rewritten storage.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
@@ -160,8 +161,8 @@ impl<'a> StoragePart<'a> {
         StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
-    /// Appends the bytes of this part to `out`. `stored` holds the bytes of the old storage, and `kept` the indices of
-    /// the rows that are kept.
+    /// Appends the bytes of this part of the rewritten storage (block of tensor values) to `out`. `stored` holds the
+    /// bytes of the old storage, and `kept` the indices of the rows that are kept.
     fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
@@ -209,9 +210,10 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. For tensors
-/// in `expected` the listed ones are right, for others the old ones. Both cannot hold if two tensors share one object
-/// for their shape and only one of them changes; then the check fails.
+/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. A tensor that
+/// is a key of `expected` must have the shape, strides and offset given there; every other tensor must have those of
+/// the old pickle. The check fails if two tensors share one shape object in the pickle although only one of them gets a
+/// new shape.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

@@ -13,7 +13,7 @@ use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::SharedCounter;
 
-/// Open container file whose columns are all attributes of Gaussians.
+/// Open container file with one column for each attribute of Gaussians.
 pub struct Container {
     pub(super) path: PathBuf,
     pub(super) reader: Reader,
@@ -48,7 +48,8 @@ impl Container {
     /// opacity_logit and sh, each of the right width.
     ///
     /// # Errors
-    /// Fails like [`Reader::open`], and if a column is missing or has another width.
+    /// Fails like [`Reader::open`]. Also fails if a column is missing or has another width, or if there are 2³²
+    /// Gaussians or more.
     pub fn open(path: &Path) -> Result<Container> {
         Self::open_within(path, ReadLimit::NONE)
     }
@@ -155,7 +156,7 @@ impl Container {
     /// block, then by Gaussian block. `index` is the index of the tile's attribute in [`Container::places`]. An
     /// attribute that does not vary over time has tiles in only one frame block, so `frame_block` is ignored for it.
     ///
-    /// If `index` is the number of attributes and both blocks are 0, the result is the number of tiles of the file.
+    /// For the number of all tiles, the caller passes the number of attributes as `index`, and 0 for both blocks.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };

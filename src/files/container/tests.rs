@@ -156,7 +156,8 @@ fn a_reader_keeps_no_more_than_allowed() {
     }
 }
 
-/// Returns the number of tiles that are read in one pass over all frames, and their bytes in the file.
+/// Returns the number of tiles that are read in one pass over all frames, and the number of bytes that these tiles take
+/// in the file.
 fn all_tiles(container: &Container) -> (u64, u64) {
     let (reader, mut found) = (container.reader(), (0, 0));
     for &(column, place) in &container.places {

@@ -26,8 +26,8 @@ struct TileRun {
 /// Values of one column (attribute) that a reader keeps in memory.
 pub(super) enum KeptColumn {
     Nothing,
-    /// Index of a frame block, and the tile of this block, which holds exactly the reader's Gaussians. The tile is
-    /// decompressed, or raw (uncompressed) in the file.
+    /// Index of a frame block, and the values of its tile, which holds exactly the reader's Gaussians. The values have
+    /// been decompressed, or are raw (uncompressed) in the file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
@@ -40,7 +40,8 @@ pub(super) struct FrameValues {
     /// Frames whose values are stored, increasing. Empty if the values are the same in all frames of the block and
     /// stored once.
     frames: Vec<usize>,
-    /// Values `[frames, width, len]` for the stored frames, the components of the column, and the Gaussians.
+    /// Values, laid out as `[frames, width, len]`: the stored frames, the components of the column, the reader's
+    /// Gaussians.
     pub(super) values: Vec<f32>,
 }
 
@@ -56,11 +57,16 @@ impl FrameValues {
 
 /// Reader of some Gaussians of a container.
 ///
-/// Memory in bytes per Gaussian, for each column (attribute) that varies over time: 4 × width (number of components) ×
-/// frames kept. The frames kept are those of a frame block that will be read, but at most the number given by
-/// [`ReadPlan::keeping_at_most`]. If this is a whole frame block, add 8 × width. Raw (uncompressed) tiles that are read
-/// whole take the same amount of mapped memory if a whole frame block may be kept, else none. No memory is used if only
-/// one frame is kept, for columns that do not vary, and for tiles that the container keeps in memory.
+/// Memory in bytes per Gaussian, for each column (attribute) that varies over time:
+///
+/// - 4 × width × frames kept, where width is the number of components. The frames kept are the frames of one frame
+///   block that the read plan lists, but at most the number given by [`ReadPlan::keeping_at_most`].
+/// - 8 × width in addition, if a whole frame block is kept.
+/// - For raw (uncompressed) tiles that are read whole, instead: the same amount of mapped memory if a whole frame block
+///   may be kept, else none.
+///
+/// No memory is used if only one frame is kept, for columns that do not vary, and for tiles that the container keeps in
+/// memory.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
@@ -82,7 +88,7 @@ pub(super) struct TileReader<'a> {
 }
 
 impl<'a> TileReader<'a> {
-    /// Returns a reader of the Gaussians with the indices `ids`.
+    /// Returns a reader of the Gaussians `ids` of the container `source`.
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();
@@ -141,10 +147,12 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Decodes the attribute with index `index` for `frame` and later frames of its frame block into the memory of this
-    /// reader, if it is worth the memory. Returns whether this reader then has the values of `frame` in memory. If not,
-    /// for example because the container itself keeps the tiles or only one frame is needed, the caller uses
-    /// [`TileReader::decode`], which writes the values directly to their destination.
+    /// Tries to decode the attribute with index `index`, for `frame` and later frames of its frame block, into the
+    /// memory of this reader. Returns whether this reader now has the values of `frame` in memory.
+    ///
+    /// Returns false if keeping the values would not save work, for example because the container itself keeps the
+    /// tiles, or because only one frame is needed. The caller then uses [`TileReader::decode`], which writes the values
+    /// directly to their destination.
     fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
         if self.try_hold(index, frame_block)? {

@@ -198,14 +198,15 @@ impl FrameMark {
 /// Hint for errors about a frame whose length differs from the one that the header states.
 const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in the same columns";
 
-/// Returns the length of a frame that follows from the header, as text for messages.
+/// Returns, as text for messages, the length in bytes that a frame must have according to the header.
 fn expected_length(header: &StreamHeader) -> String {
     let names: Vec<&str> = header.varying.iter().map(Attributes::name).collect();
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 
-/// Describes a wrong frame length for messages: as another number of Gaussians if it is a multiple of the length of one
-/// Gaussian, else as impossible.
+/// Describes `length`, the wrong length of a frame in bytes, for messages: as the length of another number of Gaussians
+/// if it is a multiple of the length of one Gaussian, else as impossible. `header` determines the length of one
+/// Gaussian.
 fn found_length(header: &StreamHeader, length: u64) -> String {
     let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
     if length.checked_rem(per_gaussian) == Some(0) {
@@ -219,12 +220,12 @@ fn escaped(bytes: &[u8]) -> String {
     bytes.escape_ascii().to_string()
 }
 
-/// Returns the little-endian `u32` at byte `at`.
+/// Returns the little-endian `u32` that begins at index `at` of `bytes`.
 fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
 }
 
-/// Returns the little-endian `u64` at byte `at`.
+/// Returns the little-endian `u64` that begins at index `at` of `bytes`.
 fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
 }

@@ -42,8 +42,8 @@ struct CountingReader<R> {
 }
 
 impl<R: Read> FrameStream<R> {
-    /// Reads the header and the attributes that are constant over all frames. `name` is the name of the stream in error
-    /// messages.
+    /// Reads the header and the attributes that are constant over all frames from the source `from`. `name` is the name
+    /// of the stream in error messages.
     ///
     /// # Errors
     /// Fails if the header violates format/STREAM.md, if the stream ends early, or if the constant attributes need more
@@ -195,13 +195,15 @@ impl<R: Read> CountingReader<R> {
         Ok(all)
     }
 
-    /// Returns the error for an illegal field of the header or mark that begins at byte `start` of the stream.
+    /// Returns the error for an illegal field of the header or mark that begins at byte `start` of the stream. `frame`
+    /// is the number of the frame, if the mark precedes one.
     fn error(&self, start: u64, frame: Option<u32>, illegal: IllegalField) -> Error {
         let IllegalField { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 
-    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames.
+    /// Returns the error for a stream that ended before `expected` arrived. `frames` is the number of complete frames;
+    /// `None` if the header or the constant attributes are incomplete.
     fn ended(&self, expected: &str, frames: Option<u32>) -> Error {
         let found = match frames {
             None => "the end of the stream, before its first frame".to_owned(),

@@ -36,7 +36,7 @@ fn states(scene: &DemoScene) -> Vec<Gaussians> {
         .collect()
 }
 
-/// Reads a frame stream. Returns the time and all attributes of each frame.
+/// Reads the frame stream `bytes`. Returns the time and all attributes of each frame.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
     let mut state = stream.constant_attributes().clone();

@@ -178,8 +178,8 @@ fn chunks<'a>(map: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     Ok((text, binary.ok_or_else(|| cut(format!("{bytes} bytes in the binary chunk")))?))
 }
 
-/// Returns the index of the mesh that holds the only primitive with the extension, and this primitive. Fails if there
-/// is no such primitive or more than one.
+/// Finds the only primitive with the extension in the JSON text `document`. Returns the index of the mesh that holds
+/// it, and the primitive. Fails if there is no such primitive or more than one.
 fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Value)> {
     let list = |value: &'a Value| value.as_array().map_or(&[][..], Vec::as_slice);
     let meshes = list(&document["meshes"]).iter().enumerate();
@@ -195,8 +195,9 @@ fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Va
     }
 }
 
-/// Returns the factor by which x and y coordinates of the file are multiplied to get the axes of a PLY: −1 if the node
-/// of the mesh with index `mesh` has no transform, 1 if it turns the mesh by 180° about z. Fails for other transforms.
+/// Returns the sign by which x and y coordinates of the file are multiplied to convert them to the axes of a PLY.
+/// `mesh` is the index of the mesh in the JSON text `document`. The sign is −1 if the node of this mesh has no
+/// transform, and 1 if the node turns the mesh by 180° about z. Fails for other transforms.
 fn axes_of(document: &Value, mesh: usize, path: &Path) -> Result<f64> {
     let nodes = document["nodes"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(node) = nodes.iter().find(|node| node["mesh"] == mesh) else { return Ok(-1.0) };

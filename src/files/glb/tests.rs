@@ -12,12 +12,12 @@ use crate::files::tests::{assert_signs_reverse_axes, gaussians_with_sh};
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 
-/// Returns 30 Gaussians without any symmetry, with SH degree `degree`.
+/// Returns 30 Gaussians with SH degree `degree`, whose values differ along all axes.
 fn gaussians(degree: usize) -> Gaussians {
     gaussians_with_sh(30, degree)
 }
 
-/// Returns the JSON text of a file and the rest of its bytes.
+/// Returns two parts of the `.glb` file `bytes`: its parsed JSON text, and all bytes after this text.
 fn parts(bytes: &[u8]) -> (Value, &[u8]) {
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
     (serde_json::from_slice(&bytes[20..20 + length]).unwrap(), &bytes[20 + length..])

@@ -25,7 +25,7 @@ struct Attribute<'a> {
     /// Type of the values in glTF's terms, such as `VEC3`.
     kind: &'static str,
     component: u32,
-    /// Number of bytes per Gaussian.
+    /// Number of bytes that the attribute takes per Gaussian.
     bytes: usize,
     write: WriteValue<'a>,
 }
@@ -97,7 +97,7 @@ pub fn write_glb(state: &Gaussians, path: &Path) -> Result<()> {
     write().map_err(Error::io("write", path))
 }
 
-/// Returns the attributes of the primitive in the order of the file.
+/// Returns the attributes of the glTF primitive for the Gaussians `state`, in the order in which they are written.
 fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     let f32s = |values: &[f32], out: &mut Vec<u8>| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
     let attribute =
@@ -160,7 +160,7 @@ fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     all
 }
 
-/// Checks that scales and SH coefficients are finite. The caller has already checked the positions.
+/// Checks that the scales and SH coefficients of `state` are finite. The caller has already checked the positions.
 fn check_finite(state: &Gaussians, path: &Path) -> Result<()> {
     let scale = state.log_scale.planes().iter().position(|log| !(f64::from(*log).exp() as f32).is_finite());
     let sh = state.sh.planes().iter().position(|x| !x.is_finite());
@@ -178,8 +178,8 @@ fn reversed([x, y, z]: [f32; 3]) -> [f32; 3] {
     [-x, -y, z]
 }
 
-/// Returns the smallest and the largest coordinates of all positions, in the axes of glTF; zeros if there are no
-/// Gaussians.
+/// Returns the smallest and the largest coordinates of all positions in `state`, in the axes of glTF; zeros if there
+/// are no Gaussians.
 fn bounds(state: &Gaussians) -> [[f32; 3]; 2] {
     let (mut mins, mut maxs) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
     for row in 0..state.len() {

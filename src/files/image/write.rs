@@ -32,7 +32,8 @@ impl ImageFormat {
         }
     }
 
-    /// Returns the format that the extension of a file name stands for, ignoring case; `None` for other extensions.
+    /// Returns the format that the extension of the file name `path` stands for, ignoring case; `None` for other
+    /// extensions.
     pub fn from_path(path: &Path) -> Option<ImageFormat> {
         let extension = path.extension()?;
         [ImageFormat::Png, ImageFormat::Npy]
@@ -50,7 +51,7 @@ pub fn write_image(image: &Image, format: ImageFormat, path: &Path) -> Result<()
     write(&mut out, image, format).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// Returns the content of the file that [`write_image`] writes.
+/// Returns the content of the file that [`write_image`] writes for `image`.
 ///
 /// # Errors
 /// Fails if a PNG would have no pixels, which that format does not allow.

@@ -79,8 +79,8 @@ impl<R: Read> CheckedReader<R> {
         self.is_blank
     }
 
-    /// Returns bytes of the file around the position of the parser, for error messages: the last two that the parser
-    /// has taken, and at least 14 that follow unless the file ends before.
+    /// Returns bytes of the file around the position of the parser, for error messages: the last two bytes that the
+    /// parser has taken, and at least 14 bytes after them unless the file ends earlier.
     pub(super) fn around(&mut self) -> Vec<u8> {
         let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
         if around.len() < 16 && self.fill().is_ok() {
@@ -128,8 +128,9 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Stores `error`, which concerns the byte at index `at` of the buffer. Returns an error at once if the parser has
-    /// already taken all bytes before this byte.
+    /// Stores `error`, which concerns the byte at index `at` of the buffer. If the parser has already taken all bytes
+    /// before this byte, returns an I/O error, which stops the parser. Otherwise returns `Ok`: a later read returns the
+    /// I/O error, after the parser has taken these bytes.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
         // Otherwise pass on the bytes before it first: they may contain an earlier error that the parser reports.

@@ -16,7 +16,8 @@ use crate::files::open::open_file;
 pub(crate) struct JsonPlace {
     /// Index in [`ListSelection::keys`] of the key of the list; 0 if the document itself is the list.
     pub(crate) key: usize,
-    /// Index of the element in the list. Restarts at 0 if the key occurs again; the last list counts.
+    /// Index of the element in the list. If the key of the list occurs several times, the index restarts at 0 for each
+    /// list; only the last list is valid.
     pub(crate) index: usize,
     /// For nested lists, the index of the element in the inner list. `None` in two cases: at the end of an inner list
     /// (the value is then an empty list), and for an element that is not a list (the value is then this element).
@@ -48,7 +49,7 @@ pub(crate) fn each_element(
 }
 
 /// Calls `each` with the position and value of every element of the lists that `ask` selects in the JSON document in
-/// `file`.
+/// `file`. Error messages call the file `path`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
@@ -77,7 +78,8 @@ pub(crate) fn each_entry(
     read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
 }
 
-/// Selection of lists, callback for their elements, and place for an error of the callback.
+/// Data that the visitors share: the selection of lists, the callback `each` for their elements, and `stopped`, which
+/// stores an error of the callback.
 struct Lists<'a> {
     ask: ListSelection<'a>,
     each: &'a mut dyn FnMut(JsonPlace, SmallValue) -> Result<()>,
@@ -186,8 +188,9 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// Visitor of a list element that should be a list itself. Passes each element of this inner list to the callback and
-/// returns an empty list.
+/// Visitor of a list element that should be a list itself. Passes each element of this inner list to the callback
+/// `each`. Its value is then an empty list, because the callback has received all elements. If the list element is not
+/// a list, the value is this element or a description of it.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,
@@ -248,7 +251,8 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
     }
 }
 
-/// Visitor of an object; passes its entries to `each`.
+/// Visitor of an object. Passes the key and the value of every entry to `each`. Of each value, only the keys `wanted`
+/// are kept.
 struct Entries<'a> {
     wanted: &'a [&'a str],
     each: &'a mut dyn FnMut(&str, SmallValue) -> Result<()>,

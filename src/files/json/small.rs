@@ -28,7 +28,8 @@ pub(crate) enum SmallValue {
     /// First elements of a list, and the number of all its elements.
     List(Vec<SmallValue>, usize),
     Object(Object),
-    /// Value larger than any in a camera file. It is replaced by a description for messages.
+    /// Value that is not kept, because it has a longer text or more parts than any value in a camera file, or because
+    /// it is not of the expected kind. Holds only a description of the value, for messages.
     Large(Box<str>),
 }
 
@@ -40,7 +41,7 @@ pub(crate) struct Object {
 }
 
 impl Object {
-    /// Returns the value under `key`, or the last such value if the key is repeated.
+    /// Returns the value under `key`, or the last such value if the key is repeated; `None` without such a key.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
@@ -68,7 +69,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns a number as the nearest f64; `None` for other values.
+    /// Returns the nearest f64 if the value is a number; `None` for other values.
     pub(crate) fn as_f64(&self) -> Option<f64> {
         match self {
             SmallValue::Number(number) => number.as_f64(),
@@ -76,7 +77,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns a non-negative integer as u64; `None` for other values.
+    /// Returns the value as u64 if it is a non-negative integer; `None` for other values.
     pub(crate) fn as_u64(&self) -> Option<u64> {
         match self {
             SmallValue::Number(number) => number.as_u64(),
@@ -84,7 +85,7 @@ impl SmallValue {
         }
     }
 
-    /// Returns the value under `key` if this is an object with this key.
+    /// Returns the value under `key` if this is an object with this key; otherwise `None`.
     pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         match self {
             SmallValue::Object(object) => object.get(key),

@@ -1,8 +1,9 @@
 //! Writes a copy of a NumPy `.npz` archive with fewer Gaussians.
 //!
-//! Input: an open archive, the axis of each of its arrays that counts Gaussians, and the indices of the Gaussians to
-//! keep. Output: an archive with the same arrays in the same order and types, compressed as before. Memory: the values
-//! of one frame. The output bytes depend only on the content, because all files in the archive are dated 1980-01-01.
+//! Input: an open archive, for each of its arrays the axis whose index is the Gaussian, and the indices of the
+//! Gaussians to keep. Output: an archive with the same arrays in the same order and types, compressed as before.
+//! Memory: the values of one frame. The output bytes depend only on the content, because all files in the archive are
+//! dated 1980-01-01.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -29,10 +30,10 @@ pub(crate) enum GaussianAxis {
     Second,
 }
 
-/// Writes a copy of `template` to `path` that keeps only the Gaussians `kept`; `axis` returns the axis of an array that
-/// counts Gaussians. `change` may change the values of the kept Gaussians: it receives the name of the array, the frame
-/// and the values at this frame, and returns the indices of the Gaussians that it changed. The values of all others
-/// keep their bytes.
+/// Writes a copy of `template` to `path` that keeps only the Gaussians `kept`; `axis` returns, for an array, the axis
+/// whose index is the Gaussian. `change` may change the values of the kept Gaussians: it receives the name of the
+/// array, the frame and the values at this frame, and returns the indices of the Gaussians that it changed. The values
+/// of all others keep their bytes.
 ///
 /// # Errors
 /// Fails if an array cannot be decoded, if `change` fails, or if the file cannot be written.
@@ -103,8 +104,9 @@ pub(crate) fn write_like(
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-/// Returns the header of a NumPy array file, in version 1.0 of the format: a dictionary padded to a multiple of 64
-/// bytes.
+/// Returns the header of a NumPy array file for values of the type `descr` (NumPy's notation) in an array of the shape
+/// `shape`. If `is_fortran` is true, the first axis is the fastest. The header has version 1.0 of the format: a
+/// dictionary padded to a multiple of 64 bytes.
 fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
     let order = if is_fortran { "True" } else { "False" };
     let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();

@@ -23,7 +23,8 @@ struct AllocationCounter {
 }
 
 impl AllocationCounter {
-    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them.
+    /// Counts `bytes` that are about to be allocated. `at` is the position in the pickle that requires them. Fails if
+    /// the memory limit would be exceeded.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
@@ -33,8 +34,8 @@ impl AllocationCounter {
         Ok(())
     }
 
-    /// Reserves memory for `more` elements of `list`. While the list grows, the old and the new buffer exist together;
-    /// both are counted.
+    /// Reserves memory for `more` elements of `list`. Fails if the memory limit would be exceeded; the error names the
+    /// byte `at` of the pickle. While the list grows, the old and the new buffer exist together; both are counted.
     fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
         let (needed, old) = (list.len() + more, list.capacity());
         if needed > old {
@@ -196,8 +197,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Executes an instruction that pushes a number, a text or other bytes without structure. Refuses unknown
-    /// instructions.
+    /// Executes the instruction `instruction`, found at byte `start`, if it pushes a number, a text or other bytes
+    /// without structure. Fails for other instructions.
     fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
         match instruction {
             b'N' => self.push(Node::None, 0)?,
@@ -232,7 +233,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node to the object tree and pushes it onto the stack.
+    /// Adds `node` to the object tree and pushes it onto the stack. `depth` is its nesting depth, 0 for a scalar.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
         self.allocations.reserve(&mut self.nodes, 1, self.at)?;
         self.allocations.reserve(&mut self.depths, 1, self.at)?;
@@ -243,14 +244,14 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Adds a node to the object tree and inserts it into the stack at index `place`.
+    /// Adds `node` to the object tree and inserts it into the stack at index `place`.
     fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
         self.push(node, 1)?;
         self.stack[place..].rotate_right(1);
         Ok(())
     }
 
-    /// Pushes an integer onto the stack, with the byte range of its instruction, which began at `start`.
+    /// Pushes the integer `value` onto the stack, with the byte range of its instruction, which began at byte `start`.
     fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
@@ -269,7 +270,8 @@ impl<'a> PickleMachine<'a> {
         Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
-    /// Begins a container by recording the present height of the stack.
+    /// Begins a container by recording the present height of the stack. `start` is the byte at which the instruction
+    /// began. Fails if too many containers are open.
     fn mark(&mut self, start: usize) -> Result<(), Wrong> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
@@ -279,7 +281,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Returns the stack index at which the innermost open container begins.
+    /// Returns the stack index at which the innermost open container begins; 0 if no container is open.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
@@ -298,7 +300,8 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index of the first of the last `count` values. Fails unless there is another value below them.
+    /// Returns the stack index at which the top `count` values begin. Fails unless the innermost open container has at
+    /// least one more value on the stack, below these values.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
@@ -309,7 +312,8 @@ impl<'a> PickleMachine<'a> {
         Ok(mark.min(self.stack.len()))
     }
 
-    /// Replaces the values from stack index `first` on by one container that holds them.
+    /// Replaces the values from stack index `first` up to the top by one container with these elements. `make` builds
+    /// the node of the container from the elements.
     fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
         let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
@@ -322,8 +326,9 @@ impl<'a> PickleMachine<'a> {
         self.push(make(elements), depth)
     }
 
-    /// Returns the container that lies on the stack directly below index `first`. Raises the depth of the container
-    /// above the depths of the values from `first` on.
+    /// Returns the node index of the value directly below stack index `first`: the container to which the values from
+    /// `first` up to the top will be added. Raises the nesting depth of this container above their depths. Fails if the
+    /// innermost open container has no value there, or if the container would be nested too deep.
     fn container(&mut self, first: usize) -> Result<usize, Wrong> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
@@ -332,7 +337,9 @@ impl<'a> PickleMachine<'a> {
         Ok(top)
     }
 
-    /// Removes the values from stack index `first` on and appends them to the list below them.
+    /// Removes the values from stack index `first` up to the top and appends them to the list directly below them on
+    /// the stack. If the value below is an object that behaves like a list, the removed values are discarded. Fails if
+    /// it is neither; the error names byte `start` of the pickle.
     fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
@@ -347,7 +354,9 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Removes the keys and values from stack index `first` on and adds them to the dict below them.
+    /// Removes the keys and values from stack index `first` up to the top and adds them to the dict directly below them
+    /// on the stack, or to the object there that behaves like a dict. Fails if the value below is neither, or if a key
+    /// has no value; the error names byte `start` of the pickle.
     fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
         let top = self.container(first)?;
         let (pairs, rest) = self.stack[first..].as_chunks::<2>();
@@ -374,7 +383,8 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Pushes the node that is stored in the memo under `key`.
+    /// Pushes the node that is stored in the memo (table of nodes for later reference) under `key`. Fails if there is
+    /// none; the error names byte `start` of the pickle.
     fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
         let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;
@@ -398,8 +408,9 @@ impl<'a> PickleMachine<'a> {
         Ok(&self.bytes[self.at - count..self.at])
     }
 
-    /// Reads an integer of variable length and pushes it. Its length in bytes is stored before it, in `length_bytes`
-    /// bytes. Integers that do not fit into `i64` become opaque nodes.
+    /// Reads an integer of variable length and pushes it onto the stack. Its length in bytes is stored before it, in
+    /// `length_bytes` bytes; its instruction began at byte `start`. Integers that do not fit into `i64` become opaque
+    /// nodes.
     fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let digits = self.take_slice(length)?;
@@ -442,7 +453,8 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Opaque, 0)
     }
 
-    /// Executes GLOBAL: reads the module and the name of a function or class as two lines and pushes a node.
+    /// Executes the instruction GLOBAL, which began at byte `start`: reads the module and the name of a function or
+    /// class as two lines and pushes a node for this function or class.
     fn global(&mut self, start: usize) -> Result<(), Wrong> {
         let (module, name) = (self.line()?, self.line()?);
         self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
@@ -454,8 +466,9 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// Executes STACK_GLOBAL: replaces two texts on the stack, a module and a name, by a node. A long text may be used
-    /// many times, so each copy of it is counted as memory.
+    /// Executes the instruction STACK_GLOBAL, which began at byte `start`: replaces two texts on the stack, a module
+    /// and a name, by a node for the function or class with this name. A long text may be used many times, so each copy
+    /// of it is counted as memory.
     fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {

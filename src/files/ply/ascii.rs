@@ -156,7 +156,7 @@ fn place(element: &Element) -> String {
     format!("element {}", element.name)
 }
 
-/// Returns the error for `word` in a text PLY file, which is not a number of the type of `property`.
+/// Returns the error for `word` in line `line` of a text PLY file, which is not a number of the type of `property`.
 fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Error {
     let expected = format!("a number of type {} for property {}", property.scalar.name(), quoted(&property.name));
     let word = String::from_utf8_lossy(&word[..word.len().min(60)]);

@@ -256,7 +256,7 @@ impl PlyHeader {
         out
     }
 
-    /// Returns the element `vertex`, which holds the Gaussians.
+    /// Returns the element `vertex`, which holds the Gaussians; `None` if the file has no such element.
     pub(crate) fn vertex(&self) -> Option<&Element> {
         self.elements.iter().find(|element| element.name == "vertex")
     }

@@ -24,7 +24,8 @@ pub(crate) enum PlaneSource {
     Thin,
 }
 
-/// Sources of the planes (components) of every attribute, in the order of [`Gaussians`](crate::model::Gaussians).
+/// Layout of a row: for each plane (component) of every attribute, the source of its values. The attributes are in the
+/// order of [`Gaussians`](crate::model::Gaussians).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
     pub(crate) sh_degree: usize,
@@ -68,7 +69,7 @@ impl PlyLayout {
         Ok(PlyLayout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
     }
 
-    /// Returns the sources of the planes (components) of the attribute `column`.
+    /// Returns the source of the values of each plane (component) of the attribute `column`.
     pub(crate) fn planes(&self, column: Attributes) -> &[PlaneSource] {
         let index = Attributes::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
@@ -87,7 +88,8 @@ pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<S
     (coefficient < new_count).then(|| format!("f_rest_{}", channel * new_count + coefficient))
 }
 
-/// Returns the error for the missing property `name`, with a hint about the kind of file.
+/// Returns the error for the property `name`, which the element `vertex` lacks. A hint says what kind of file it may
+/// be.
 fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
     let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();

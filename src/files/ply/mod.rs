@@ -337,7 +337,7 @@ impl Ply {
     }
 }
 
-/// Returns the element `vertex`, which holds the Gaussians. Fails if there is none.
+/// Returns the element `vertex` of `header`, which holds the Gaussians. Fails if there is none.
 fn vertex_element<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
     header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
 }
@@ -386,7 +386,8 @@ fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Rang
     Ok(rows)
 }
 
-/// Reads the values of one property into `out`, from the rows at the byte offsets `starts` in `rows`.
+/// Reads the values of `property` into `out`, from the rows that begin at the byte offsets `starts` in `rows`.
+/// `big_endian` states the byte order of the rows.
 pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
     let at = property.offset;
     match (property.scalar, big_endian) {
@@ -407,7 +408,8 @@ pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big
     }
 }
 
-/// Converts, for each row, the `W` bytes at `offset` in the row to f32 and writes the results to `out`.
+/// Converts, for each row, the `W` bytes at `offset` in the row to f32 by `convert`, and writes the results to `out`.
+/// `starts` holds the byte offset of each row in `rows`.
 fn fill<const W: usize>(
     rows: &[u8],
     starts: &[usize],

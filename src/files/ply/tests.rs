@@ -81,8 +81,8 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// Returns the Gaussians that [`file`] writes, assembled by property name and so independently of the layout code under
-/// test.
+/// Returns the Gaussians that [`file`] writes for the same `count` and `names`. They are assembled by property name, so
+/// independently of the layout code under test.
 fn expected(count: usize, names: &[String]) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {

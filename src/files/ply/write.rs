@@ -15,7 +15,7 @@ use crate::files::ply::{
 };
 use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// One row (Gaussian) of a compressed PLY file.
+/// One row (Gaussian) of the PLY file of a compressed model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputRow {
     /// Index of the Gaussian in the original file (template) whose row is copied: the Gaussian itself, or the leader
@@ -39,12 +39,15 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutputRow> {
 /// (properties, order, types, comments, line ends). Only the number of Gaussians changes, and SH coefficients above
 /// `sh_degree` are removed, so that `f_rest_*` are renumbered.
 ///
-/// A row without a proxy keeps the bytes of the template, except that `change` (parameter deltas) is added to its
-/// values; zeros leave the bytes unchanged. A row with a proxy (Gaussian that replaces a merged cluster) is a copy of
-/// the row of the cluster's leader (most important member) in which position, rotation, log_scale, opacity_logit and sh
-/// are replaced. Each is converted to the type of its property (integers: nearest, saturated). Normals and extra
-/// properties are those of the leader. A template without `scale_2` cannot store the third scale of a proxy, so callers
-/// must order the axes of proxies with the largest first.
+/// - A row without a proxy keeps the bytes of the template, except that `change` (parameter deltas) is added to its
+///   values. A delta of 0 leaves the bytes unchanged.
+/// - A row with a proxy (Gaussian that replaces a merged cluster) is a copy of the row of the cluster's leader (most
+///   important member). In this copy, position, rotation, log_scale, opacity_logit and sh are replaced by the values of
+///   the proxy, converted to the types of the properties (integers: nearest, saturated). Normals and extra properties
+///   are those of the leader.
+///
+/// A template without `scale_2` cannot store the third scale of a proxy, so callers must order the axes of proxies with
+/// the largest first.
 ///
 /// Other elements of the template and the bytes after the last element are copied. If the template is a text file, the
 /// output is little-endian binary. Otherwise, writing all rows in order without proxies and changes reproduces the
@@ -114,8 +117,8 @@ pub(crate) fn write_rows_like(
     })
 }
 
-/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as comment lines (line
-/// breaks in them become spaces). f32 values keep their bits.
+/// Writes `gaussians` to the file `path` in the INRIA layout: binary little-endian f32, zero normals, `comments` as
+/// comment lines (line breaks in them become spaces). f32 values keep their bits.
 ///
 /// # Errors
 /// Fails if the file cannot be written, or if the number of SH coefficients belongs to no degree from 0 to 3.
@@ -123,8 +126,8 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     write_inria_with(gaussians, comments, &[], path)
 }
 
-/// Writes `gaussians` like [`write_inria`], with the float properties `more` appended to each row. Each of these
-/// properties is given by its name and one value per Gaussian.
+/// Writes `gaussians` and `comments` like [`write_inria`], with the float properties `more` appended to each row. Each
+/// of these properties is given by its name and one value per Gaussian.
 ///
 /// # Errors
 /// Fails like [`write_inria`].
@@ -164,7 +167,7 @@ pub(crate) fn write_inria_with(
 }
 
 /// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`,
-/// followed by the properties `more`.
+/// followed by the properties `more`. `comments` become comment lines.
 fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl Iterator<Item = &'a str>) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
@@ -237,7 +240,8 @@ pub(crate) fn write_rows(
     })
 }
 
-/// Returns the byte ranges of a row that hold extra properties (those that are no attribute of a Gaussian).
+/// Returns the byte ranges, in a row with the properties `properties`, of the extra properties: those that `layout`
+/// does not use for an attribute of a Gaussian.
 fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
     for column in Attributes::all().iter() {
@@ -286,6 +290,7 @@ fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &
 }
 
 /// Replaces the attributes in the bytes `row` of a row by those of the Gaussian with index `proxy` in `proxies`.
+/// `layout` locates the attributes, and `big_endian` states the byte order.
 fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
@@ -296,7 +301,8 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
     }
 }
 
-/// Adds the parameter delta (change of the stored values) of output row `place` to the bytes `row` of this row.
+/// Adds the parameter delta `change` (change of the stored values) of output row number `place` to `row`, the bytes of
+/// this row, which is laid out as in `template`.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.attributes().iter() {
@@ -310,14 +316,16 @@ fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     }
 }
 
-/// Returns the value of `property` in the bytes `row` of a row, rounded to the nearest f32.
+/// Returns the value of `property` in the bytes `row` of a row, rounded to the nearest f32. `big_endian` states the
+/// byte order.
 pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
     let mut value = [0.0];
     read_plane(row, &[0], property, big_endian, &mut value);
     value[0]
 }
 
-/// Writes `value` as `property` into the bytes `row` of a row, in the type of the property.
+/// Writes `value` as `property` into the bytes `row` of a row, in the type of the property. `big_endian` states the
+/// byte order.
 pub(crate) fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
     let rounded = value.round();
     let mut bytes = [0; 8];

@@ -59,8 +59,8 @@ impl Codebook {
         &self.entries
     }
 
-    /// Returns the index of the entry nearest to `value`, the lower one of two equally near ones. The entries must be
-    /// sorted.
+    /// Returns the index of the entry nearest to `value`. If two entries are equally near, returns the lower index. The
+    /// entries must be sorted.
     pub fn nearest(&self, value: f32) -> u8 {
         let after = self.entries.partition_point(|&entry| entry < value).min(self.entries.len() - 1);
         let distance = |at: usize| (f64::from(self.entries[at]) - f64::from(value)).abs();
@@ -74,7 +74,8 @@ impl Codebook {
     }
 }
 
-/// Number, smallest and largest of the values in one of the equal bins of the range of values.
+/// One of the bins of equal width into which the range of the values is divided: the number of values in the bin, the
+/// smallest and the largest of them.
 #[derive(Debug, Clone, Copy)]
 struct Bin {
     count: u64,
@@ -97,7 +98,7 @@ fn few_different(values: impl Iterator<Item = f32>) -> Option<Vec<f32>> {
     Some(padded(different))
 }
 
-/// Repeats the last entry up to 256 entries; without entries, returns zeros.
+/// Returns `entries` extended to 256 numbers: the last entry is repeated, and without entries all numbers are 0.
 fn padded(mut entries: Vec<f32>) -> Vec<f32> {
     let last = entries.last().copied().unwrap_or(0.0);
     entries.resize(ENTRIES, last);

@@ -104,8 +104,9 @@ pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     keys.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Returns two images, of the low and of the high bytes of 16-bit numbers. `codes` returns the three numbers (x, y, z)
-/// of the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`: x, y and z are red, green and blue.
+/// Returns two images of size `size`, of the low and of the high bytes of 16-bit numbers. `codes` returns the three
+/// numbers (x, y, z) of the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`: x, y and z are red,
+/// green and blue.
 pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u16; 3]) -> [RgbaImage; 2] {
     [0, 1].map(|byte| {
         size.image(order, |row| {
@@ -121,8 +122,8 @@ pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
     [0, 1, 2].map(|c| u16::from_le_bytes([low[c], high[c]]))
 }
 
-/// Returns the ranges of the logarithmic coordinates of `position`, and the two images of their low and their high
-/// bytes. Pixel i holds the Gaussian `order[i]`.
+/// Returns the ranges of the logarithmic coordinates of `position`, and two images of size `size`: the low and the high
+/// bytes of the coordinates as 16-bit numbers. Pixel i holds the Gaussian `order[i]`.
 pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u32]) -> (Range3, [RgbaImage; 2]) {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
     let range = Range3::from_rows(order.iter().map(|&row| logs(row as usize)));
@@ -133,8 +134,8 @@ pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u3
     (range, images)
 }
 
-/// Returns the position, in scene units, whose logarithmic coordinates have the low bytes `low` and the high bytes
-/// `high`.
+/// Returns the position, in scene units, that is stored as the low bytes `low` and the high bytes `high` of its
+/// logarithmic coordinates within `range`.
 pub fn decode_position(range: &Range3, low: [u8; 4], high: [u8; 4]) -> [f32; 3] {
     let codes = decode_16_bit(low, high);
     [0, 1, 2].map(|axis| from_log_coordinate(range.decode(axis, codes[axis])) as f32)
@@ -157,7 +158,8 @@ pub fn encode_rotation(q: [f32; 4]) -> [u8; 4] {
     pixel
 }
 
-/// Returns the unit quaternion wxyz that a pixel stands for; `None` if its alpha is not 252, 253, 254 or 255.
+/// Returns the unit quaternion wxyz that `pixel` stands for; `None` if the alpha of the pixel is not 252, 253, 254 or
+/// 255.
 pub fn decode_rotation(pixel: [u8; 4]) -> Option<[f32; 4]> {
     let largest = usize::from(pixel[3].checked_sub(FIRST_ROTATION_TAG)?);
     let mut q = [0.0; 4];
@@ -169,8 +171,9 @@ pub fn decode_rotation(pixel: [u8; 4]) -> Option<[f32; 4]> {
     Some(q.map(|x| (x / length) as f32))
 }
 
-/// Returns the image of the three-component `values`. Each component is stored as its index in `codebook`, and `alpha`
-/// returns the alpha for the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`.
+/// Returns the image of size `size` for the three-component `values`. Each component is stored as its index in
+/// `codebook`, and `alpha` returns the alpha for the Gaussian with a given index. Pixel i holds the Gaussian
+/// `order[i]`.
 pub fn encode_by_codebook(
     values: &AttributeValues,
     codebook: &Codebook,
@@ -225,8 +228,8 @@ pub fn palette_entry(image: &RgbaImage, label: usize) -> Option<&[[u8; 4]]> {
     image.pixels.get(label.checked_mul(coefficients)?..)?.get(..coefficients)
 }
 
-/// Returns the image of the palette labels of the Gaussians, with 16 bits each in red and green. Pixel i holds the
-/// Gaussian `order[i]`.
+/// Returns the image of size `size` for the palette labels of the Gaussians, with 16 bits each in red and green. Pixel
+/// i holds the Gaussian `order[i]`.
 pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImage {
     size.image(order, |row| {
         let [low, high, ..] = labels[row].to_le_bytes();

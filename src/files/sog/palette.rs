@@ -19,7 +19,7 @@ const SAMPLES_PER_GROUP: usize = 64;
 pub struct Palette {
     /// Number of components of a vector (palette entry).
     pub width: usize,
-    /// Entries one after the other, `width` numbers each.
+    /// Palette entries, one after another, `width` numbers each.
     pub centroids: Vec<f32>,
     /// Index of the palette entry of each Gaussian.
     pub labels: Vec<u32>,
@@ -142,7 +142,8 @@ fn k_means(vectors: &[f32], width: usize, k: usize) -> Vec<f32> {
     centroids
 }
 
-/// Returns the index of the centroid nearest to `vector`, the first of several equally near ones.
+/// Returns the index of the centroid nearest to `vector` among `centroids` (`width` components each), the first of
+/// several equally near ones.
 fn nearest(vector: &[f32], centroids: &[f32], width: usize) -> u32 {
     let (mut best, mut least) = (0, f32::INFINITY);
     for (at, centroid) in centroids.chunks_exact(width).enumerate() {

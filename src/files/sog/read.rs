@@ -34,11 +34,11 @@ const IMAGES: u64 = 6;
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
 /// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
-/// Largest magnitude of a stored SH coefficient and of the logarithm of a scale.
+/// Largest accepted magnitude of a stored SH coefficient and of the logarithm of a scale.
 const MAX_CODEBOOK_VALUE: f32 = 1e30;
 
-/// Reads the Gaussians of the `.sog` file at `path`, or of a folder with the files of such an archive, in the order of
-/// the file.
+/// Reads the Gaussians of the `.sog` file at `path`, in the order in which the file holds them. `path` may also be a
+/// folder with the files of such an archive.
 ///
 /// # Errors
 /// Fails if the file is damaged, has another version than 2, or needs more memory than `memory`.
@@ -48,7 +48,8 @@ pub fn read_sog(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     decode(&parse(&text, path)?, &mut files, path, memory)
 }
 
-/// Decodes the Gaussians that `meta` describes from the images in `files`, in the order of the file.
+/// Decodes the Gaussians that `meta` describes from the images in `files`, in the order of the pixels. Messages call
+/// the archive `path`.
 ///
 /// # Errors
 /// Fails if an image is missing or damaged, or if more memory than `memory` is needed.
@@ -239,9 +240,9 @@ fn codebook(entries: &[Option<f32>], path: &Path, what: &str) -> Result<Codebook
 /// Decoded palette of SH coefficients above degree 0.
 struct DecodedPalette {
     degree: usize,
-    /// Number of entries.
+    /// Number of palette entries.
     count: usize,
-    /// Number of values per entry: red, green and blue of each coefficient.
+    /// Number of values per palette entry: red, green and blue of each SH coefficient above degree 0.
     width: usize,
     values: Vec<f32>,
 }

@@ -19,7 +19,7 @@ use crate::limits::ReadLimit;
 use crate::model::{Attributes, Gaussians, color_from_sh, opacity};
 use crate::passes::gather_all;
 
-/// Returns `count` Gaussians without any symmetry, with SH degree `degree`.
+/// Returns `count` Gaussians with SH degree `degree`, whose values differ along all axes.
 fn gaussians(count: usize, degree: usize) -> Gaussians {
     let mut state = gaussians_with_sh(count, degree);
     let plain = gather_all(&DemoScene::new(count, 1), 0, Attributes::SH).unwrap();
@@ -116,13 +116,13 @@ fn archive_is_the_one_that_strict_players_read() {
     }
 }
 
-/// Returns the `meta.json` of an archive.
+/// Returns the `meta.json` of the archive `bytes`.
 fn meta_of(bytes: &[u8]) -> Value {
     let mut archive = ZipArchive::new(Cursor::new(bytes)).unwrap();
     serde_json::from_reader(archive.by_name(META_FILE).unwrap()).unwrap()
 }
 
-/// Returns a copy of an archive with another `meta.json`; `edit_file` may change the other files.
+/// Returns a copy of the archive `bytes` with `meta` as its `meta.json`; `edit_file` may change the other files.
 fn with_meta(bytes: &[u8], meta: &[u8], edit_file: impl Fn(&str, &mut Vec<u8>)) -> Vec<u8> {
     let mut archive = ZipArchive::new(Cursor::new(bytes)).unwrap();
     let mut out = ZipWriter::new(Cursor::new(Vec::new()));

@@ -28,7 +28,7 @@ const MAX_LOG_SCALE: f32 = 20.0;
 /// Number of palette entries for the smallest files.
 const LEAST_PALETTE: usize = 1024;
 
-/// Largest differences between the Gaussians and the values in a written file.
+/// Errors of a written file: differences between the Gaussians and the values in the file.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SogErrors {
     /// Largest error of a position, in scene units.
@@ -161,7 +161,8 @@ pub(crate) fn encode(
     Ok((meta, images, SogErrors { position: accuracy.position_error(), sh }))
 }
 
-/// Adds the images of the SH coefficients above degree 0 to `images`. Returns the member `shN` of `meta.json`, and the
+/// Adds the images of the SH coefficients of `state` above degree 0 to `images`. The image of the palette labels has
+/// the size `size`, and its pixel i holds the Gaussian `order[i]`. Returns the member `shN` of `meta.json`, and the
 /// root of the mean squared error of these coefficients; `None` if there are no such coefficients.
 fn encode_sh(
     state: &Gaussians,

@@ -36,7 +36,8 @@ const KEPT_ZERO_QUATERNION: Defect = ("zero quaternion", false, "taken as the id
 const INFINITE_WIDTH: Defect =
     ("infinite temporal width", false, "visible at every time, as in players; written as the largest half");
 
-/// Returns the defects of a row (Gaussian).
+/// Returns the defects of a row (Gaussian). `zero_rotation` decides whether a quaternion that is 0 at every time drops
+/// the row.
 fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
     let is_finite = |values: &[f32]| values.iter().all(|x| x.is_finite());
     let others = [&row.motion[..], &row.rotation, &row.omega, &row.scale, &[row.center]];
@@ -61,7 +62,8 @@ pub(crate) fn has_zero_quaternion(row: &SplatvGaussian) -> bool {
 }
 
 /// Checks every row (Gaussian) of `file`. Returns the defects found and, if some rows have to be left out, the indices
-/// of the other rows in increasing order.
+/// of the other rows in increasing order. `zero_rotation` decides whether rows whose quaternion is 0 at every time are
+/// left out.
 ///
 /// # Errors
 /// Fails if all rows of the file would be left out.
@@ -110,7 +112,7 @@ mod tests {
     use super::*;
     use crate::files::splatv::write::{encode_words, write_splatv};
 
-    /// Returns a row (Gaussian) without defects.
+    /// Returns a row (Gaussian) without defects. `x` is its x coordinate.
     fn sound(x: f32) -> SplatvGaussian {
         SplatvGaussian {
             position: [x, 0.5, 2.0],

@@ -26,10 +26,12 @@ const VISIBLE_WIDTHS: f64 = 2.36;
 /// Number of texels of the texture that store one Gaussian.
 const TEXELS_PER_GAUSSIAN: usize = 4;
 
-/// Returns the 32-bit words that store the Gaussian `row` in a file for viewers. Values beyond the range of half
-/// precision become the largest finite value; NaN becomes 0. If half precision would turn the quaternion and its rate
-/// of change into 0, both are scaled so that the quaternion has length 1, or the quaternion becomes the identity,
-/// because players divide by the length of the quaternion.
+/// Returns the 32-bit words that store the Gaussian `row` in a file for viewers.
+///
+/// - Values beyond the range of half precision become the largest finite value; NaN becomes 0.
+/// - Players divide by the length of the quaternion, so it must not be stored as 0 at every time. If half precision
+///   would turn the quaternion and its rate of change into 0, both are divided by the length of the quaternion. If this
+///   length is itself 0 or too small to divide by, the quaternion becomes the identity instead.
 pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
@@ -71,8 +73,8 @@ pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
 }
 
 /// Adds the coding errors of Gaussian `id` to `to`: the differences between `row` and the values that a file stores for
-/// it. The position error includes the error of the path over the times around its center at which the Gaussian is
-/// visible.
+/// it. The position error includes the error of the path at the times at which the Gaussian is visible, around the
+/// center of its temporal window.
 pub fn add_errors(row: &SplatvGaussian, id: usize, to: &mut CodingErrors) {
     let held = SplatvGaussian::from_words(&encode_words(row));
     let drawn = |row: &SplatvGaussian| RenderedAttributes {
@@ -149,7 +151,8 @@ mod tests {
     use super::*;
     use crate::files::splatv::Splatv;
 
-    /// Returns a Gaussian whose values are exact in half precision or as bytes, as they are stored.
+    /// Returns a Gaussian that depends on `seed`. Its values are exact in half precision or as bytes, as they are
+    /// stored.
     fn row(seed: u16) -> SplatvGaussian {
         let value = |k: u16| f16::from_bits(0x3000 + (seed.wrapping_mul(31).wrapping_add(k * 977)) % 0x1000).to_f32();
         let byte = |k: u16| f64::from((seed.wrapping_mul(7).wrapping_add(k)) % 255 + 1) / 255.0 + 1e-4;

@@ -22,7 +22,7 @@ const MAX_DEGREE: u8 = 4;
 const HAS_EXTENSIONS: u8 = 2;
 /// Maximum number of bytes between the header and the table of streams of version 4.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;
-/// Largest zstd window that is accepted when an array is decoded, as a power of two in bytes.
+/// Base-2 logarithm of the largest zstd window, in bytes, that is accepted when an array is decoded.
 const MAX_WINDOW: u32 = 24;
 
 /// Values that the header of a file declares.
@@ -47,7 +47,8 @@ struct Arrays {
 }
 
 impl Arrays {
-    /// Returns the arrays in the order of the file, each with its name and its number of bytes per Gaussian.
+    /// Returns the arrays in the order of the file. Each array comes with its name and its number of bytes per
+    /// Gaussian, which `header` determines.
     fn list(&mut self, header: &Header) -> [(&'static str, usize, &mut Vec<u8>); 6] {
         let rotation = if header.version == 2 { 3 } else { 4 };
         let harmonics = 3 * (sh_coefficients(header.sh_degree) - 1);
@@ -273,7 +274,7 @@ mod tests {
     use crate::files::tests::gaussians_with_sh;
     use crate::model::{AttributeValues, opacity};
 
-    /// Returns Gaussians whose attributes have no symmetry, with SH degree `degree`.
+    /// Returns 200 Gaussians with SH degree `degree`, whose values differ along all axes.
     fn gaussians(degree: usize) -> Gaussians {
         gaussians_with_sh(200, degree)
     }

@@ -39,8 +39,8 @@ fn tuple(items: &[i32]) -> Vec<u8> {
     [b"(".to_vec(), items.iter().flat_map(|&i| int(i)).collect(), b"t".to_vec()].concat()
 }
 
-/// Returns the pickle that torch.save writes for an OrderedDict of tensors, but without a memo (table for repeated
-/// values).
+/// Returns the pickle that torch.save writes for an OrderedDict of the tensors `entries`, but without a memo (table for
+/// repeated values).
 fn pickle(entries: &[Entry]) -> Vec<u8> {
     let mut out = b"\x80\x02ccollections\nOrderedDict\n)R(".to_vec();
     for (key, e) in entries.iter().enumerate() {

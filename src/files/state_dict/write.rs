@@ -19,13 +19,13 @@ use crate::files::zip_output::ZipOutput;
 /// Alignment in bytes of the values of each tensor in the file, as in files that PyTorch writes.
 const ALIGNMENT: u16 = 64;
 
-/// Tensor in the layout in which it is stored: the element with indices `i` is value `offset + Σ i·stride` of `values`.
-/// Strides may be 0, and elements may share values.
+/// Tensor in the layout in which it is stored: the element with indices `i` is value number `offset + Σ i·stride` of
+/// `values`. Strides may be 0, and several elements may be the same stored value.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct StoredTensor {
     /// Name of the tensor; the keys of nested dicts are joined by dots.
     pub(crate) name: String,
-    /// Stored values, which the elements refer to.
+    /// Stored values. Each element of the tensor is one of them.
     pub(crate) values: TensorValues,
     /// Index in `values` of the first element.
     pub(crate) offset: usize,
@@ -79,7 +79,7 @@ impl TensorValues {
 }
 
 impl StoredTensor {
-    /// Returns a tensor whose `values` are contiguous, with the last axis fastest.
+    /// Returns the tensor `name` of the shape `shape`, whose `values` are contiguous, with the last axis fastest.
     pub(crate) fn dense(name: String, shape: Vec<usize>, values: TensorValues) -> StoredTensor {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
@@ -89,7 +89,7 @@ impl StoredTensor {
     }
 }
 
-/// Writes a state dict of `tensors`, in the given order.
+/// Writes a state dict of `tensors`, in the given order, to the file `path`.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
@@ -240,7 +240,8 @@ mod tests {
         }
     }
 
-    /// Returns the name, offset and content of every file in a zip archive, read by the definition of the zip format.
+    /// Returns the name, offset and content of every file in the zip archive `bytes`, read by the definition of the zip
+    /// format.
     fn entries(bytes: &[u8]) -> Vec<(String, usize, Vec<u8>)> {
         let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]) as usize;
         let long = |at: usize| word(at) | word(at + 2) << 16;

@@ -34,7 +34,8 @@ pub fn is_tsog(path: &Path) -> bool {
     meta().is_ok_and(|meta| meta["version"] == VERSION)
 }
 
-/// Reads the `.tsog` file at `path`, in the order of the file.
+/// Reads the `.tsog` file at `path`: the Gaussians, in the order in which the file holds them, and the times at which
+/// players show them.
 ///
 /// # Errors
 /// Fails if the file is damaged, has another version than 4, or needs more memory than `memory`.
@@ -108,8 +109,8 @@ fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
     Ok(frames)
 }
 
-/// Reads the images of the timeline `entry` and writes the frame or the time window of each Gaussian to `own`, its
-/// format-specific parameters.
+/// Reads the images of the timeline `entry` from `files`. Writes the frame or the time window of each Gaussian to
+/// `own`, the format-specific parameters of the Gaussians.
 fn read_timeline(
     entry: &TimelineEntry,
     timeline: Timeline,
@@ -143,8 +144,8 @@ fn read_timeline(
     Ok(())
 }
 
-/// Reads the images of the velocities that `entry` describes and writes the velocity of each Gaussian to `own`, its
-/// format-specific parameters.
+/// Reads the images of the velocities that `entry` describes from `files`. Writes the velocity of each Gaussian to
+/// `own`, the format-specific parameters of the Gaussians.
 fn read_velocities(
     entry: &Velocity,
     files: &mut Files,
@@ -194,8 +195,9 @@ fn is_f32(value: f64) -> bool {
     (value as f32).is_finite()
 }
 
-/// Returns the number, the rate and the times of the frames. The times are those of the sequence that was converted if
-/// the file states them, else from 0 to 1.
+/// Returns the number, the rate and the times of the frames of the archive described by `meta`, whose Gaussians have
+/// the visibility `timeline`. The times are those of the sequence that was converted if the file states them, else from
+/// 0 to 1.
 fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTimes> {
     let playback = meta.playback.as_ref();
     let number = |name: &str, value: Option<f64>| match value {

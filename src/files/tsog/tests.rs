@@ -16,12 +16,12 @@ use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
 
 const COUNT: usize = 40;
 
-/// Returns a number from −0.5 to 0.5 that differs for other arguments.
+/// Returns a pseudorandom number from −0.5 to 0.5 that depends on `seed` and `i`.
 fn noise(seed: usize, i: usize) -> f32 {
     ((i * 379 + seed * 1013) % 997) as f32 / 997.0 - 0.5
 }
 
-/// Returns Gaussians with the visibility `timeline`.
+/// Returns Gaussians with the visibility `timeline` and the SH degree `sh_degree`.
 fn timed(timeline: Timeline, sh_degree: usize) -> TimedGaussians {
     let mut gaussians = Gaussians::zeros(COUNT, sh_degree);
     let mut own = AttributeValues::zeros(timeline.param_count(), COUNT);

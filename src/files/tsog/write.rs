@@ -21,8 +21,8 @@ const MAX_DEVIATION: f64 = 8.0;
 const MAX_OPACITY: f64 = 1.0 - 1e-6;
 /// Maximum number of frames of a timeline of type 0, in which each Gaussian is seen in a single frame.
 pub const MAX_FRAMES: usize = 1 << 16;
-/// Maximum position errors up to which velocities are stored with 8 bits, as fractions of the middle one of a
-/// Gaussian's three scales: the root of the mean squared error, and the largest error.
+/// Maximum position errors up to which velocities are stored with 8 bits: first the root of the mean squared error over
+/// all Gaussians, then the largest error. The unit is the middle one of a Gaussian's three scales.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
 /// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`.
@@ -71,9 +71,9 @@ pub fn write_tsog(content: &TimedGaussians, path: &Path) -> Result<SogErrors> {
     Ok(errors)
 }
 
-/// Returns the Gaussians `params` with time windows of at most [`MAX_DEVIATION`]. A wider window is replaced by one
-/// that has the same opacity and the same slope of its logarithm in the middle of the sequence; the motion does not
-/// change.
+/// Returns the Gaussians `params` with time windows whose standard deviation is at most [`MAX_DEVIATION`]. A wider
+/// window is replaced by a narrower one. In the middle of the sequence, the opacity and the slope of the logarithm of
+/// the opacity stay the same. The motion does not change.
 fn narrowed(params: &StoredParams) -> StoredParams {
     let mut params = params.clone();
     for row in 0..params.len() {
@@ -97,8 +97,9 @@ fn narrowed(params: &StoredParams) -> StoredParams {
     params
 }
 
-/// Adds the two images that hold the frame of each Gaussian to `images`, and returns the member `timeline` of
-/// `meta.json`.
+/// Adds two images of size `size` to `images` that hold the frame in which each Gaussian of `params` is seen, and
+/// returns the member `timeline` of `meta.json`. The sequence has `frames` frames. Pixel i holds the Gaussian
+/// `order[i]`.
 fn encode_frames(
     params: &StoredParams,
     frames: usize,
@@ -116,8 +117,8 @@ fn encode_frames(
     TimelineEntry { kind: 0, frames: Some(frames as u64), delta: Some(delta as u64), mins: None, maxs: None, files }
 }
 
-/// Adds the two images that hold the time window of each Gaussian to `images`, and returns the member `timeline` of
-/// `meta.json`.
+/// Adds two images of size `size` to `images` that hold the time window of each Gaussian of `params`, and returns the
+/// member `timeline` of `meta.json`. Pixel i holds the Gaussian `order[i]`.
 fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images: &mut NamedImages) -> TimelineEntry {
     let window = |row: usize| {
         let deviation =
@@ -134,8 +135,9 @@ fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images:
     TimelineEntry { kind: 1, frames: None, delta: None, mins, maxs, files }
 }
 
-/// Adds the image or the two images of the velocities to `images`, with 8 bits if these are accurate enough, else with
-/// 16. Returns the member `temporal` of `meta.json`; `None` if nothing moves.
+/// Adds the velocities of `params` to `images`: one image with 8 bits per axis if these are accurate enough, else two
+/// images with 16 bits per axis. The images have the size `size`, and pixel i holds the Gaussian `order[i]`. Returns
+/// the member `temporal` of `meta.json`; `None` if nothing moves.
 fn encode_velocities(
     params: &StoredParams,
     size: ImageSize,
@@ -172,9 +174,9 @@ fn encode_velocities(
     Some(Temporal { means: Velocity { mins: [range.mins], maxs: [range.maxs], files } })
 }
 
-/// Returns whether velocities that are stored with 8 bits within `range` keep the position errors within
-/// [`MAX_8_BIT_ERRORS`]. Errors count up to two standard deviations from the center of a time window, and only within
-/// the sequence.
+/// Returns whether velocities of `params` that are stored with 8 bits within `range` keep the position errors within
+/// [`MAX_8_BIT_ERRORS`]. The error of a Gaussian is the one at the time furthest from the center of its time window,
+/// but at most two standard deviations away and within the sequence.
 fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     let half_step = (0..3).map(|axis| ((range.maxs[axis] - range.mins[axis]) / 510.0).powi(2)).sum::<f64>().sqrt();
     let (mut squares, mut most) = (0.0, 0.0f64);

@@ -20,7 +20,7 @@ const NETWORK_FILE: &str = "deform.pth";
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Paths {
     pub(super) root: PathBuf,
-    /// Training iteration K of both folders `iteration_K`.
+    /// Number K of the training iteration whose files are in `point_cloud/iteration_K` and `deform/iteration_K`.
     pub(super) iteration: u32,
     pub(super) cfg_args: PathBuf,
     pub(super) point_cloud: PathBuf,
@@ -40,7 +40,8 @@ pub(in crate::models) fn network_tensor_names(root: &Path, memory: ReadLimit) ->
     last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
-/// Returns the number K of each subfolder `iteration_K` of `within` that contains `file`, in increasing order.
+/// Returns the number K of each subfolder `iteration_K` of `within` that contains `file`, in increasing order. Fails if
+/// `within` cannot be listed.
 fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
     let mut found = iteration_numbers(within)?;
     found.retain(|k| within.join(format!("iteration_{k}")).join(file).is_file());
@@ -48,8 +49,8 @@ fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
 }
 
 impl Paths {
-    /// Finds the files of the model folder `root`, of the requested `iteration`, or of the largest one that has both a
-    /// point cloud file and a network.
+    /// Finds the files of the model folder `root` that belong to the training iteration `iteration`. `None` selects the
+    /// largest iteration that has both a point cloud file and a network.
     ///
     /// # Errors
     /// Fails if a folder or file is missing.

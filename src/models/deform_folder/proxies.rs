@@ -106,8 +106,9 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for every Gaussian of `raw` the squared distance between its position and the position that `wanted` returns
-/// for it, summed over `frames`, in scene units squared.
+/// Returns for every Gaussian of `raw` the squared distance between its computed position and its target position,
+/// summed over `frames`, in scene units squared. `wanted(k, row)` returns the target position of the Gaussian in row
+/// `row` at frame `frames[k]`.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -124,7 +125,8 @@ fn squared_distances<L: NetworkMotionModel>(
     Ok(off)
 }
 
-/// Returns `raw` with the position of every proxy moved by one Gauss-Newton step toward its targets `wanted`.
+/// Returns `raw` with the position of every proxy moved by one Gauss-Newton step, so that its path comes nearer to its
+/// target. `wanted` holds the target states of all proxies, one entry for each of `frames`.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -156,11 +158,13 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all stored parameters of the proxies `made` except their positions. The parameters start as those of the
-/// leaders. Then, [`CORRECTIONS`] times, the mean over `frames` of the target (returned by `wanted`) minus the proxy's
-/// state is added. One correction suffices if the network's output is simply added; quaternions that are not normalized
-/// need several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the
-/// target.
+/// Sets all stored parameters of the proxies `made` except their positions. `wanted` holds the target states of all
+/// proxies, one entry for each of `frames`.
+///
+/// The parameters start as those of the `leaders` (the most important member of each cluster). Then they are corrected
+/// [`CORRECTIONS`] times: the difference between the target and the state of the proxy, averaged over `frames`, is
+/// added. One correction suffices if the network's output is simply added; quaternions that are not normalized need
+/// several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the target.
 fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,
@@ -202,7 +206,7 @@ fn shape<L: NetworkMotionModel>(
     Ok(())
 }
 
-/// Target state minus state of one proxy, summed over frames.
+/// Difference between the target state and the state of one proxy (target minus state), summed over frames.
 #[derive(Clone, Copy, Default)]
 struct StateDifference {
     scale: [f64; 3],
@@ -214,7 +218,7 @@ struct StateDifference {
 }
 
 impl StateDifference {
-    /// Adds `wanted` (the target) minus `state` in row `row`, at one frame.
+    /// Adds the difference at one frame: row `row` of `wanted` (the target states) minus row `row` of `state`.
     fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
@@ -233,7 +237,8 @@ impl StateDifference {
         self.opacity += to - from;
     }
 
-    /// Adds the mean difference to the stored parameters in row `row` of `to`. `share` is 1 / number of frames.
+    /// Adds the mean of the summed differences to the stored parameters in row `row` of `to`. `share` is 1 / number of
+    /// summed frames.
     fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);

@@ -25,8 +25,9 @@ pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     turned + angle * v + rest * w.cross(v) + (angle - sine) * w.cross(w.cross(v))
 }
 
-/// Returns the derivative of the moved position when x moves along `axis` and w and v change with the derivatives
-/// `of_w` and `of_v`. Uses central differences in which x, w and v change together.
+/// Returns the derivative of the moved position when `x` moves in the direction `axis`. `of_w` and `of_v` are the
+/// derivatives of the network's outputs w and v in this direction. Uses central differences in which x, w and v change
+/// together.
 pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
     // Screw motions may change fast with x, so the step is shortened accordingly.
     let step = HALF_STEP / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
@@ -40,7 +41,8 @@ mod tests {
 
     use super::*;
 
-    /// Returns the moved position, computed from the matrix formula.
+    /// Returns the position `x` moved by the screw motion `w`, `v`, computed with the matrices of the formula at the
+    /// top of this file.
     fn by_matrices(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
         let angle = w.length();
         let (w, v) = (w / angle + DVec3::splat(1e-5), v / angle + DVec3::splat(1e-5));

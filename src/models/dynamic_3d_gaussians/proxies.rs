@@ -1,8 +1,8 @@
 //! Computes proxies (Gaussians that replace merged ones) for a model where positions, rotations and colors vary freely,
 //! but scales and opacities are constant in time.
 //!
-//! Position, rotation and color of a proxy are the moment match of its members (merged Gaussians) at every frame. Scale
-//! and opacity are means over time of those of the moment matches.
+//! Position, rotation and color of a proxy are the moment match of its members (merged Gaussians) at every frame. For
+//! scale and opacity, the moment matches are averaged over time.
 
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
@@ -19,8 +19,8 @@ const SAMPLED_FRAMES: usize = 16;
 /// Attributes that are constant in time in this model format: scale and opacity.
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
-/// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. They are geometric means
-/// of scales and arithmetic means of opacities over sampled frames.
+/// Returns the constant scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. The moment
+/// matches at sampled frames are averaged: scales by the geometric mean, opacities by the arithmetic mean.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -66,14 +66,14 @@ pub(super) struct MergedSource<'a> {
 }
 
 impl<'a> MergedSource<'a> {
-    /// Creates the compressed model of `params` as `reduction` says.
+    /// Creates the frames of the compressed model that `reduction` makes of the Gaussians `params`.
     pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
         MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Returns a pair for each proxy (Gaussian that replaces merged ones) among the output Gaussians with the indices
-    /// `places`: its position in `places`, and the index of its cluster.
+    /// Finds the proxies (Gaussians that replace merged ones) among the output Gaussians with the indices `places`.
+    /// Returns for each of them its position in the list `places` and the index of its cluster.
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =

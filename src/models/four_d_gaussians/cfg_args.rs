@@ -54,9 +54,9 @@ pub struct ModelConfig {
     pub no_dshs: bool,
     /// Whether the network reads positions instead of features from planes.
     pub no_grid: bool,
-    /// Whether a network computes a mask for the stored parameters of each Gaussian.
+    /// Whether a network computes for each Gaussian a mask: a factor on its stored parameters.
     pub static_mlp: bool,
-    /// Whether a voxel grid provides a mask for the stored parameters of each Gaussian.
+    /// Whether a voxel grid provides for each Gaussian a mask: a factor on its stored parameters.
     pub empty_voxel: bool,
     /// Number of frequencies whose sines and cosines are added to the features; default 0, none.
     pub grid_pe: i64,
@@ -175,7 +175,8 @@ impl ModelConfig {
     }
 }
 
-/// Returns the text of the `cfg_args` file at `path`.
+/// Returns the text of the `cfg_args` file at `path`. Fails if the file cannot be read, is not UTF-8 text or has more
+/// than [`MAX_BYTES`] bytes.
 pub(in crate::models) fn read(path: &Path) -> Result<String> {
     let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
     String::from_utf8(bytes).map_err(|error| {
@@ -185,7 +186,8 @@ pub(in crate::models) fn read(path: &Path) -> Result<String> {
 }
 
 /// Returns `text`, the content of a `cfg_args` file, with the SH degree `degree` and all other bytes unchanged. If
-/// `text` does not give the SH degree, it becomes the first key. `path` is for error messages.
+/// `text` does not give the SH degree, it becomes the first key. `path` is for error messages. Fails if `text` is not a
+/// `Namespace(…)`.
 pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
     let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
@@ -200,7 +202,7 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
 }
 
 /// Returns the text of the `cfg_args` file at `path` for an output with SH degree `degree`. `own` is the SH degree of
-/// the model; the text is unchanged unless `degree` is lower.
+/// the model; the text is unchanged unless `degree` is lower. Fails if the file cannot be read.
 pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
     if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
@@ -208,7 +210,8 @@ pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize)
 
 /// Returns `text`, the content of the `cfg_args` file at `path`, without the folders of the training machine, because
 /// archives are made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute
-/// paths, are replaced by their last path components; all other bytes are unchanged.
+/// paths, are replaced by their last path components; all other bytes are unchanged. Fails if `text` is not a
+/// `Namespace(…)`.
 pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<String> {
     let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (mut out, mut end) = (String::with_capacity(text.len()), 0);
@@ -264,7 +267,8 @@ impl<'a> ConfigKey<'a> {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }
 
-    /// Returns the value as a boolean, or `default` if the key is missing; 0 and 1 count as booleans.
+    /// Returns the value as a boolean, or `default` if the key is missing; 0 and 1 count as booleans. Fails for any
+    /// other value.
     pub(in crate::models) fn bool(&self, default: bool) -> Result<bool> {
         match self.value {
             Literal::None => Ok(default),
@@ -275,7 +279,7 @@ impl<'a> ConfigKey<'a> {
     }
 
     /// Returns the value as an integer, or `default` if the key is missing. Accepts booleans: Python's `True` is the
-    /// integer 1, and some forks write `grid_pe=False`.
+    /// integer 1, and some forks write `grid_pe=False`. Fails for any other value.
     pub(in crate::models) fn int(&self, default: i64) -> Result<i64> {
         match self.value {
             Literal::None => Ok(default),
@@ -285,7 +289,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a number, or `default` if the key is missing.
+    /// Returns the value as a number, or `default` if the key is missing. Fails if the value is not a number.
     pub(in crate::models) fn float(&self, default: f64) -> Result<f64> {
         match self.value {
             Literal::None => Ok(default),
@@ -295,7 +299,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a string; `None` if the key is missing.
+    /// Returns the value as a string; `None` if the key is missing. Fails if the value is not a string.
     pub(in crate::models) fn string(&self) -> Result<Option<String>> {
         match self.value {
             Literal::None => Ok(None),
@@ -304,7 +308,8 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the value as a list of integers, or `default` if the key is missing.
+    /// Returns the value as a list of integers, or `default` if the key is missing. Fails if the value is not such a
+    /// list.
     fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
         match self.value {
             Literal::None => Ok(default.to_vec()),
@@ -315,7 +320,8 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Returns the entry `name` of this key's value, which is a dictionary.
+    /// Returns the entry `name` of this key's value, which must be a dictionary. The returned entry has no value if the
+    /// key or the entry is missing. Fails if the value is not a dictionary.
     fn entry(&self, name: &'static str) -> Result<ConfigKey<'a>> {
         let value = match self.value {
             Literal::None => &Literal::None,

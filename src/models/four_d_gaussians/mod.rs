@@ -267,12 +267,13 @@ impl ModelFolder {
     }
 }
 
-/// Returns the path of the folder of a training iteration in the model folder `root`.
+/// Returns the path of the folder in which the model folder `root` stores the files of training iteration `iteration`.
 pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
-/// Returns the size in bytes of the three files of a model, divided into parts.
+/// Returns the size in bytes of the three files of a model (point cloud, deformation field and configuration), divided
+/// into parts.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize> {
     let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
     Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })

@@ -15,8 +15,9 @@ use crate::source::FrameSource;
 /// Maximum number of frames at which a proxy is compared with its members (the Gaussians that it replaces).
 const SAMPLED_FRAMES: usize = 16;
 
-/// Returns the stored parameters of the proxies of `clusters`: their states at the reference frame minus the changes
-/// (deltas) that the field makes at the canonical positions of their leaders.
+/// Returns the stored parameters of the proxies of the clusters `all`: the state of each proxy at the reference frame,
+/// minus the changes (deltas) that the field makes at the canonical position of its leader (the most important member
+/// of its cluster).
 ///
 /// A proxy placed at the mean of its members is moved by the field at the mean, not by the field at the members. If it
 /// drifts further than `max_drift` from its members, it is placed at its leader's canonical position; its shape about
@@ -100,8 +101,10 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns the `states` of proxies with every quaternion scaled to the length that the quaternion of its leader has at
-/// the same frame. The field adds its delta to the stored quaternion, so the angle of rotation depends on the length.
+/// Returns the `states` of proxies with every quaternion scaled to the length of the quaternion that its leader (the
+/// most important member of its cluster) has at the same frame. The field adds its delta to the stored quaternion, so
+/// the angle of rotation depends on the length. The states of the leaders are computed from their stored parameters
+/// `of_leaders` and from `deltas`.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);
@@ -115,8 +118,8 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
     states
 }
 
-/// Replaces each row of `raw` that has a value that is not finite by the row of its leader. Returns the number of
-/// replaced rows.
+/// Replaces each row of `raw` that contains a value that is not finite by the same row of `leaders`. Returns the number
+/// of replaced rows.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     let columns: Vec<Attributes> = Attributes::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
@@ -140,9 +143,9 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 }
 
 /// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in
-/// scene units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at
-/// the leader of the cluster (its most important member), the offset that the leader has from the mean at the reference
-/// frame is added.
+/// scene units. The expected position is the weighted mean of the members of its cluster. If the proxy was placed at
+/// the leader of the cluster (its most important member), the offset of the leader from this mean at the reference
+/// frame is added to the expected position.
 fn deviations(
     model: &ModelFolder,
     reference: ReferenceFrame,

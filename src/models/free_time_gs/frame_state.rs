@@ -5,7 +5,7 @@
 //! `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer does without the bounds
 //! 1e-4 and 0.02.
 //!
-//! The same motion with other bounds, and with another unit of time, is that of `.ftgs.ply` and `.tsog` files.
+//! `.ftgs.ply` and `.tsog` files use the same motion, but with other bounds and another unit of time.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -27,10 +27,10 @@ pub(in crate::models) struct FreeTime {
     /// Conversion from the times of frames to the time unit of the stored parameters, in which the clip lasts from 0 to
     /// 1.
     pub(in crate::models) clip: ClipTimes,
-    /// Two values in the time unit of the stored parameters: the minimum of the standard deviation in time, and the
-    /// value that is added to it after that.
+    /// Lower limit to which the standard deviation in time is raised, and value that is then added to it, both in the
+    /// time unit of the stored parameters.
     pub(in crate::models) deviation_floor: [f64; 2],
-    /// Minimum opacity of a Gaussian at any time.
+    /// Lower limit to which the opacity of every Gaussian is raised at every time.
     pub(in crate::models) min_opacity: f64,
 }
 
@@ -59,13 +59,14 @@ impl FreeTime {
         0.5 / self.deviation(duration).powi(2)
     }
 
-    /// Returns the logit of the minimum opacity of a Gaussian.
+    /// Returns the logit of the opacity [`FreeTime::min_opacity`].
     fn min_logit(&self) -> f64 {
         (self.min_opacity / (1.0 - self.min_opacity)).ln()
     }
 
-    /// Returns the stored parameters `raw`, where each duration is replaced by the logarithm of the standard deviation
-    /// that this motion model uses. A reader of the result must not apply the minimum again.
+    /// Returns the stored parameters `raw` with each duration replaced by the logarithm of the standard deviation in
+    /// time that this motion model computes from it. The lower limit is already applied to the result; a reader of the
+    /// result must not apply it again.
     pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
         let mut raw = raw.clone();
         let durations = raw.format_specific.plane_mut(LOG_DEVIATION).iter_mut();

@@ -16,7 +16,8 @@ use crate::source::FrameSource;
 
 /// Maximum number of frames at which proxies are compared with their members.
 const SAMPLED_FRAMES: usize = 48;
-/// Minimum product of opacity and temporal window of a proxy at a frame; other frames are not used for matching.
+/// Minimum product of opacity and temporal window that a proxy must have at a frame; frames with a smaller product are
+/// not used for matching.
 const MIN_VISIBLE: f64 = 1e-4;
 /// Minimum and maximum opacity of a proxy. They bound its opacity logit.
 const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
@@ -83,9 +84,12 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) row: usize,
 }
 
-/// Matches the proxies of `clusters` to their members. `line_of` returns the path and window of a member by its id;
-/// `window` returns the value of a window at a time. Calls `visit` with the moment match of each proxy at each sampled
-/// frame at which it is visible. The moment match has the attributes `wanted`, rotation, scale and opacity.
+/// Computes for each of `clusters` the path, temporal window and shape of its proxy from its members (merged
+/// Gaussians).
+///
+/// `line_of` returns the path and window of a member by its id; `window` returns the value of a window at a time. Calls
+/// `visit` with the moment match of each proxy at each sampled frame at which the proxy is visible. The moment match
+/// has the attributes `wanted`, and always rotation, scale and opacity.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -140,7 +144,8 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds the moment match in row `row` of `state`, at a frame where the window is `m` and the opacity is `alpha`.
+    /// Adds one frame to the sums. Row `row` of `state` is the moment match at this frame, `m` the window, and `alpha`
+    /// the opacity.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;

@@ -38,7 +38,7 @@ struct ReceivedFrames {
 
 impl ReceivedFrames {
     /// Creates an empty temporary folder in `scratch`. `reader_bytes` is the memory of the reader from which the frames
-    /// come.
+    /// come. Fails if the folder cannot be created.
     fn new(scratch: &Path, reader_bytes: u64) -> Result<ReceivedFrames> {
         Ok(ReceivedFrames {
             folder: ScratchFolder::new(scratch)?,
@@ -57,8 +57,9 @@ impl ReceivedFrames {
         Ok(())
     }
 
-    /// Links the Gaussians of the received frames. `kind` is the name of the original input format, `bytes` the size of
-    /// the original input, `name` what messages call it, and `why` the reason for linking.
+    /// Links the Gaussians of the received frames into tracks (Gaussians followed through frames). If `joins`, tracks
+    /// that seem to be the same Gaussian are joined. `kind` is the name of the original input format, `bytes` the size
+    /// of the original input, `name` what messages call the input, and `why` the reason for linking.
     fn link(
         self,
         kind: &'static str,

@@ -16,7 +16,8 @@ pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
 /// Bytes of memory per Gaussian of a frame for its entry (track and row) in a list, and for a copy of this list for
 /// sorting.
 const BYTES_PER_ROW: u64 = 16;
-/// Number of frames of which renders are compared before and after tracks are joined or attributes are made constant.
+/// Number of frames that are rendered before and after tracks are joined or attributes are made constant, to measure
+/// the change.
 pub(super) const SAMPLED_FRAMES: usize = 3;
 /// Bytes of memory of two renders by a virtual camera and of their comparison.
 const RENDER_BYTES: u64 = 16 << 20;
@@ -46,13 +47,13 @@ impl Sizes {
         self.state() + 24
     }
 
-    /// Returns the bytes of the largest file of a frame.
+    /// Returns the size in bytes of the largest file of a frame.
     pub(super) fn frame_file(&self) -> u64 {
         self.frame_gaussians * self.file()
     }
 
-    /// Returns the number of frames that are packed into the container at a time: the number that fits into
-    /// [`TOGETHER_BYTES`], at least 1, at most the frames of a tile.
+    /// Returns the number of frames that are packed into the container together: the number that fits into
+    /// [`TOGETHER_BYTES`], but at least 1 and at most the number of frames in a tile.
     pub(super) fn frame_block(&self) -> usize {
         (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }
@@ -77,10 +78,13 @@ impl Sizes {
         self.frame_gaussians * of_frame + self.live_tracks * of_living + self.linked * of_track
     }
 
-    /// Returns the bytes of memory for making attributes constant: the larger of two steps. Computing means takes sums
-    /// for a batch of tracks and one frame per thread. Rendering takes the sampled frames before and after the change,
-    /// and their renders. Joining tracks reads as many frames as computing means and needs less per track, so it is
-    /// covered.
+    /// Returns the bytes of memory that making attributes constant takes: the memory of the open frames, the first row
+    /// and the length of each track, and the larger of two steps:
+    /// - computing means, which takes sums for a batch of tracks and one frame per thread,
+    /// - rendering, which takes the sampled frames before and after the change, and their renders.
+    ///
+    /// Joining tracks reads as many frames as computing means and needs less memory per track, so it is not counted
+    /// separately.
     fn holding(&self) -> u64 {
         let threads = rayon::current_num_threads() as u64;
         let sums = self.linked.min(BATCH as u64) * TrackSums::bytes(self.sh_degree);

@@ -45,7 +45,8 @@ pub struct LinkedFrames {
     tracks: LinkedTracks,
     /// Temporary container with the state of every track at every frame.
     container: Container,
-    /// Sequence info of the container; its times may have been replaced.
+    /// Number of Gaussians, times and SH degree of the sequence. They are those of the container, except that the times
+    /// may have been replaced.
     info: SequenceInfo,
     notes: Vec<String>,
     /// Owner of the container's file; deletes the file when it is dropped.

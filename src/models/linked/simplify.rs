@@ -19,12 +19,12 @@ use crate::tracking::{Joiner, Linker};
 const MIN_PSNR_DB: f64 = 40.0;
 /// Number of virtual cameras by which each sampled frame is rendered.
 const VIEWS: usize = 3;
-/// Maximum deviations of attributes that become constant, tried in this order. The first are the differences that
-/// trainers leave between tracks of one Gaussian, the second are half of them.
+/// Maximum deviations of attributes that become constant. The entries are tried in this order. The first entry has the
+/// size of the differences that trainers leave between tracks of one Gaussian, the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
-/// Joins the tracks that `joiner` recorded and that seem to be the same Gaussian. Tries the joiner's proposals in order
-/// and keeps the first whose renders reach [`MIN_PSNR_DB`]. Returns a note for the user if any tracks could be joined.
+/// Joins tracks that seem to be the same Gaussian. Tries the proposals of `joiner` in order and keeps the first one
+/// with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if the joiner proposed to join any tracks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -90,8 +90,8 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
     Ok(None)
 }
 
-/// Returns sums of the attributes over all frames for each track of `range`. No track of `range` begins before the
-/// frame `born`.
+/// Returns sums of the attributes over all frames for each track of `range`. Reads only frames from `born` on, because
+/// no track of `range` begins before frame `born`.
 fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
     let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));

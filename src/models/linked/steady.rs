@@ -77,8 +77,8 @@ impl Steady {
         Ok(Steady { columns, means: means.finish()?, sh_degree })
     }
 
-    /// Returns four fractions of all tracks: of the tracks with constant colors, with constant scales, with constant
-    /// rotations, and with constant opacities.
+    /// Returns the fraction of all tracks that have constant colors, and the same for scales, rotations and opacities,
+    /// in this order.
     pub(super) fn parts(&self) -> [f64; 4] {
         [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
@@ -91,7 +91,7 @@ impl Steady {
         !self.columns[track as usize].is_empty()
     }
 
-    /// Returns the constant attributes of `tracks` and their values, in the same order. Fast if `tracks` are in
+    /// Returns the constant attributes of `tracks` and their values, in the order of `tracks`. Fast if `tracks` are in
     /// increasing order.
     ///
     /// # Errors
@@ -116,8 +116,8 @@ impl Steady {
 }
 
 impl HeldMeans {
-    /// Writes the values of constant attributes to `state`. Each pair of `places` is the index of a track in this
-    /// object and the row of that track in `state`.
+    /// Writes the values of constant attributes to `state`. Each pair of `places` is the index of a track in this list
+    /// of tracks, and the row of that track in `state`.
     pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {

@@ -55,16 +55,16 @@ pub(super) struct LinkedTracks {
     starts: Vec<u64>,
 }
 
-/// Number of frames in which each track is present.
+/// Number of frames in which each track is present, and frames that need blending.
 pub(super) struct TrackLengths {
-    /// Number of frames of each track, by index of the track.
+    /// Number of frames in which each track is present, by index of the track.
     frames_per_track: Vec<u32>,
     /// Frames in which some track has several Gaussians, which are blended into one.
     pub(super) blended: Vec<u32>,
 }
 
 impl TrackLengths {
-    /// Returns the median over all tracks of the number of frames.
+    /// Returns the median, over all tracks, of the number of frames in which a track is present.
     pub(super) fn median(mut self) -> u32 {
         let middle = self.frames_per_track.len() / 2;
         if self.frames_per_track.is_empty() { 0 } else { *self.frames_per_track.select_nth_unstable(middle).1 }
@@ -175,8 +175,8 @@ impl LinkedTracks {
         Ok((tracks, LinkingResult { states: end, cuts, doubtful }, linker))
     }
 
-    /// Joins the linked tracks to `count` tracks. `joined_tracks` holds the index of the joined track of each linked
-    /// one.
+    /// Joins the linked tracks, so that `count` tracks remain. Entry i of `joined_tracks` is the index of the joined
+    /// track to which the linked track i belongs.
     pub(super) fn join(&mut self, joined_tracks: Vec<u32>, count: usize) {
         (self.joined, self.count) = (Some(joined_tracks), count);
     }
@@ -217,7 +217,7 @@ impl LinkedTracks {
         Ok(lengths)
     }
 
-    /// Returns the index of the track of each Gaussian of a frame.
+    /// Returns for each Gaussian of a frame the index of its track, in the order of the Gaussians in the file.
     fn tracks_in_frame(&self, frame: usize) -> Result<Vec<u32>> {
         let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
         self.track_of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
@@ -227,7 +227,8 @@ impl LinkedTracks {
         Ok(tracks)
     }
 
-    /// Returns the first frame and row of each track, in the order of frames.
+    /// Returns for each track the first frame in which it is present and its row in the file of that frame. Tracks are
+    /// in the order of their first frames.
     pub(super) fn first(&self) -> Vec<TrackPosition> {
         match &self.joined {
             None => self.births.clone(),
@@ -264,7 +265,7 @@ impl LinkedTracks {
         self.count
     }
 
-    /// Returns the rows of frame `frame` whose Gaussians belong to `tracks`, sorted by track.
+    /// Returns the rows of the Gaussians of frame `frame` that belong to tracks in the range `tracks`, sorted by track.
     pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<TrackedRow>> {
         let rows = self.tracks_in_frame(frame)?.into_iter().enumerate();
         let rows = rows.map(|(row, track)| TrackedRow { track, row: row as u32 });
@@ -384,7 +385,7 @@ impl FrameSource for FrameBlock<'_> {
 
 impl FrameBlock<'_> {
     /// Writes to `state` the states that the tracks of `range` have just before the first frame of this block of
-    /// frames.
+    /// frames. A track that has not begun yet gets the state at its beginning.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -412,7 +413,7 @@ impl FrameBlock<'_> {
 struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
-    /// Next frame of the block that is to be applied to `state`.
+    /// Index, within the block, of the next frame that is to be copied to `state`.
     next: usize,
     /// Values of the attributes that were made constant along the tracks of `range`; `None` if there are none.
     means: Option<HeldMeans>,
@@ -458,7 +459,8 @@ impl BlockReader for TrackReader<'_> {
     }
 }
 
-/// Copies rows of `part` to `state`. Each pair of `places` is a row of `part` and a row of `state`.
+/// Copies rows of `part` to `state`. Each pair of `places` is the index of a row of `part` and the index of the row of
+/// `state` that it replaces.
 fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
     for column in Attributes::all().iter() {
         let (from, to) = (part.column(column), state.column_mut(column));

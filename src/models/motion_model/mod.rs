@@ -100,7 +100,8 @@ impl<L> Clone for MotionModelFrames<L> {
 }
 
 impl<L: MotionModel> MotionModelFrames<L> {
-    /// Creates a model that has no frames yet. `sh_degree` is the SH degree of its states.
+    /// Creates a model whose states `motion_model` computes from the stored parameters `raw`. It has no frames yet.
+    /// `sh_degree` is the SH degree of its states.
     pub(super) fn new(motion_model: L, raw: StoredParams, sh_degree: usize) -> MotionModelFrames<L> {
         let info = SequenceInfo { count: raw.len(), times: Vec::new(), sh_degree, varying: motion_model.varying() };
         MotionModelFrames {
@@ -130,7 +131,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
         Ok(self)
     }
 
-    /// Returns a model with the same motion model and frames, but with the Gaussians `raw`.
+    /// Returns a model with the same motion model and frames, but with the stored parameters `raw`.
     pub(super) fn with_raw(&self, raw: StoredParams) -> MotionModelFrames<L> {
         let sh_degree = self.info.sh_degree.min(raw.gaussians.sh_degree());
         let info = SequenceInfo { count: raw.len(), sh_degree, ..self.info.clone() };
@@ -196,8 +197,8 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
-    /// Returns a reader that computes the Gaussians block by block. A model computes each frame on its own, so a reader
-    /// of all Gaussians has no decoded frames to keep in memory.
+    /// Returns a reader that computes the Gaussians block by block. Frames do not depend on one another, so the reader
+    /// keeps nothing between frames.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }

@@ -46,7 +46,9 @@ impl TrainingConfig {
     }
 }
 
-/// Returns the period L of colors from the YAML files in `root`, and the name of the file that gives it.
+/// Returns the period L of colors from the YAML files in `root`, and the name of the file that gives it. Returns `None`
+/// if no file gives it. Fails if two files give different periods, or if the entry of a file is not a pair of
+/// increasing times.
 fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
     for path in yaml_files_in(root) {

@@ -104,8 +104,8 @@ impl Native {
         -0.5 / (variance + self.prefilter.max(0.0))
     }
 
-    /// Returns the temporal marginal m at `time` (factor of the opacity) of a Gaussian with this center and variance in
-    /// time; 0 at or below [`MIN_MARGINAL`].
+    /// Returns the temporal marginal m (factor of the opacity) at `time` of a Gaussian with the given center and
+    /// variance in time. Values up to [`MIN_MARGINAL`] are replaced by 0.
     pub(super) fn marginal(&self, time: f64, center: f64, variance: f64) -> f64 {
         let m = (self.rate(variance) * (time - center).powi(2)).exp();
         if m > MIN_MARGINAL { m } else { 0.0 }

@@ -26,8 +26,8 @@ fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// Returns the parameters of a test model, each with its index in the capture tuple. `turns` states whether Gaussians
-/// have a 4D rotation.
+/// Returns the parameters of a test model, each with its index in the tuple that the trainer saves in a checkpoint
+/// (capture tuple). `turns` states whether Gaussians have a 4D rotation.
 fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
     let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
     let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
@@ -46,7 +46,8 @@ fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
     tensors.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
 }
 
-/// Returns the values of the capture tuple of a test model. `turns` states whether Gaussians have a 4D rotation.
+/// Returns the values of the tuple that the trainer saves in a checkpoint (capture tuple) of a test model. `turns`
+/// states whether Gaussians have a 4D rotation.
 fn capture(turns: bool) -> Vec<Made> {
     let mut parts = vec![Made::None; CAPTURE_LENGTH_4D];
     let mut state = Vec::new();
@@ -85,7 +86,8 @@ impl CheckpointFolder {
         self.0.path().join(name)
     }
 
-    /// Writes a model folder whose checkpoint has the capture tuple `parts`.
+    /// Writes a model folder whose checkpoint has the values `parts` in its capture tuple. Returns the path of the
+    /// folder.
     fn put(&self, parts: Vec<Made>) -> PathBuf {
         let root = self.path("model");
         fs::create_dir_all(&root).unwrap();

@@ -44,7 +44,7 @@ impl SpacetimeMotion {
         }
     }
 
-    /// Stores this motion and window as those of the Gaussian in row `row`, rounded to f32.
+    /// Stores this motion and temporal window as the parameters of the Gaussian in row `row` of `raw`, rounded to f32.
     pub(super) fn write(&self, raw: &mut StoredParams, row: usize) {
         let mut own = |plane: usize, value: f64| raw.format_specific.plane_mut(plane)[row] = value as f32;
         own(CENTER, self.center);
@@ -64,7 +64,7 @@ impl SpacetimeMotion {
 pub(super) struct Spacetime {
     /// Whether this is the full model, where a network computes pixel colors from features.
     pub(super) is_full: bool,
-    /// Network that computes pixel colors; `None` if it is not known.
+    /// Network that computes pixel colors; `None` if the model has none or the network is not known.
     pub(super) decoder: Option<ColorDecoder>,
 }
 
@@ -78,6 +78,7 @@ pub(super) struct PreparedGaussian {
 }
 
 /// Returns the natural logarithm of the temporal window (factor of the opacity) at time `dt` from its center.
+/// `inverse_squared` is 1 / width², with the width of the window.
 #[inline(always)]
 fn window_exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared

@@ -41,8 +41,9 @@ impl SpacetimeMotion {
         (-dt * dt).exp()
     }
 
-    /// Returns the same motion expressed with another `center`, to which the window is moved. Positions and the
-    /// directions of quaternions stay the same up to rounding; `rotation` is normalized if it is not zero.
+    /// Returns the same motion, expressed by coefficients around another `center`. The positions and the directions of
+    /// the quaternions at each time stay the same up to rounding, but the temporal window is moved to the new center.
+    /// `rotation` is normalized if it is not zero.
     pub(super) fn recentered(&self, center: f64) -> SpacetimeMotion {
         let (by, [_, p1, p2, p3]) = (center - self.center, self.path);
         let path = [
@@ -76,8 +77,8 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Returns the center and log width of the temporal window that has the same first and second moments in time as the
-/// weighted sum of the windows of `members`.
+/// Returns the center and the log width of the merged temporal window, which has the same first and second moments in
+/// time as the weighted sum of the windows of `members`. Each member is a weight and a motion.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     // Each window counts with its area in time, relative to the widest one, so that no area overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
@@ -94,9 +95,10 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     (center, longest + 0.5 * squared.ln())
 }
 
-/// Returns the weighted mean of motions that have the same center. Its state at any time is the weighted mean of the
-/// states of all `members`. Before the mean is taken, each quaternion gets the sign that brings it nearer to the
-/// quaternion of the member with the largest weight. Returns `None` without members.
+/// Returns the weighted mean of motions that have the same center; `None` if `members` is empty. Each member is a
+/// weight and a motion. The state of the mean at any time is the weighted mean of the states of all `members`. Before
+/// the mean is taken, each quaternion gets the sign that brings it nearer to the quaternion of the member with the
+/// largest weight.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);

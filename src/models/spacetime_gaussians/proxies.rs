@@ -24,7 +24,7 @@ use crate::source::FrameSource;
 /// Maximum ratio between the widths of the temporal windows of a member and of the proxy. With a larger ratio, or with
 /// centers further apart than half of the proxy's width, the windows count as different.
 const MAX_WIDTH_RATIO: f64 = 1.5;
-/// A temporal window, whose maximum is 1, is ignored at times where its value is below this.
+/// Minimum value of a temporal window, whose maximum is 1. Times at which its value is smaller are ignored.
 const MIN_WINDOW: f64 = 0.05;
 /// Maximum number of times at which a proxy's shape and opacity are compared with those of its members.
 const SAMPLED_TIMES: usize = 12;
@@ -137,7 +137,7 @@ fn proxy_parameters(
     Ok(out)
 }
 
-/// Returns the weighted mean over the members of the parameter `plane`, which has one value per member. If all values
+/// Returns the weighted mean, over the members, of a parameter. `plane` holds its value for each member. If all values
 /// are equal, the result is exactly this value.
 fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
@@ -154,7 +154,8 @@ fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -
 }
 
 /// Returns the state that the proxy should approximate at each frame: the mean of the members, weighted by their
-/// temporal windows. Quaternions have the sign that brings them nearest to that of `mean`.
+/// temporal windows. `recentered` holds the weights of the members and their motions around the center of the proxy.
+/// Quaternions have the sign that brings them nearest to the quaternion of the motion `mean`.
 fn target_states(
     members: &ClusterMembers<'_>,
     recentered: &[(f64, SpacetimeMotion)],
@@ -182,7 +183,7 @@ fn target_states(
 }
 
 /// Returns the natural logarithms of the scales of the proxy, and sets the rotation of `motion` to the axes along which
-/// these scales are measured.
+/// these scales are measured. `states` holds the states of the members at each of `times`.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {
@@ -216,7 +217,8 @@ fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
 }
 
 /// Returns the logit of the proxy's opacity at the center of its temporal window: the amplitude of the window that fits
-/// the opacities of the members' moment match best (least squares).
+/// the opacities of the members' moment match best (least squares). `states` holds the states of the members at each of
+/// `times`.
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

@@ -24,9 +24,8 @@ pub(super) struct FrameByFrame {
 }
 
 impl FrameByFrame {
-    /// Creates the motion model of `frames` frames, whose times are evenly spaced from the first time of `clip`. The
-    /// last frame is at the last time of `clip`; but if `clip` is the range from 0 to 1, frame i of n is at the time
-    /// i/n.
+    /// Creates the motion model of `frames` frames with evenly spaced times. If `clip` is the range from 0 to 1, frame
+    /// i of n is at the time i/n; else the first and the last frame are at the first and the last time of `clip`.
     pub(super) fn new(frames: usize, clip: ClipTimes) -> FrameByFrame {
         let is_mapped = (clip.first, clip.last) != (0.0, 1.0);
         // Frames of a converted sequence reach its last time. Without it, frame i of n begins at i/n.
@@ -85,7 +84,8 @@ impl MotionModel for FrameByFrame {
 }
 
 impl ProxyRule for FrameByFrame {
-    /// Returns the leaders as they are: Gaussians of different frames cannot be merged, so their clusters are refused.
+    /// Returns the stored parameters of the leaders (the most important members of the clusters) unchanged: Gaussians
+    /// of different frames cannot be merged, so their clusters are refused.
     fn propose(model: &MotionModelFrames<Self>, clusters: &[Cluster], _: &MergeParams) -> Result<StoredParams> {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         Ok(model.raw().pick(&leaders))

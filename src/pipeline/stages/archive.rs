@@ -36,22 +36,23 @@ use crate::scene::Scene;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
-/// Maximum quantization step of a group, in standard deviations of its values; a coarser one would erase the values.
+/// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
+/// coarser step would erase the values.
 const MAX_STEP: f64 = 4.0;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
-/// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this value the
-/// quantization of that many Gaussians costs 0.5 and 1.2 dB PSNR on two trained models.
+/// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
+/// value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
 const ESTIMATE_OCTAVES: f64 = 3.3;
 
 /// Stage that quantizes and encodes the result as an archive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArchiveStage {
     /// Required PSNR, dB, of renders of the archive against renders of the result before quantization. `None`: derived
-    /// from a permitted loss against the original.
+    /// from the goal of the run or from a default.
     pub psnr: Option<f64>,
 }
 
-/// Adds the stage to `stages` if the output is an archive.
+/// Adds the stage that makes an archive to `stages` if the output is an archive.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.output == OutputKind::Archive {
         stages.add(Phase::Write, ArchiveStage { psnr: planning.request.archive_psnr });
@@ -99,8 +100,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns the standard deviation of the values divided by the initial quantization step. Initial steps are finer
-    /// than most final ones.
+    /// Returns the number of initial quantization steps in one standard deviation of the values. Initial steps are
+    /// finer than most final ones.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -112,7 +113,7 @@ impl ValueGroup {
 }
 
 impl ArchiveStage {
-    /// Returns the resource estimate of the stage. Its memory holds the result, renders of it, the archive and the
+    /// Returns the resource estimate of the stage. Its memory holds the result, its renders, the archive and the
     /// decoded archive.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
@@ -143,8 +144,8 @@ impl ArchiveStage {
     /// Makes an archive of `compressed` that meets the quality or size `asked`. Returns its content and its summary.
     ///
     /// # Errors
-    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if no
-    /// archive of these Gaussians is as small as the byte limit.
+    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, if the
+    /// required PSNR is missed by far, or if even the coarsest archive of these Gaussians exceeds the byte limit.
     pub fn archive(
         &self,
         scene: &Scene,
@@ -223,8 +224,8 @@ impl ArchiveStage {
     }
 }
 
-/// Returns the estimated size, bytes, of an archive of `compressed`. Its quantization steps or error bounds are fixed
-/// ones, chosen without renders.
+/// Returns the estimated size, in bytes, of an archive of `compressed`: the size with fixed quantization steps or error
+/// bounds, for which nothing has to be rendered.
 ///
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
@@ -236,8 +237,8 @@ pub fn estimated_bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u6
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
 }
 
-/// Returns `encoded`, the archive of `gaussians` Gaussians with the coarsest steps, or an error if it has more than
-/// `most` bytes.
+/// Checks that `encoded`, the archive of `gaussians` Gaussians with the coarsest quantization steps, has at most `most`
+/// bytes, and returns it. Fails if it has more.
 fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Result<EncodedArchive> {
     let least = encoded.bytes.len();
     if least as u64 > most {
@@ -252,11 +253,12 @@ fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Resul
 /// Quantization steps of all groups of values (attributes and tensors) in the content of an archive.
 struct Grids {
     groups: Vec<ValueGroup>,
-    /// Standard deviation of the values of each group.
+    /// Standard deviation of the values of each group in `groups`.
     deviations: Vec<f64>,
-    /// Log2 of the quantization step of each group.
+    /// Log2 of the quantization step of each group in `groups`.
     octaves: Vec<f64>,
-    /// For each tensor, by name: offsets of the steps of its parts from the step of the tensor.
+    /// For each tensor, by name: offsets, in eighths of an octave, by which the steps of its channels (or of its rows
+    /// and columns) differ from the step of the tensor. See [`TensorSteps::channels`].
     offsets: BTreeMap<String, Vec<i8>>,
 }
 
@@ -272,7 +274,7 @@ impl Grids {
         Grids { groups, deviations, octaves, offsets }
     }
 
-    /// Returns the quantization steps, each made coarser by `added` octaves (doublings).
+    /// Returns the quantization steps of all groups, each made coarser by `added` octaves (doublings).
     fn steps(&self, added: f64) -> QuantizationSteps {
         let mut steps = QuantizationSteps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
@@ -288,9 +290,10 @@ impl Grids {
         TensorSteps { step: nearest_step(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
-    /// Measures the squared error on renders and the bits of every group of values. Sets the quantization steps so that
-    /// the error of each group is proportional to the bits that one octave of its step saves, and all errors together
-    /// are `error`. Returns the measurements: name, log2 of the step before, error, and bits.
+    /// Measures the squared error of renders and the bits that every group of values causes. Then sets the quantization
+    /// steps so that the error of each group is proportional to the bits that one octave of its step saves, and the sum
+    /// of all errors is about `error`. Returns the measurements, one entry per group: its name, log2 of its step before
+    /// the change, its error, and its bits.
     fn balance(
         &mut self,
         scene: &Scene,
@@ -320,8 +323,8 @@ impl Grids {
         Ok(measured)
     }
 
-    /// Returns for each group of values the squared error of renders if this group is quantized and all others are
-    /// exact. Leaves `content` unchanged.
+    /// Returns for each group of values the squared error of renders if only this group is quantized and all others are
+    /// exact. Changes `content` for every measurement and restores it afterward.
     fn errors(
         &self,
         scene: &Scene,
@@ -366,7 +369,7 @@ fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
         .collect()
 }
 
-/// Returns the standard deviation of the values of `group`, at least 1e-9.
+/// Returns the standard deviation of the values of `group` in `content`, at least 1e-9.
 fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     let deviation = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
@@ -385,8 +388,8 @@ fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     found.max(1e-9)
 }
 
-/// Returns the quantization step nearest to 2^`octave`, as a number of eighths of an octave, limited to the valid
-/// steps.
+/// Returns the number k of the quantization step 2^(k/8) that is nearest to 2^`octave`, limited to the valid numbers
+/// [`STEP_NUMBERS`].
 fn nearest_step(octave: f64) -> i32 {
     ((8.0 * octave).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }

@@ -26,11 +26,12 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
-/// Name under which dropping SH degrees is listed as omitted, if all degrees have to stay.
+/// Name under which the journal records that no SH degree was dropped, in its list of the work that the run omitted.
 const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// Returns the SH degree of a result of `scene` if the user asks for degrees up to `degree`: the degree of the input if
-/// that is lower, or if its format needs all degrees.
+/// Returns the SH degree of a result of `scene` if the user asks for at most `degree`. This is `degree`, or the degree
+/// of the input if that is lower or if the format of the input needs all degrees. If a lower degree than that of the
+/// input is asked for, adds a note to the journal: that coefficients are dropped, or why they stay.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
     match scene.input.needs_all_bands() {
@@ -54,7 +55,7 @@ pub(crate) struct ShDegreeStage {
     pub margin: f64,
 }
 
-/// Adds the stage to `stages` if the output may have a lower SH degree.
+/// Adds the stage that drops SH degrees to `stages` if the output may have a lower SH degree than the input.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = ShDegreeStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);
@@ -83,8 +84,8 @@ impl Stage for ShDegreeStage {
 }
 
 impl ShDegreeStage {
-    /// Returns the stage if the output may have a lower SH degree. An archive needs no such stage, because quantization
-    /// already removes coefficients that do not change renders.
+    /// Returns the stage if the output may have a lower SH degree than the input; otherwise `None`. An archive needs no
+    /// such stage, because quantization already removes coefficients that do not change renders.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == ShDegreeRule::Needed;
@@ -92,7 +93,7 @@ impl ShDegreeStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds three states (all Gaussians at one frame) and
-    /// renders of them. `left` is the fraction of the Gaussians in the result.
+    /// renders of them. `left`: number of Gaussians in the result divided by that in the input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) =
             (work.state_bytes(Attributes::all()), work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
@@ -116,7 +117,8 @@ impl ShDegreeStage {
         }
     }
 
-    /// Returns `compressed` with the lowest SH degree at which renders change no more than the margin allows.
+    /// Returns `compressed` with the lowest SH degree at which renders change no more than the margin allows. Adds the
+    /// measured PSNRs, and the reason if no degree is dropped, to the journal.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -159,8 +161,8 @@ impl ShDegreeStage {
     }
 }
 
-/// Returns two mean PSNRs over the views `pictures`, dB: of renders of `result` against the original, and of renders of
-/// `result` with SH degree `degree` against `result` with all degrees.
+/// Returns two mean PSNRs over the views `pictures`, dB. First: renders of `result` against renders of the original.
+/// Second: renders of `result` with SH coefficients up to `degree` only, against renders of `result` with all of them.
 fn quality_without_degrees(
     scene: &Scene,
     result: &dyn FrameSource,

@@ -1,11 +1,11 @@
-//! Error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
+//! Choice of the error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
 //!
 //! If one attribute alone has an error bound, the squared error of renders grows in proportion to the square of the
-//! bound, and each octave (doubling) of the bound saves one bit of every value that carries information. As for the
-//! quantization steps of an archive of a model, the bits are fewest for a given total error if the error of each
-//! attribute is proportional to the bits that one octave saves. Errors are measured on renders of values rounded to
-//! multiples of twice the bound, bits by encoding some blocks. Then all bounds together are made as wide as the quality
-//! of renders allows.
+//! bound, and each octave (doubling) of the bound saves one bit of every value that carries information. For a given
+//! total error the archive has the fewest bits if the error of each attribute is proportional to the bits that one
+//! octave saves in this attribute. (The same rule gives the quantization steps of an archive of a model.) Errors are
+//! measured on renders of values that are rounded to multiples of twice the bound. Bits are counted by encoding some
+//! blocks of Gaussians. Finally all bounds are widened by a common factor, as far as the quality of renders allows.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -26,24 +26,24 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Compression level of zstd for archives of frames.
 const LEVEL: i32 = 15;
-/// Initial error bounds of position, rotation, log scale, opacity and SH, in the units of the attributes; of positions,
-/// as a fraction of the scene extent. They are finer than most final bounds.
+/// Initial error bounds of position, rotation, log scale, opacity and SH: for positions as a fraction of the scene
+/// extent, for the others in the units of the attributes. They are finer than most final bounds.
 const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Maximum factor by which initial error bounds are widened; with wider bounds no motion and no color would remain.
+/// Maximum ratio of a final error bound to its initial one; with wider bounds no motion and no color would remain.
 const MAX_WIDENING: f64 = 64.0;
-/// Number of blocks of Gaussians that are encoded to count bits.
+/// Maximum number of blocks of Gaussians that are encoded to count the bits of every attribute.
 const COUNTED_BLOCKS: usize = 4;
 /// Octaves (doublings) by which the initial error bounds are widened to estimate the size of an archive without
 /// rendering.
 const ESTIMATE_OCTAVES: f64 = 2.0;
 
-/// Returns the storage options of a container whose values may err by at most `bounds`.
+/// Returns the storage options of a container whose values may differ from the exact ones by at most `bounds`.
 pub(crate) fn packing(bounds: ErrorBounds) -> Packing {
     Packing::with_bounds(bounds, LEVEL)
 }
 
-/// Returns the memory that storing the frames of an input within error bounds takes. Empty for models and point clouds,
-/// whose archives store no frames.
+/// Returns the memory that writing an archive of frames takes, as named parts in bytes. Empty for models and point
+/// clouds, whose archives store no frames.
 pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
@@ -52,10 +52,12 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
 }
 
 /// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If
-/// `psnr` is given, renders within the bounds must have this PSNR, dB, against renders of `source`.
+/// `psnr` is given, renders of the archive must have at least this PSNR, dB, against renders of `source`. Returns the
+/// bounds and the summary of the archive.
 ///
 /// # Errors
-/// Fails if frames cannot be read, if renders are not finite, or if no bounds are wide enough for the byte limit.
+/// Fails if frames cannot be read, if renders are not finite, if an archive with the widest bounds exceeds the byte
+/// limit, or if the required PSNR is missed by far ([`check_met`]).
 pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
@@ -131,8 +133,8 @@ pub(crate) fn find(
     Ok((ErrorBounds::new(widths), summary))
 }
 
-/// Returns the estimated size, bytes, of an archive of the frames of `source`. Its error bounds are fixed ones, chosen
-/// without renders.
+/// Returns the estimated size, in bytes, of an archive of the frames of `source`: the size with fixed error bounds, for
+/// which nothing has to be rendered.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -140,7 +142,8 @@ pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
     stored_bytes(scene, source, widened(&initial_bounds(source)?, ESTIMATE_OCTAVES))
 }
 
-/// Writes `source` to a scratch file with the error bounds `widths`, one per attribute. Returns the bytes of the file.
+/// Writes `source` to a scratch file with the error bounds `widths`, one per attribute. Returns the size of the file in
+/// bytes.
 fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");
@@ -148,7 +151,8 @@ fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Re
     Ok(fs::metadata(&path).map_err(Error::io("read", &path))?.len())
 }
 
-/// Returns the initial error bounds [`INITIAL_BOUNDS`], with that of positions in scene units.
+/// Returns the initial error bounds [`INITIAL_BOUNDS`], in which the bound of positions is converted to scene units by
+/// the extent of the first frame of `source`.
 fn initial_bounds(source: &dyn FrameSource) -> Result<[f64; 5]> {
     let extent = first_frame_box(source)?.map_or(1.0, |found| found.extent());
     let [position, others @ ..] = INITIAL_BOUNDS;
@@ -161,8 +165,8 @@ fn widened(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
     widths.map(|width| width * octaves.exp2())
 }
 
-/// Returns for each attribute the squared error of renders if this attribute is rounded within its bound and all others
-/// are exact.
+/// Returns for each attribute the mean squared error of renders if only this attribute is rounded within its bound in
+/// `widths` and all others are exact.
 fn errors(reference_views: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
     (0..5).map(|k| reference_views.error(&Rounded { source, bounds: ErrorBounds::new(alone(k)) })).collect()

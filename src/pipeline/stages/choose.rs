@@ -1,8 +1,8 @@
-//! Stage `choose`: compares merging with pruning to the same number of Gaussians by renders, and keeps the better
-//! result.
+//! Stage `choose`: compares the merged model with a model that is only pruned to the same number of Gaussians, and
+//! keeps the one whose renders are closer to those of the original.
 //!
-//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: the states of the original and of one
-//! alternative at one frame, and [`VIEWS_PER_BATCH`] rendered views.
+//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: the state of the original and of the
+//! merged or the pruned model at one frame, and [`VIEWS_PER_BATCH`] rendered views.
 
 use super::merge::MergeOutcome;
 use crate::compressed_model::CompressedModel;
@@ -24,14 +24,14 @@ use crate::scene::Scene;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "choose";
 
-/// Number of scored views on which merging and pruning are compared. The mean PSNR over these differs from that over
-/// all views by less than the two alternatives usually differ from each other.
+/// Number of views, chosen among those used for scoring, on which the merged and the pruned model are compared. The
+/// mean PSNR over these views differs from that over all views by less than the PSNRs of the two models usually differ.
 const COMPARED_VIEWS: usize = 24;
 
 /// Number of views of one frame that are rendered at the same time.
 const VIEWS_PER_BATCH: usize = 4;
 
-/// Bytes of memory per Gaussian for the clusters of merging, which are held twice during the comparison, and for
+/// Bytes of memory per Gaussian for the merged clusters, which are in memory twice during the comparison, and for
 /// reading their members.
 pub(crate) const CLUSTERED: u64 = 125;
 
@@ -42,7 +42,8 @@ pub(crate) struct Choose {
     pub has_target: bool,
 }
 
-/// Adds the stage to `stages` if survivors (Gaussians that are not removed) are both pruned by views and merged.
+/// Adds the stage that chooses between merging and pruning to `stages` if Gaussians are pruned by a ranking on rendered
+/// views, survivors (Gaussians that are not removed) are merged, and the recipe asks for the comparison.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.prunes_by_views() && planning.merges && planning.request.recipe.select.choose_by_views {
         stages.add(Phase::Reduce, Choose { has_target: planning.target.is_some() });
@@ -66,7 +67,8 @@ impl Stage for Choose {
 
 impl Choose {
     /// Returns the resource estimate of the stage. Its memory holds the merged and the pruned model, two states (all
-    /// Gaussians at one frame), and rendered views. `left` is the fraction of the Gaussians in the result.
+    /// Gaussians at one frame), and rendered views. `left`: number of Gaussians in the result divided by that in the
+    /// input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         // The trajectories of proxies, which replace merged clusters, are computed from all members.
@@ -97,8 +99,14 @@ impl Choose {
     }
 
     /// Compares the model `merged` with the same number of unmerged Gaussians from the top of the ranking, by mean PSNR
-    /// against the original on scored views. Returns the better model; in a tie the one without merging. If merging
-    /// loses and no exact number was requested, the returned model has as many Gaussians as selection kept.
+    /// against the original on views used for scoring.
+    ///
+    /// - If `merged` has the higher PSNR, returns it.
+    /// - Otherwise, if an exact number of Gaussians was requested, returns the unmerged model.
+    /// - Otherwise returns an unmerged model with as many Gaussians from the top of the ranking as the selection by
+    ///   scores keeps.
+    ///
+    /// Records merging that is discarded in the journal.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -135,8 +143,8 @@ impl Choose {
     }
 }
 
-/// Returns two mean PSNRs against the original over the views `pictures`, dB: of the Gaussians `pruned`, unchanged, and
-/// of the model `merged`.
+/// Returns two mean PSNRs against the original over the views `pictures`, dB. First: of the model that consists of the
+/// unchanged Gaussians `pruned` (increasing ids). Second: of the model `merged`.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[FrameView]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
@@ -174,7 +182,8 @@ mod tests {
         mean_psnr(scene, &[], compressed, &select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
-    /// Merges the Gaussians of a scene and runs the stage. Returns the merged model, the chosen model, and the journal.
+    /// Merges the Gaussians of a scene down to `target`, if given, and runs the stage. Returns the merged model, the
+    /// chosen model, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,

@@ -1,9 +1,10 @@
 //! Stage `degree`: finds the SH degree that gives the best quality for a requested size on disk.
 //!
 //! A Gaussian of SH degree 3 takes as many bytes as three and a half of degree 0. Whether more Gaussians or more SH
-//! coefficients give better renders depends on the scene. For each degree, from the highest down, as many Gaussians as
-//! fit the size are refined with a fraction of the optimization steps, until the quality on validation views no longer
-//! grows. The best degree is then refined in full by the stage `refine`.
+//! coefficients give better renders depends on the scene. The stage tries degrees from the highest down: it takes as
+//! many Gaussians of this degree as fit the size, and refines them with a fraction of the usual optimization steps. It
+//! stops at the first degree whose quality on validation views is no better than that of the degree before. The best
+//! degree is then refined in full by the stage `refine`.
 //!
 //! Memory: that of refinement.
 
@@ -22,17 +23,18 @@ use crate::scene::Scene;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "degree";
-/// Fraction of the recipe's optimization steps with which an SH degree is tried.
+/// Fraction of the recipe's optimization steps that refinement does to try an SH degree.
 const TRIAL_STEPS: f64 = 0.2;
 
 /// Stage that chooses the SH degree for a requested size on disk.
 #[derive(Debug, Clone)]
 pub(crate) struct Degree {
-    /// Refinement stage with fewer optimization steps, by which a degree is tried.
+    /// Refinement stage with fewer optimization steps than the recipe's; it is run to try an SH degree.
     refine: RefineStage,
 }
 
-/// Adds the stage to `stages` if a size on disk is requested and the run refines and may lower the SH degree.
+/// Adds the stage that chooses the SH degree to `stages` if a size on disk is requested and the run refines and may
+/// lower the SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
@@ -65,8 +67,9 @@ impl Degree {
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
 
-    /// Returns the entry of `fits` (SH degrees with the numbers of Gaussians that fit, by decreasing degree) with the
-    /// best PSNR on validation views. `template` holds all other settings of the model.
+    /// Refines models for the entries of `fits` (SH degrees with the numbers of Gaussians that fit the size, in order
+    /// of decreasing degree), and returns the entry with the best PSNR on validation views. `template` holds all other
+    /// settings of the model.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a scratch file cannot be written.

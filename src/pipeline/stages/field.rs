@@ -1,4 +1,5 @@
-//! Stage `field`: stores the deformation field of the result in half precision if renders hardly change by it.
+//! Stage `field`: stores the deformation field of the result in half precision (16-bit floats) if this hardly changes
+//! renders.
 //!
 //! Memory: two states (all Gaussians at one frame), and two rendered views.
 
@@ -24,7 +25,8 @@ use crate::source::FrameSource;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "field";
-/// Number of scored views on which renders with both precisions are compared.
+/// Number of views, chosen among those used for scoring, on which renders before and after a reduction of the model are
+/// compared.
 pub(crate) const COMPARED_VIEWS: usize = 12;
 
 /// Stage that chooses the precision in which the deformation field of a result is written.
@@ -35,7 +37,8 @@ pub(crate) struct FieldPrecisionStage {
     pub margin: f64,
 }
 
-/// Adds the stage to `stages` if the deformation field may be written in half precision.
+/// Adds the stage that chooses the precision of the deformation field to `stages` if the deformation field may be
+/// written in half precision.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = FieldPrecisionStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);
@@ -58,7 +61,8 @@ impl Stage for FieldPrecisionStage {
 }
 
 impl FieldPrecisionStage {
-    /// Returns the stage if the run writes a model folder and the recipe allows half precision.
+    /// Returns the stage if the output `kind` is a model folder and the recipe of `request` allows half precision;
+    /// otherwise `None`.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == FieldPrecision::Half)
@@ -66,7 +70,8 @@ impl FieldPrecisionStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds two states (all Gaussians at one frame), rendered
-    /// views, and a second copy of the deformation field. `left` is the fraction of the Gaussians in the result.
+    /// views, and a second copy of the deformation field. `left`: number of Gaussians in the result divided by that in
+    /// the input.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let per_gaussian = vec![
@@ -93,7 +98,8 @@ impl FieldPrecisionStage {
     }
 
     /// Returns `compressed` with its deformation field in half precision, if the input supports it and renders change
-    /// no more than the margin allows. Otherwise returns it unchanged and adds the reason to the journal.
+    /// no more than the margin allows. Otherwise returns `compressed` unchanged. Adds the measured PSNRs, and the
+    /// reason if the field stays exact, to the journal.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -128,13 +134,12 @@ impl FieldPrecisionStage {
 }
 
 /// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result.
-/// `result` is the PSNR of the result against the original; the minimum is `margin` more, but at most
-/// [`MAX_USEFUL_PSNR`].
+/// It is `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]; `result` is the PSNR of the result against the original.
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }
 
-/// Returns the mean PSNR between renders of two sources over the views `pictures`, dB.
+/// Returns the mean PSNR, dB, between renders of the two models `a` and `b` over the views `pictures`.
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sum = 0.0;

@@ -1,5 +1,5 @@
-//! Stages `scan`, `visible` and `score`, which lead from frames to a selection of Gaussians. The commands `score` and
-//! `report` also run them.
+//! Stages `scan`, `visible` and `score`, which compute the statistics and scores of the Gaussians from the frames and
+//! select the Gaussians that stay. The commands `score` and `report` run these stages, too.
 
 use std::sync::Arc;
 
@@ -20,7 +20,8 @@ use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
 
-/// Adds the stages that take statistics and score to `stages`.
+/// Adds to `stages` the stages that compute the statistics of the Gaussians and score them. Records why the visible
+/// contribution is not measured if there are no cameras for it.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
@@ -31,23 +32,25 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     stages.add(Phase::Rank, MeasureStages::from_planning(planning));
 }
 
-/// Stages that take statistics of the Gaussians and score them.
+/// Stages that compute the statistics of the Gaussians and score them.
 #[derive(Debug, Clone)]
 pub struct MeasureStages {
-    /// Scan of every frame for statistics of motion, opacity and shape.
+    /// Stage that scans the frames for statistics of motion, opacity and shape.
     pub scan: ScanStage,
-    /// Rendering of views, if the contribution C of Gaussians is measured on renders.
+    /// Stage that renders views to measure the contribution C of every Gaussian; `None` if C is computed without
+    /// renders, from opacity and projected area.
     pub visible: Option<VisibilityStage>,
-    /// Scoring of Gaussians and selection of those that stay.
+    /// Stage that scores the Gaussians and selects those that stay.
     pub score: ScoreStage,
 }
 
 impl MeasureStages {
-    /// Returns the stages for the request and the input of `planning`.
+    /// Returns the stages for the request and the input in `planning`.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> MeasureStages {
         let recipe = &planning.request.recipe;
         let mut measure = MeasureStages::new(recipe, planning.input.has_cameras, planning.user.clone());
-        // If rounds rank the Gaussians and their number is given, no threshold of the scores decides which of them stay.
+        // If pruning rounds rank the Gaussians and their number is given, no threshold of the scores decides which of
+        // them stay.
         measure.scan.can_be_partial = recipe.scan.scan_frames == ScanFrames::Needed
             && planning.target.is_some()
             && planning.prunes_by_views()
@@ -58,8 +61,8 @@ impl MeasureStages {
         measure
     }
 
-    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own; `user` holds
-    /// Gaussians that the user keeps or drops.
+    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own, rather than
+    /// virtual ones placed by the program. `user` states which Gaussians the user wants to keep or to drop in any case.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> MeasureStages {
         MeasureStages {
             scan: ScanStage { recipe: recipe.scan.clone(), can_be_partial: false },
@@ -74,7 +77,8 @@ impl MeasureStages {
         }
     }
 
-    /// Returns the resource estimates of the stages. Statistics that are `measured` already are not counted.
+    /// Returns the resource estimates (memory, time, reads) of the stages. `measured` states which kinds of statistics
+    /// were already computed; the stages that compute them are left out.
     pub fn resource_estimates(
         &self,
         work: &Workload,
@@ -90,8 +94,9 @@ impl MeasureStages {
         [scan, visible, Some(self.score.resource_estimate(work, limits))].into_iter().flatten().collect()
     }
 
-    /// Takes the statistics of the Gaussians of `scene`, unless they were taken while it arrived (`arrived`), and
-    /// scores the Gaussians.
+    /// Computes the statistics of the Gaussians of `scene` and the scores of the Gaussians, and returns both. `arrived`
+    /// holds statistics that were already computed while the input, a stream, arrived; they are used instead of a new
+    /// scan.
     ///
     /// # Errors
     /// Fails if a stage fails.
@@ -108,8 +113,8 @@ impl MeasureStages {
         scored.within(&scene.limits, &scene.scratch)
     }
 
-    /// Scans all frames. If the recipe drops Gaussians with NaN or infinity, these are marked as absent from the scene,
-    /// which is then scanned again without them.
+    /// Scans the frames of `scene` and returns the statistics of every Gaussian. If there are Gaussians with NaN or
+    /// infinity and the recipe drops them, marks them as absent from `scene` and scans again without them.
     ///
     /// # Errors
     /// Fails if frames cannot be read, or if their times do not allow statistics of motion.

@@ -1,8 +1,10 @@
 //! Stage `merge`: replaces clusters of similar survivors (Gaussians that are not removed) by one Gaussian each, a
 //! proxy.
 //!
-//! Memory: [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive, plus the memory of survivors and candidate pairs
-//! stated in [`crate::merging`], and of pairs measured at the same time stated in [`crate::merging::motion_pass`].
+//! Memory:
+//! - [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive;
+//! - the memory of survivors and of candidate pairs, stated in [`crate::merging`];
+//! - the memory of the pairs that are measured at the same time, stated in [`crate::merging::motion_pass`].
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -42,51 +44,53 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "merge";
 
-/// Name under which measured motions of pairs of Gaussians are cached. The measurement can be divided into shards.
+/// Name under which the measured motion similarities of pairs of Gaussians are cached. The measurement can be divided
+/// into shards.
 pub(crate) const PAIRS: &str = "pairs";
-/// Minimum number of pairs whose measurement is divided into shards.
+/// Minimum number of pairs of Gaussians for which the measurement of their motion is divided into shards.
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
-/// Bytes of memory per Gaussian that may survive: id, state with base colors only, whether the state is finite, and
-/// merge class. Ids count twice because merging is tried on subsets.
+/// Bytes of memory per Gaussian that may survive. They hold its id in the list of all such Gaussians and in the subset
+/// on which merging is tried, its state with base colors only, a flag whether the state is finite, and its merge class.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Assumed number of times that merging is tried until it leaves the requested number of Gaussians; used to estimate
-/// reads. The secant search usually needs fewer.
+/// Assumed number of sets of survivors on which merging is tried until it leaves the requested number of Gaussians;
+/// used to estimate reads. The secant search ([`bracket`]) usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
-/// Number of Gaussians whose full state is in memory at a time while the attributes that merging does not use are
-/// dropped.
+/// Number of Gaussians whose full states are read at a time at the reference frame. Merging then keeps only the
+/// attributes that it uses.
 const GATHER_CHUNK: usize = 16 * GAUSSIANS_PER_BLOCK;
 
-/// Processor time per Gaussian of finding neighbors, tests and clusters, seconds (`benches/merge.rs`).
+/// Processor time per Gaussian of finding neighbors, testing pairs and forming clusters, seconds (`benches/merge.rs`).
 const SECONDS_TO_MERGE: f64 = 1e-5;
-/// Approximate fraction of the Gaussians that belong to a pair whose motion is followed over the frames.
+/// Approximate fraction of the Gaussians that belong to a pair whose motion is compared over all frames.
 const FOLLOWED_FRACTION: f64 = 0.3;
 
-/// Stage that merges similar survivors.
+/// Stage that merges similar survivors (Gaussians that are not removed).
 #[derive(Debug, Clone)]
 pub(crate) struct MergeStage {
     /// Parameters of the tests for similarity, of the merge passes and of the proxies.
     pub recipe: recipe::MergeParams,
-    /// Parameters of the scan, which define life spans (frames in which a Gaussian is alive) and steps between frames.
+    /// Parameters of the scan, which define in which frames a Gaussian is alive (its life span) and how motion between
+    /// frames is measured.
     pub scan: recipe::ScanParams,
-    /// Whether survivors may be pruned, too, to reach the requested number of Gaussians.
+    /// Whether survivors may be pruned in addition to merging, to reach the requested number of Gaussians.
     pub prunes: bool,
     /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
 }
 
-/// Result of merging: the compressed model, and counts of the merge passes.
+/// Result of merging: the compressed model, and statistics of the merge passes.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct MergeOutcome {
     /// Compressed model with its merged clusters.
     pub compressed: CompressedModel,
-    /// Counts of every merge pass; `None` if nothing was merged.
+    /// Statistics of every merge pass, such as numbers of joins; `None` if nothing was merged.
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage to `stages` if survivors are merged; otherwise adds the reason why they are not.
+/// Adds the stage that merges survivors to `stages` if the run merges; otherwise records the reason why it does not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -168,8 +172,9 @@ impl MergeStage {
         }
     }
 
-    /// Merges the first `survivors` Gaussians of the ranking. If an exact number is requested and Gaussians may be
-    /// pruned, merges only as many of them as leave exactly this number. Then computes the parameters of the proxies.
+    /// Merges the first `survivors` Gaussians of the ranking, computes the parameters of the proxies, and returns the
+    /// merged model. If an exact number of Gaussians is requested and Gaussians may be pruned, merges only the first m
+    /// Gaussians of the ranking, where m is chosen so that merging leaves exactly the requested number.
     ///
     /// # Errors
     /// Fails if frames cannot be read, or if merging without pruning cannot reach the requested number.
@@ -218,10 +223,13 @@ impl MergeStage {
     }
 }
 
-/// Searches for the largest number m of survivors, up to `all`, whose merging leaves at most `target` Gaussians. m =
-/// `target` always does. `merged` returns the number that merging m survivors leaves; it grows with m except for small
-/// dips, so the interval of possible m is narrowed by the secant method. The search ends early if less than a
-/// thousandth of `target` is missing; merging can then stop that many joins early to leave exactly `target`.
+/// Returns about the largest number m of survivors, up to `all`, that can be merged so that at most `target` Gaussians
+/// are left. (m = `target` always satisfies this.) `merged` returns for a number m the number of Gaussians that are
+/// left after m survivors are merged.
+///
+/// The number left grows with m except for small dips, so the interval of possible m is narrowed by the secant method.
+/// The search ends early if the number left is below `target` by at most a thousandth of it; the caller then makes
+/// fewer joins, so that exactly `target` Gaussians are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -247,13 +255,15 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
 /// Input of merging, kept in memory so that merging can be tried on many sets of survivors.
 struct Trial<'a> {
     scored: &'a Scored,
-    /// Merge parameters of the recipe; the motion noise is raised to at least the resolution of the positions.
+    /// Merge parameters of the recipe, with the motion noise raised to at least twice the distance between neighboring
+    /// f32 values at the scene's largest coordinate.
     merge: recipe::MergeParams,
     /// Ids of the Gaussians whose states are in memory, the pool, in increasing order.
     pool: Vec<u32>,
-    /// States of the Gaussians of the pool at the reference frame, with base colors only.
+    /// States at the reference frame of the Gaussians in the pool (Gaussians in memory), with base colors only.
     states: Gaussians,
-    /// Merge class of each Gaussian of the pool. Only Gaussians of the same class may merge; `None`: never merges.
+    /// Merge class of each Gaussian in the pool (Gaussians in memory). Only Gaussians of the same class may merge.
+    /// `None`: the Gaussian never merges.
     classes: Vec<Option<u8>>,
     /// Importances of all Gaussians, by id: contribution C, and fraction Vis of the views that may show the Gaussian.
     importance: [Cow<'a, [f64]>; 2],
@@ -264,7 +274,7 @@ struct Trial<'a> {
     /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is
     /// tried.
     known: SimilarityCache,
-    /// Progress of the stage: one unit per set of survivors on which merging was tried.
+    /// Progress display of the stage: one unit per set of survivors on which merging was tried.
     progress: &'a Progress,
 }
 
@@ -303,7 +313,8 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left.
+    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left, and returns the result. Fails
+    /// if merging cannot reduce them to so few.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
         let left = merged.compressed.len();
@@ -316,8 +327,8 @@ impl<'a> Trial<'a> {
         Ok(merged)
     }
 
-    /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory). Stops after `limit` joins, if
-    /// given.
+    /// Merges `survivors` (increasing ids, all in the pool of Gaussians in memory), and returns the result. If `limit`
+    /// is given, stops after this number of joins (a join reduces the number of Gaussians by one).
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
         let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
             self;
@@ -347,8 +358,10 @@ impl<'a> Trial<'a> {
     }
 }
 
-/// Returns the similarity of motion of each of `pairs`, not in the order of `pairs`. A large number of pairs is sorted
-/// by position and divided into shards.
+/// Measures the similarity of motion of the two Gaussians of each pair in `pairs`. Returns the pairs with their
+/// similarities, in no particular order. The pairs hold indices in `pool`, the ids of the Gaussians in memory;
+/// `reference` holds the positions of these Gaussians at the reference frame. If there are many pairs, sorts them by
+/// position in space and divides them into shards.
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,

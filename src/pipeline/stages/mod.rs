@@ -21,10 +21,10 @@ pub mod write;
 use super::planning::Planning;
 use super::stage::StageList;
 
-/// Function that adds a stage to the list of a run if the request needs it, or adds the reason why the run omits it.
+/// Function that adds a stage to the list of a run if the request needs it, or records the reason why the run omits it.
 pub(super) type PlanStage = fn(&Planning<'_>, &mut StageList);
 
-/// Functions that plan the stages, in the order in which stages run.
+/// Functions that add the stages to a plan, in the order in which the stages run.
 pub(super) const STAGES: &[PlanStage] = &[
     measure::plan,
     size::plan_count,

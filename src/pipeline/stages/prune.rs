@@ -21,7 +21,8 @@ pub(crate) struct Prune {
     pub merges: bool,
 }
 
-/// Adds the stage to `stages`.
+/// Adds the stage that prunes Gaussians to `stages`. If the user asks for merging only, also records that pruning is
+/// omitted.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if !planning.prunes {
         stages.leave_out("pruning", "--merge-only");
@@ -47,12 +48,17 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors (Gaussians that are not removed); with a `target`, this number. If merging later
-    /// reduces them to the target, returns all Gaussians that may stay, because only merging can tell how many it
-    /// needs.
+    /// Returns the number of survivors (Gaussians that are not removed):
+    /// - if Gaussians are not pruned by rank: all Gaussians in `ranked`;
+    /// - otherwise, if no number of Gaussians is requested (`target` is `None`): the number that the thresholds of the
+    ///   recipe select;
+    /// - otherwise, if survivors are not merged later: `target`;
+    /// - otherwise: all Gaussians in `ranked`, because merging later reduces them to `target`, and only merging can
+    ///   tell how many it needs.
     ///
     /// # Errors
-    /// Fails if the target is below the number of Gaussians that must stay or above the number that may stay.
+    /// Fails if the target is below the number of Gaussians that must stay, or above the number of Gaussians in
+    /// `ranked`.
     pub(crate) fn survivors(
         &self,
         scene: &Scene,

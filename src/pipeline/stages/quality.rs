@@ -1,9 +1,10 @@
 //! Stage `quality`: measures PSNR and SSIM of the result against the original, on views that were used neither to fit
-//! nor to choose anything, and the time of a render before and after.
+//! nor to choose anything. It also measures the time of rendering a view of the original and of the result.
 //!
 //! If the cameras have a test split, test views are measured: at most [`MOST_VIEWS`], spread over frames and views, and
-//! fewer in a short run ([`SHARE`]). Without a test split, the result on the validation views of refinement is
-//! reported, with this label because they chose the best state. Without either, training views are measured.
+//! fewer in a short run ([`SHARE`]). Without a test split, the PSNR on the validation views of refinement is reported.
+//! It is labeled as such, because these views were used to choose the best state of refinement. Without test and
+//! validation views, training views are measured.
 //!
 //! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
@@ -36,12 +37,14 @@ const MOST_VIEWS: usize = 60;
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take.
 const SHARE: f64 = 0.02;
-/// Maximum reads of the input, relative to reading the measured views once: for the original, for the result, whose
-/// frames are computed from the same input, and for the timed views.
+/// Maximum number of times that the frames of the measured views are read: for the original, for the result (whose
+/// frames are computed from the same input) and for the timed views.
 const READS: f64 = 2.5;
-/// The same maximum for a result with proxies, whose members lie in other blocks of the input than their leaders.
+/// Maximum number of times that the frames of the measured views are read for a result with proxies (Gaussians that
+/// replace merged clusters). It is higher than [`READS`] because the members of a cluster lie in several blocks of the
+/// input.
 const MERGED_READS: f64 = 6.0;
-/// Bytes that must be left within the memory limit besides the estimate: this optional stage runs only if memory is
+/// Bytes that must remain free within the memory limit, beyond the estimate: this optional stage runs only if memory is
 /// plentiful.
 const MARGIN: u64 = 8 << 20;
 /// Number of views whose rendering is timed, on one thread.
@@ -55,7 +58,8 @@ pub(crate) struct QualityStage {
     merges: bool,
 }
 
-/// Adds the stage to `stages`, unless it does not fit within the memory limit or is not wanted.
+/// Adds the stage that measures the quality of the result to `stages` if the quality is to be measured; otherwise
+/// records that memory does not suffice for it.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     match planning.measures_quality {
         true => {
@@ -66,7 +70,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     }
 }
 
-/// Notes that the quality is not measured, because memory does not suffice.
+/// Records in `stages` that the quality is not measured because memory does not suffice.
 pub(in crate::pipeline) fn leave_out(stages: &mut StageList) {
     stages.leave_out("quality on test views", "memory: it does not fit within the limit (--memory)");
 }
@@ -96,8 +100,8 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
-    /// Returns the resource estimate of rendering views of the original and of the result, which has the fraction
-    /// `left` of the Gaussians.
+    /// Returns the resource estimate of the stage, which renders views of the original and of the result. `left`:
+    /// number of Gaussians in the result divided by that in the input.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
         let of_views = pictures::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
@@ -113,8 +117,9 @@ impl QualityStage {
         }
     }
 
-    /// Measures the quality of the result of `run`. Returns `None` if the result has no frames that can be rendered
-    /// yet.
+    /// Measures the quality of the result of `run`. Returns `None` if the result is an archive of frames: its frames
+    /// exist only once it is written. If refinement used validation views and there are no test views, takes the PSNR
+    /// on the validation views from the journal.
     fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;
@@ -152,9 +157,9 @@ impl QualityStage {
         Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))
     }
 
-    /// Returns on how many views quality is measured: [`MOST_VIEWS`], or fewer if they would take more than the
-    /// fraction [`SHARE`] of the run. Times are estimates for a reference machine, so that the number of views is the
-    /// same on every machine.
+    /// Returns the number of views on which quality is measured: [`MOST_VIEWS`], or fewer if these would take more than
+    /// the fraction [`SHARE`] of the time of the run, but at least [`FEWEST_VIEWS`]. Times are estimates for a
+    /// reference machine, so that the number of views is the same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
         let work = Workload { throughput: Throughput::UNKNOWN, ..scene.workload() };
@@ -171,7 +176,7 @@ impl QualityStage {
 /// Approximate processor time of PSNR and SSIM per pixel, seconds (`benches/filters.rs`).
 const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
 
-/// Returns the mean PSNR, dB, and the mean SSIM of renders of `result` against the original over `views`.
+/// Returns the mean PSNR, dB, and the mean SSIM of renders of `result` against renders of the original over `views`.
 fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<(f64, f64)> {
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
@@ -189,9 +194,10 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     Ok((mean(|score| score.0), mean(|score| score.1)))
 }
 
-/// Returns the median times of rendering one view of the original and of the result on one thread, milliseconds,
-/// without the evaluation of the deformation field. Each view is rendered once before its time is taken, to warm the
-/// processor's caches.
+/// Returns two median times, in milliseconds: of rendering a view of the original, and of rendering a view of the
+/// result, on one thread. The evaluation of the deformation field is not included. Each view is rendered once before
+/// its time is taken, to fill the processor's caches. Returns `None` if there are no views or a thread cannot be
+/// started.
 pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<Option<RenderTime>> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
     let views = spread_views(views.to_vec(), TIMED_VIEWS);

@@ -1,4 +1,5 @@
-//! Quality targets of archives, and the views on which an archive is compared with the result before quantization.
+//! Quality targets of archives, and renders of the result before quantization, with which renders of an archive are
+//! compared.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -11,65 +12,73 @@ use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Minimum and maximum number of views on which an archive is compared. Between these, [`MAX_VIEW_BYTES`] decides.
+/// Minimum and maximum number of views on which an archive is compared with the result before quantization. Between
+/// these limits, [`MAX_VIEW_BYTES`] determines the number.
 const VIEW_COUNTS: [u64; 2] = [4, 12];
-/// Maximum bytes of memory of all renders of the result and of the original, from which the number of compared views
-/// follows.
+/// Maximum bytes of memory of all renders of the result and of the original together. The number of compared views
+/// follows from this limit.
 const MAX_VIEW_BYTES: u64 = 128 << 20;
-/// Maximum loss of PSNR against the original by quantization if the user requests nothing, dB.
+/// Maximum amount by which quantization may lower the PSNR against the original if the user requests no quality and no
+/// size, dB.
 const DEFAULT_LOSS: f64 = 0.5;
 /// PSNR of the result against the original, dB, above which the errors of pruning are too small to hide quantization
 /// noise. The archive then has to reach this PSNR against the result before quantization.
 const ENOUGH_PSNR: f64 = 50.0;
-/// Surplus of quality that a search for a quality leaves for quantization, dB. It corresponds to a third of the squared
-/// error of pruning: at the best trade-off, errors are proportional to how fast bytes fall with them, which is about
-/// three times as fast for the number of Gaussians as for quantization.
+/// Surplus of PSNR, dB, that a search for a quality reserves for the later quantization of an archive. With it,
+/// quantization may add a third of the squared error of pruning: 10·log10(1 + 1/3) ≈ 1.2. A third is the best
+/// trade-off, because a relative growth of the error of pruning saves about three times as many bytes as the same
+/// growth of the error of quantization.
 pub(crate) const ARCHIVE_HEADROOM: f64 = 1.2;
-/// Maximum shortfall of the PSNR of an archive against its target, dB.
+/// Maximum amount by which the PSNR of an archive may be below its target, dB.
 const MAX_SHORTFALL: f64 = 10.0;
 /// Bytes of memory per pixel of a rendered view.
 pub(crate) const BYTES_PER_PIXEL: u64 = 3 * size_of::<f32>() as u64;
-/// Number of rounds in which the error and the bits of every group of values are measured and the quantization steps
-/// adjusted.
+/// Number of balancing rounds. Each round measures the error and the bits of every group of values (attribute or
+/// tensor), and adjusts the quantization steps of the groups.
 pub(crate) const BALANCING_ROUNDS: usize = 2;
-/// Maximum change of a quantization step after one measurement, octaves (doublings).
+/// Maximum change of a quantization step in one balancing round, octaves (doublings).
 const MAX_STEP_CHANGE: f64 = 2.5;
-/// Smallest squared error of renders that is distinguished from 0.
+/// Smallest mean squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
-/// Range of the final common change of all quantization steps, octaves (doublings), from finer to coarser.
+/// Range, in octaves (doublings), of the common change of all quantization steps at the end: from the finest to the
+/// coarsest steps.
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
-/// Number of times that [`OCTAVE_RANGE`] is halved to find the change.
+/// Number of bisection steps that find the common change of all quantization steps within [`OCTAVE_RANGE`].
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Search range if the archive has a byte limit. At the end, all quantization steps are multiplied by one factor
-/// 2^octaves, chosen so that the archive just fits the limit. First the coarsest, then the finest allowed number of
-/// octaves.
+/// Range, in octaves (doublings), of the common change of all quantization steps at the end if the archive has a byte
+/// limit: from the coarsest to the finest steps. The change is chosen so that the archive is as large as the limit
+/// allows.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
-/// Number of times that [`BYTES_OCTAVE_RANGE`] is halved to find the change.
+/// Number of bisection steps that find the common change of all quantization steps within [`BYTES_OCTAVE_RANGE`].
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
-/// Returns the number of views on which an archive is compared, for views of `pixels` pixels each.
+/// Returns the number of views on which an archive is compared with the result before quantization, if each view has
+/// `pixels` pixels.
 pub(crate) fn pictures(pixels: u64) -> u64 {
     let [fewest, most] = VIEW_COUNTS;
     (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
 
-/// What the goal of the run requires of an archive. The PSNR of the option `--archive-psnr` is passed separately.
+/// Requirement on an archive that follows from the goal of the run. The PSNR of the option `--archive-psnr` is passed
+/// separately.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub enum ArchiveTarget {
-    /// The goal requires nothing.
+    /// No requirement.
     Nothing,
-    /// Maximum loss of PSNR against the original by quantization, dB.
+    /// Maximum amount by which quantization may lower the PSNR against the original, dB.
     Loss(f64),
     /// Maximum number of bytes of the archive.
     Bytes(u64),
 }
 
-/// Requirement that the quantization steps of an archive have to meet.
+/// Requirement that an archive has to meet. It results from the goal of the run, the option `--archive-psnr` and the
+/// defaults.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum QualityTarget {
-    /// Minimum PSNR against the result before quantization, dB.
+    /// Minimum PSNR of renders of the archive against renders of the result before quantization, dB.
     Close(f64),
-    /// Maximum loss of PSNR against the original, compared with the result before quantization, dB.
+    /// Maximum amount by which the PSNR against the original may be lower for the archive than for the result before
+    /// quantization, dB.
     Loss(f64),
     /// Maximum number of bytes of the archive.
     Bytes(u64),
@@ -77,7 +86,8 @@ pub(crate) enum QualityTarget {
 
 impl QualityTarget {
     /// Returns the requirement for an archive of a result whose PSNR against the original is `level`, dB. `psnr` is the
-    /// value of the option `--archive-psnr`, if given; `asked` is what the goal of the run requires.
+    /// value of the option `--archive-psnr`, if given; `asked` is the requirement that follows from the goal of the
+    /// run.
     pub(crate) fn new(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
         match (psnr, asked) {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
@@ -89,8 +99,8 @@ impl QualityTarget {
     }
 
     /// Returns whether an archive meets the requirement. `psnr` is its PSNR against the result before quantization,
-    /// `loss` its loss of PSNR against the original, both in dB. `asked` is the value of
-    /// [`required_psnr`](QualityTarget::required_psnr).
+    /// `loss` is the amount by which quantization lowered its PSNR against the original; both are in dB. `asked` is the
+    /// result of [`required_psnr`](QualityTarget::required_psnr).
     pub(crate) fn is_met_by(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
         match self {
             QualityTarget::Loss(most) => loss <= most,
@@ -98,8 +108,9 @@ impl QualityTarget {
         }
     }
 
-    /// Returns the PSNR against the result before quantization, dB, that corresponds to the requirement. `level` is the
-    /// PSNR of the result against the original, dB.
+    /// Returns the PSNR, dB, that renders of the archive must have against renders of the result before quantization.
+    /// `level` is the PSNR of the result before quantization against the original, dB; the returned PSNR depends on it
+    /// if the requirement is a maximum loss or a byte limit.
     pub(crate) fn required_psnr(self, level: f64) -> f64 {
         match self {
             QualityTarget::Close(psnr) => psnr,
@@ -152,14 +163,15 @@ impl ReferenceViews<'_> {
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
     }
 
-    /// Returns the mean squared error of renders of `source` against the reference renders.
+    /// Returns the mean squared error of renders of `source` against the reference renders. Color values are from 0 to
+    /// 1.
     pub(crate) fn error(&self, source: &dyn FrameSource) -> Result<f64> {
         let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
     }
 }
 
-/// Returns `psnr`, the PSNR of a result against the original, if it is a number.
+/// Checks that `psnr`, the PSNR of a result against the original in dB, is a number, and returns it.
 ///
 /// # Errors
 /// Fails if `psnr` is NaN, which means that some pixels are NaN.
@@ -193,8 +205,10 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
     }
 }
 
-/// Searches a range for the number nearest to its second end at which `evaluate` returns a result, by bisection with
-/// `halvings` steps from the first end. Returns this result, or `None` if no tried number has one.
+/// Searches the range `[low, high]` by bisection, with `halvings` steps, for the number nearest to `high` at which
+/// `evaluate` returns a result. Assumes that there is a result at every number between `low` and the one searched for.
+/// `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried number has a
+/// result.
 pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],
     halvings: usize,
@@ -211,8 +225,8 @@ pub(crate) fn bisect<T>(
     Ok(best)
 }
 
-/// Returns by how many octaves (doublings) a quantization step that causes the squared error `found` must grow to cause
-/// about `error`. The change is limited to [`MAX_STEP_CHANGE`] in both directions.
+/// Returns the number of octaves (doublings) by which a quantization step must grow so that it causes about the squared
+/// error `error` instead of `found`, the measured one. The result is limited to [`MAX_STEP_CHANGE`] in both directions.
 pub(crate) fn step_change(error: f64, found: f64) -> f64 {
     (0.5 * (error / found.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
 }

@@ -9,8 +9,8 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets;
 use crate::scene::Scene;
 
-/// Adds the stage to `stages` if the recipe refines and memory suffices. Adds the reason for parts that are omitted for
-/// lack of memory.
+/// Adds the refinement stage to `stages` if the recipe refines and memory suffices. Records the parts of refinement
+/// that are omitted for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     for (what, bytes) in planning.fallback.left_out() {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
@@ -31,8 +31,9 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
     }
 
-    /// Returns whether at most the fraction `hardly_seen` of the Gaussians is removed, so that the result may be close
-    /// enough to the original without refinement.
+    /// Returns whether refinement may be unnecessary, because the run removes only Gaussians whose removal hardly
+    /// changes renders. `hardly_seen` is the fraction of such Gaussians. The result may then be close enough to the
+    /// original without refinement.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
         input.left >= 1.0 - hardly_seen
     }

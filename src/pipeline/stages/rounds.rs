@@ -1,11 +1,11 @@
 //! Stage `rounds`: ranks the Gaussians by removal error (squared error of renders caused by removing one) in pruning
 //! rounds, each of which measures the errors anew on a smaller model.
 //!
-//! For strong reductions, one measurement on the full model is not enough: when a Gaussian is removed, those behind it
-//! become visible, and others that it made redundant are needed. So each round measures the survivors (Gaussians not
-//! removed so far), ranks them by [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors
-//! of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a larger one.
-//! Memory: see [`removal_error`].
+//! For strong reductions, one measurement on the full model is not enough. When a Gaussian is removed, Gaussians behind
+//! it become visible, and others become necessary that were redundant beside it. So each round measures the survivors
+//! (Gaussians not removed so far), ranks them by [`RemovalError`](crate::render::RemovalError) and removes the lowest.
+//! The survivors of a round do not depend on the final number of Gaussians, so a smaller target keeps a subset of a
+//! larger one. Memory: see [`removal_error`].
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -32,31 +32,37 @@ use crate::scene::Scene;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "rounds";
 
-/// Stage that ranks Gaussians in pruning rounds.
+/// Stage that ranks Gaussians in pruning rounds. A round measures the removal error of the survivors, ranks them and
+/// removes the lowest.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Fraction of the Gaussians that a round leaves.
+    /// Fraction of the Gaussians present at the start of a round that the round leaves.
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
     /// Number of groups (turns) into which the views are divided. A round renders the views of one group; for the other
     /// groups it uses errors measured in earlier rounds.
     pub turns: usize,
-    /// Minimum contrast that is assumed between a Gaussian and what is behind it.
+    /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
+    /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
+    /// color of its background.
     pub contrast_floor: f64,
-    /// Smallest fraction of the Gaussians that the last round is assumed to leave; bounds the number of rounds in
-    /// estimates.
+    /// Smallest fraction of the Gaussians of the input that the last round is assumed to leave; bounds the number of
+    /// rounds in estimates.
     pub fewest: f64,
-    /// Fraction of the Gaussians that the last round usually leaves; used for estimates of time.
+    /// Fraction of the Gaussians of the input that the last round usually leaves; used for estimates of time.
     pub usual: f64,
 }
 
-/// Smallest fraction left ([`Rounds::fewest`]) if no size is requested.
+/// Value of [`Rounds::fewest`] (smallest fraction of the Gaussians that the last round is assumed to leave) if the user
+/// requests no number of Gaussians.
 const MIN_LEFT: f64 = 0.05;
-/// Usual fraction left ([`Rounds::usual`]) if no size is requested.
+/// Value of [`Rounds::usual`] (fraction of the Gaussians that the last round usually leaves) if the user requests no
+/// number of Gaussians.
 const USUAL_LEFT: f64 = 0.5;
 
-/// Adds the stage to `stages` if Gaussians are ranked by views.
+/// Adds the stage that ranks Gaussians in pruning rounds to `stages` if Gaussians are pruned by a ranking on rendered
+/// views and the recipe asks for several rounds.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.target_fraction());
     if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {
@@ -92,8 +98,8 @@ impl Stage for Rounds {
 }
 
 impl Rounds {
-    /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians.
-    /// The stage needs the visible contributions of the Gaussians.
+    /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians,
+    /// if any. The stage can run only if the visible contributions of the Gaussians were measured.
     pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
         let recipe::SelectParams {
             round_fraction: fraction,
@@ -106,8 +112,8 @@ impl Rounds {
         (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
-    /// Returns the resource estimate of the stage. Its memory holds the ranking, and what rendering all survivors
-    /// needs.
+    /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
+    /// buffers for rendering all survivors.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
@@ -137,15 +143,16 @@ impl Rounds {
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
-    /// Returns the rounds from `count` Gaussians down to `fewest`, for display: one line each with the number of views.
+    /// Returns one line of text for display for each round on the way from `count` Gaussians down to `fewest`: the name
+    /// of the round and the maximum number of its views.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
         let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
         rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// Returns the views divided into groups (turns). Views of a frame stay together if there are enough frames,
-    /// otherwise views are divided one by one.
+    /// Chooses the views by which Gaussians are ranked, and returns them divided into groups (turns). Views of a frame
+    /// are in the same group if there are at least as many frames as groups; otherwise views are divided one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = select_evenly_over_frames(&scene.schedule, self.pictures, scored.frames_to_cover);
         let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
@@ -156,9 +163,12 @@ impl Rounds {
         turns
     }
 
-    /// Ranks all Gaussians that are not dropped in rounds, until a round leaves at most `fewest`. The Gaussians removed
-    /// in one round, and the survivors of the last round, are ordered by removal error; ties keep the order of the
-    /// ranking `before`. Gaussians that must stay come first.
+    /// Ranks the Gaussians of the ranking `before` anew by pruning rounds, until a round leaves at most `fewest`, and
+    /// returns the new ranking.
+    ///
+    /// The new ranking begins with the Gaussians that must stay, by id. The other survivors of the last round follow,
+    /// then the Gaussians removed in each round, from the last round to the first. Each of these sets is sorted by
+    /// descending removal error; ties keep the order of `before`. If no round is needed, returns `before`.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -208,8 +218,9 @@ impl Rounds {
         Ok(Ranking::new(protected.iter().copied().chain(free).chain(removed).collect()))
     }
 
-    /// Returns how many of `free` Gaussians (which may be removed) each round leaves, until these and the `protected`
-    /// Gaussians together are at most `fewest`. Every round removes at least one.
+    /// Returns for each round the number of removable Gaussians that it leaves. At the start there are `free` removable
+    /// Gaussians and `protected` Gaussians that must stay; rounds follow until both together are at most `fewest`.
+    /// Every round removes at least one Gaussian.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
@@ -220,8 +231,13 @@ impl Rounds {
         sizes
     }
 
-    /// Runs round number `round`, which leaves `left` of the Gaussians that may be removed. Its views can be divided
-    /// among shards.
+    /// Runs a pruning round and returns the new state. The views of the round can be divided among shards.
+    ///
+    /// - `state`: state before the round; `turns`: all groups of views;
+    /// - `round`: number of the round, from 0;
+    /// - `key`: cache key of the whole ranking;
+    /// - `left`: number of removable Gaussians that the round leaves;
+    /// - `stride`: only every `stride`-th pixel of a view in each direction is rendered.
     fn round(
         &self,
         scene: &Scene,
@@ -279,24 +295,24 @@ impl Rounds {
     }
 }
 
-/// State of the ranking after a round.
+/// State of the ranking between two pruning rounds.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Ids of the survivors that may be removed, best first.
+    /// Ids of the survivors that later rounds may remove, best first.
     free: Vec<u32>,
-    /// Ids of the removed Gaussians, worst last.
+    /// Ids of the Gaussians removed so far, worst last.
     removed: Vec<u32>,
     /// For each group of views: removal error of every Gaussian, by id, from the last round that rendered this group.
     errors: Vec<Vec<u64>>,
 }
 
-/// Returns the name under which a round is cached.
+/// Returns the name under which the result of round number `round` (from 0) is cached.
 fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Returns the indices of the groups of views that a round renders: all groups in the first round, then one per round
-/// in turn.
+/// Returns the indices in `turns` of the groups of views that round number `round` (from 0) renders: all groups in the
+/// first round, then one group per round in turn.
 fn active_turns(turns: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
     let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
@@ -313,7 +329,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::render::render;
 
-    /// Returns the ranking by score, and the ranking by rounds down to `fewest` Gaussians.
+    /// Returns two rankings of the Gaussians of `scene`: by score, and by pruning rounds down to `fewest` Gaussians.
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);

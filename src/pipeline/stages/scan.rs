@@ -1,4 +1,5 @@
-//! Stage `scan`: reads every Gaussian at every frame once and gathers its statistics in a state of fixed size.
+//! Stage `scan`: reads every Gaussian at every frame once and gathers its statistics in a record whose size does not
+//! depend on the number of frames.
 
 use crate::error::Result;
 use crate::journal::Journal;
@@ -21,8 +22,8 @@ const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
 /// Processor time of projecting one Gaussian at one frame to a view, seconds (`benches/projection.rs`).
 const SECONDS_TO_PROJECT: f64 = 8e-9;
 
-/// Maximum number of frames that a partial scan reads. They give the bounds of positions and the fraction of views in
-/// which a Gaussian is on screen; neither decides which Gaussians stay.
+/// Maximum number of frames that a partial scan reads. These frames give the bounds of positions and the fraction of
+/// views in which a Gaussian is on screen; neither decides which Gaussians stay.
 const PARTIAL_FRAMES: usize = 24;
 
 /// Stage that gathers the statistics of all Gaussians.
@@ -30,14 +31,15 @@ const PARTIAL_FRAMES: usize = 24;
 pub struct ScanStage {
     /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
-    /// Whether the statistics of motion and opacity (D, κ and V) decide nothing in this run. If a deformation field
-    /// also gives the frames, few of them are read: its values change smoothly with time.
+    /// Whether the scan may read only some of the frames, because the statistics of motion and opacity (D, κ and V)
+    /// decide nothing in this run. Frames are skipped only if a deformation field computes them, because its values
+    /// change smoothly with time.
     pub can_be_partial: bool,
 }
 
 impl ScanStage {
     /// Returns the number of frames that the scan of a sequence of `frames` frames reads. `is_deformed`: whether a
-    /// deformation field gives the frames.
+    /// deformation field computes the frames.
     fn frames_read(&self, frames: usize, is_deformed: bool) -> usize {
         if self.can_be_partial && is_deformed { frames.min(PARTIAL_FRAMES) } else { frames }
     }
@@ -97,7 +99,8 @@ impl ScanStage {
         Ok(found.for_all_frames(&frames, info.times.len()))
     }
 
-    /// Reads all frames of `source`, which are frames of `scene`, seen by the cameras of `schedule`.
+    /// Reads all frames of `source` (all or some frames of `scene`), and returns the statistics of every Gaussian as
+    /// the recipe in `plan` defines them. `schedule` holds the views of these frames.
     fn scan_frames(
         &self,
         scene: &Scene,
@@ -123,7 +126,7 @@ impl ScanStage {
     }
 }
 
-/// Returns the frames of `schedule` that have views, increasing.
+/// Returns the indices of the frames that have views in `schedule`, in increasing order.
 fn frames_with_views(schedule: &ViewSchedule) -> Vec<usize> {
     (0..).zip(schedule.iter()).filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect()
 }

@@ -1,6 +1,6 @@
-//! The two stages `size` of a run with a requested size on disk. The first finds how many Gaussians fit, before
-//! anything is ranked. The second removes Gaussians from the result at the end if its refined values take more bytes
-//! than the values with which the number was found.
+//! Two stages, both named `size`, of a run with a requested size on disk. The first stage finds how many Gaussians fit
+//! the size, before Gaussians are ranked. The second stage removes Gaussians from the result at the end, if the result
+//! exceeds the size because refined values compress worse than the values with which the number was found.
 
 use std::num::NonZeroU32;
 
@@ -24,22 +24,24 @@ use crate::scene::Scene;
 
 /// Name of both stages in plans, progress and summaries.
 const NAME: &str = "size";
-/// Fraction of the byte limit that may remain unused.
+/// Fraction of the byte limit that may remain unused. The search for the number of Gaussians that fit the limit ends
+/// once at most this fraction is unused.
 const MAX_UNUSED: f64 = 0.01;
-/// Maximum number of sizes (numbers of Gaussians) that are written to measure their bytes.
+/// Maximum number of sizes (numbers of Gaussians) for which the search for the number that fits writes an output to
+/// measure its bytes.
 const MAX_TRIED: usize = 8;
 /// Number of views by which Gaussians are ranked if the result exceeds the byte limit.
 const RANKING_VIEWS: usize = 48;
 
-/// Adds the stage that finds how many Gaussians fit the byte limit to `stages`, if one is requested.
+/// Adds to `stages` the stage that finds how many Gaussians fit the requested size on disk, if a size is requested.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning) {
         stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_degree(), limit });
     }
 }
 
-/// Adds the stage that shrinks a result above the byte limit to `stages`. An archive needs no such stage, because its
-/// quantization steps are adapted to the limit.
+/// Adds to `stages` the stage that removes Gaussians from a result above the requested size on disk, if a size is
+/// requested. An archive needs no such stage, because its quantization steps are adapted to the size.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
@@ -50,7 +52,8 @@ pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
-    /// Whether lower SH degrees are tried, too.
+    /// Whether lower SH degrees are tried as well: the number of Gaussians that fit the byte limit is then found for
+    /// each of them.
     drops_bands: bool,
 }
 
@@ -90,11 +93,12 @@ impl Stage for ShrinkToBytes {
 /// Limit on the bytes of all output files together.
 #[derive(Debug, Clone)]
 struct ByteLimit {
-    /// Stage that writes the output files, by which sizes are measured.
+    /// Stage that writes the output files; used to measure the size of a result.
     writer: WriteStage,
     /// Maximum number of bytes of all output files together.
     most: u64,
-    /// Precision of the deformation field that is assumed: half precision if the recipe allows it.
+    /// Precision of the deformation field that is assumed when sizes are measured: half precision if the recipe allows
+    /// it.
     field: FieldPrecision,
 }
 
@@ -106,12 +110,13 @@ impl ByteLimit {
         Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
-    /// Returns how many of the Gaussians `ids` fit the byte limit with the SH degree of `template` and, if `drops`,
-    /// with every lower degree, until all Gaussians fit. `recipe` is the size of the recipe file, bytes. See
-    /// [`ByteLimit::count`].
+    /// Returns how many of the Gaussians `ids` fit the byte limit ([`ByteLimit::count`]), for one or more SH degrees.
+    /// The first degree is that of `template`. If `drops`, lower degrees follow in decreasing order, up to the first
+    /// degree at which all Gaussians fit. `template` holds the other settings of the model, `recipe` is the size of the
+    /// recipe file, bytes.
     ///
     /// # Errors
-    /// Fails where [`ByteLimit::count`] fails.
+    /// Fails in the cases in which [`ByteLimit::count`] fails.
     fn fits(
         &self,
         scene: &Scene,
@@ -140,8 +145,9 @@ impl ByteLimit {
         scene.work.key(&(self.writer.kind, self.writer.merges, self.most, recipe, compressed))
     }
 
-    /// Returns how many of the Gaussians `ids`, evenly sampled, fit the byte limit. `template` holds the other settings
-    /// of the model, `recipe` is the size of the recipe file, bytes.
+    /// Returns how many Gaussians an output within the byte limit can hold. Sizes are measured on evenly spaced samples
+    /// of the Gaussians `ids`. `template` holds the other settings of the model, such as the SH degree; `recipe` is the
+    /// size of the recipe file, bytes.
     ///
     /// # Errors
     /// Fails if not even one Gaussian fits, if frames cannot be read, or if a write fails.
@@ -196,8 +202,9 @@ impl ByteLimit {
     }
 
     /// Removes the Gaussians with the lowest removal error (squared error of renders caused by removing one) from
-    /// `compressed` until the output fits the byte limit. Refined values may compress worse than those with which the
-    /// number of Gaussians was found. Gaussians that must stay are not removed.
+    /// `compressed` until the output fits the byte limit, and returns the smaller model. This is needed if refined
+    /// values compress worse than the values with which the number of Gaussians was found. Gaussians that must stay are
+    /// not removed. `recipe` is the size of the recipe file, bytes.
     ///
     /// # Errors
     /// Fails if the Gaussians that must stay do not fit alone, if frames cannot be read, or if a write fails.
@@ -250,10 +257,12 @@ impl ByteLimit {
     }
 }
 
-/// Returns how many of `count` Gaussians to try next, after `tried` sizes, if the fraction `part` of their bytes is
-/// expected to fit. At least `protected` Gaussians, fewer than `count`, stay. The result is less than `count`. After
-/// [`MAX_TRIED`] sizes it is at most half of `count`, so that the search ends after at most 32 more sizes, however
-/// bytes depend on the number of Gaussians.
+/// Returns the number of Gaussians to try next if an output with `count` Gaussians takes too many bytes. `part`: number
+/// of bytes that the Gaussians may take, divided by the number that they take. `protected`: number of Gaussians that
+/// must stay, less than `count`. `tried`: number of sizes tried before.
+///
+/// The result is at least `protected` and less than `count`. After [`MAX_TRIED`] sizes, it is at most half of `count`
+/// (or `protected`). So the search ends after at most 32 more sizes, however bytes depend on the number of Gaussians.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)

@@ -36,13 +36,13 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "emit";
 
-/// Fraction of the Gaussians that is usually written; used for estimates of time.
+/// Assumed fraction of the input's Gaussians that a run writes; used for estimates of time.
 const USUAL_LEFT: f64 = 0.5;
 /// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
 pub const SECONDS_TO_ENCODE: f64 = 3.5e-7;
 
-/// Assumed maximum number of bytes of the summary and a file header beside a result. Long lists of files or notes may
-/// exceed it.
+/// Assumed maximum number of bytes of two parts of the files beside a result: the summary, and the header of the index
+/// map. Long lists of files or notes may exceed it.
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
 /// Name of the file, beside every result, that holds all parameters of its run.
@@ -81,7 +81,7 @@ pub struct WriteStage {
     overwrite: Replace,
 }
 
-/// Adds the stage to `stages`.
+/// Adds the stage that writes the result to `stages`.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     stages.add(Phase::Write, WriteStage::from_planning(planning));
 }
@@ -147,7 +147,8 @@ impl Stage for WriteStage {
     }
 }
 
-/// Replaces the output indices in `map` by indices in the file, whose Gaussian `i` had the index `order[i]` before.
+/// Adapts `map`, which holds for every input Gaussian its index in the result, to an output file with another order of
+/// Gaussians. The Gaussian with index `i` in the file has the index `order[i]` in the result.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     let mut places = vec![0; order.len()];
     order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
@@ -185,8 +186,8 @@ impl WriteStage {
         self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
-    /// Returns the resource estimate of the stage. Its memory holds the result, which has the fraction `left` of the
-    /// Gaussians, and write buffers.
+    /// Returns the resource estimate of the stage. Its memory holds the result and write buffers. `left`: number of
+    /// Gaussians in the result divided by that in the input.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let is_solved = work.input.reduced > 0;
@@ -240,8 +241,9 @@ impl WriteStage {
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Returns the bytes of all output files of `compressed`, with a recipe file of `recipe` bytes. Writes the result
-    /// to a scratch folder and removes it again.
+    /// Returns the total size, in bytes, of all output files for the model `compressed`. Measures it by writing the
+    /// result to a scratch folder, which is then deleted. `recipe` is the size of the recipe file in bytes; for the
+    /// summary, an assumed maximum size is counted.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
@@ -254,9 +256,10 @@ impl WriteStage {
         Ok(written + beside)
     }
 
-    /// Writes the result and the files beside it under temporary names, and renames them at the end: a folder in one
-    /// step, a result file after the files beside it. `summarize` makes the summary from the journal and the size of
-    /// the result.
+    /// Writes the result and the files beside it (recipe, index map, summary) under temporary names, and renames them
+    /// at the end: a folder in one step, a result file after the files beside it. `map` holds for every input Gaussian
+    /// its index in the output, `archive` the content of the archive if one is written, `recipe` the text of the recipe
+    /// file. `summarize` makes the summary from the journal and the size of the result. Returns the summary.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails; no output is left behind then.
@@ -326,8 +329,8 @@ impl WriteStage {
     }
 }
 
-/// Writes `compressed` to `path` as an output of kind `kind`, without the files beside it. Returns the bytes of the
-/// output.
+/// Writes `compressed` to `path` as an output of kind `kind`, without the files beside it. Returns the size of the
+/// output in bytes.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -346,7 +349,8 @@ pub fn write_without_companions(
     Ok(input.size_written(kind, path)?.total())
 }
 
-/// Writes the frames of `source` as a container to `path`, with values that err by at most `bounds`.
+/// Writes the frames of `source` as a container to `path`, with values that differ from the exact ones by at most
+/// `bounds`.
 fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);

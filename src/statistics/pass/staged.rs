@@ -1,5 +1,5 @@
 //! Scan of a source on a slow disk as a pipeline: one thread fetches bytes from the disk, several threads decode tiles,
-//! and as many accumulate statistics. Disk, decoding and arithmetic overlap.
+//! and an equal number of threads accumulate statistics. Disk, decoding and arithmetic overlap.
 //!
 //! The unit of work is a block of Gaussians over a frame block (the frames of one tile). A lane is a thread that
 //! decodes and a thread that accumulates, with a bounded channel between them. There are as many lanes as the thread

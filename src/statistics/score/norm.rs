@@ -21,10 +21,10 @@ pub struct Norm {
     clip: bool,
 }
 
-/// Number of passes over the values in which a percentile is found.
+/// Number of passes over the values that are made to find a percentile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PercentilePasses {
-    /// Two passes, which find the exact value.
+    /// Two passes over the values, which find the exact percentile.
     Two,
     /// One pass, with a histogram whose keys have this number of mantissa bits. The result is the middle of the
     /// histogram bucket that contains the percentile.
@@ -32,7 +32,8 @@ pub enum PercentilePasses {
 }
 
 impl Norm {
-    /// Computes the normalization of the values that `values` iterates over. NaN and infinities are ignored.
+    /// Computes the normalization of the values that `values` iterates over, with the ε and the clipping of `recipe`.
+    /// `passes` states how the percentiles are found. NaN and infinities are ignored.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,
@@ -52,12 +53,12 @@ impl Norm {
         Norm { p1, p99, epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
     }
 
-    /// Returns whether the 1st and the 99th percentile differ, so that the normalized term grades Gaussians on a scale.
+    /// Returns whether the 1st and the 99th percentile differ. If they do not, a normalized value can only be 0 or 1.
     pub fn has_spread(&self) -> bool {
         self.p99 > self.p1
     }
 
-    /// Returns the normalized value norm(x).
+    /// Returns norm(x), the normalized value of `x`.
     pub fn apply(&self, x: f64) -> f64 {
         if !self.has_spread() {
             return f64::from(u8::from(x > self.p99));

@@ -29,8 +29,8 @@ impl FloatSketch {
         Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
-    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MAX_MANTISSA_BITS`]. The histogram has
-    /// 2^(9 + bits) counts of 4 bytes.
+    /// Counts `values` in a histogram whose keys have `bits` mantissa bits, at most [`MAX_MANTISSA_BITS`]. The
+    /// histogram has 2^(9 + bits) counts of 4 bytes.
     pub fn with_mantissa_bits(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
         let dropped = ALL_BITS - bits.min(MAX_MANTISSA_BITS);
         let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
@@ -61,7 +61,7 @@ impl FloatSketch {
     }
 
     /// Returns the key of the bucket that contains the `p`-th percentile, and the percentile's rank within the bucket,
-    /// counted from 0.
+    /// counted from 0. Returns `None` if there are no finite values.
     fn locate(&self, p: f64) -> Option<(u32, usize)> {
         // Multiplying before dividing is exact for whole p, so the 1st percentile of 100 values is the smallest.
         let mut rank = ((p * self.finite as f64 / 100.0).ceil() as u64).max(1) - 1;
@@ -75,8 +75,8 @@ impl FloatSketch {
     }
 }
 
-/// Returns the histogram key of `value`: its f32 bits without the lowest `dropped` bits, mapped so that keys order as
-/// values do.
+/// Returns the histogram key of `value`: its f32 bits, mapped so that keys order as values do, without the lowest
+/// `dropped` bits.
 fn key(value: f64, dropped: u32) -> u32 {
     let bits = (value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32 + 0.0).to_bits();
     // The bits of negative floats order backward, so all of them are inverted. Positive floats must come after negative
@@ -85,7 +85,8 @@ fn key(value: f64, dropped: u32) -> u32 {
     ordered >> dropped
 }
 
-/// Returns the value whose bits were mapped to `ordered` by the order-preserving map.
+/// Returns the value of a histogram key `ordered` from which no bits were dropped; the inverse of the mapping in
+/// [`key`].
 fn value_of(ordered: u32) -> f64 {
     let bits = if ordered >> 31 == 1 { ordered ^ (1 << 31) } else { !ordered };
     f64::from(f32::from_bits(bits))
@@ -96,7 +97,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Returns the `p`-th percentile by nearest rank of `values`, which must be sorted.
+    /// Returns the `p`-th percentile by nearest rank of the finite values of `values`, found by sorting; `None` if no
+    /// value is finite.
     fn sorted_percentile(values: &[f64], p: u32) -> Option<f64> {
         let mut finite: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
         finite.sort_by(|a, b| a.partial_cmp(b).unwrap());

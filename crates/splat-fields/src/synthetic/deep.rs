@@ -3,8 +3,8 @@
 use super::Noise;
 use crate::{Tensor, Tensors};
 
-/// Number of outputs of the hidden layers. Deliberately not a multiple of the number of outputs that a layer sums
-/// together.
+/// Number of outputs of the hidden layers. Deliberately not a multiple of 4, the number of outputs that a layer
+/// computes together.
 const WIDTH: usize = 22;
 
 /// Number of values in the encoding of a position: its 3 components, and their sines and cosines in 10 octaves.
@@ -21,7 +21,7 @@ pub struct DeepVariant {
     pub all_heads: bool,
 }
 
-/// Variants to test: each option is on in one and off in another.
+/// Variants to test. Each option is on in at least one variant and off in another.
 pub const ALL_VARIANTS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },

@@ -110,7 +110,8 @@ impl MapsLine {
         MapsLine { range: [0; 2], field: 0, after_blank: false, length: 0 }
     }
 
-    /// Reads `byte`, the next byte of the line. Appends it to `path` if it belongs to the path.
+    /// Reads `byte`, the next byte of the line. Appends it to `path` if it belongs to the path at the end of the line;
+    /// a control character becomes `?`.
     fn push(&mut self, byte: u8, path: &mut [u8; PATH_BYTES]) {
         const PATH: usize = 6;
         if self.field < PATH && (byte == b' ' || self.field == 0 && byte == b'-') {

@@ -30,8 +30,8 @@ fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit>
     Some(MemoryLimit { bytes: kibibytes.saturating_mul(1024), source: LimitSource::Machine })
 }
 
-/// Appends to `limits` the limits of the control group of this process and of all its parent groups that are visible.
-/// Each of these limits applies. `read` returns the text of a system file.
+/// Appends to `limits` the limits of the control group of this process, and those of its parent groups as far as they
+/// are mounted in the file system: they apply to this process too. `read` returns the text of a system file.
 fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLimit>) {
     let (Some(memberships), Some(mounts)) =
         (read(Path::new("/proc/self/cgroup")), read(Path::new("/proc/self/mountinfo")))
@@ -61,10 +61,9 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
     }
 }
 
-/// Mount of a hierarchy of control groups, or of a part of one, in the file system.
+/// Mount of a hierarchy of control groups in the file system. The mounted part is one group with all groups below it.
 struct Mount {
-    /// Path, within the hierarchy of control groups, of the group whose folder is mounted; `/` if the whole hierarchy
-    /// is mounted.
+    /// Path of the mounted group within the hierarchy of control groups; `/` if the whole hierarchy is mounted.
     root: PathBuf,
     /// Folder at which the hierarchy is mounted.
     point: PathBuf,
@@ -88,8 +87,8 @@ impl Mount {
         Some(Mount { root, point, kind, limits_memory })
     }
 
-    /// Returns the folder of the control group `path` in the file system, or the mount point if the group is outside
-    /// the mounted part of the hierarchy.
+    /// Returns the folder in the file system that represents the control group `path`. Returns the mount point if the
+    /// group is not in the mounted part of the hierarchy.
     fn folder_of(&self, path: &str) -> PathBuf {
         let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
         // With `..`, the path is relative to the root of a control group namespace that does not contain this process.

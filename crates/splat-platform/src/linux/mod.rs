@@ -1,4 +1,4 @@
-//! Functions with an implementation for Linux alone: memory limits, page cache, and truncation of mapped files.
+//! Functions that are implemented separately for Linux: memory limits, page cache, and truncation of mapped files.
 
 mod cut_short;
 mod memory;

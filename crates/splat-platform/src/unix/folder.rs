@@ -116,7 +116,8 @@ impl FolderHandle {
         Ok(rustix::fs::renameat(&self.0, from.as_ref(), &to.0, name.as_ref())?)
     }
 
-    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder.
+    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder of
+    /// the process.
     ///
     /// Systems move a folder to another parent only if the folder itself is writable. A read-only folder of this user
     /// is therefore made writable while it is moved.

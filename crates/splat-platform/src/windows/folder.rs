@@ -2,8 +2,8 @@
 //! an open folder.
 //!
 //! Each operation first checks that the path still leads to the folder that was opened, without a link. Another program
-//! may replace the folder between this check and the operation; Linux and macOS exclude that. No folder counts as one
-//! of this user, so the program reuses and removes only folders that this process has created.
+//! may replace the folder between this check and the operation; the implementation for Linux and macOS excludes this.
+//! No folder counts as one of this user, so the program reuses and removes only folders that this process has created.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions};
@@ -114,7 +114,8 @@ impl FolderHandle {
         fs::rename(self.entry_path(from)?, to.entry_path(name)?)
     }
 
-    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder.
+    /// Moves the entry at the path `from`, relative to this folder, to the path `to`, relative to the current folder of
+    /// the process.
     ///
     /// # Errors
     /// Fails if there is no entry `from` or the system refuses.

@@ -1,4 +1,5 @@
-//! Implementation for Windows: files, folders, signals, memory maps and memory limits. Type-checked only.
+//! Implementation for Windows: files, folders, signals, memory maps and memory limits. The code is type-checked but not
+//! tested.
 
 mod folder;
 mod memory;
@@ -89,7 +90,7 @@ pub fn open_stream(_path: &Path) -> io::Result<Option<File>> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// Returns false: Windows gives no answer to whether `file` is the file, device or pipe of standard output.
+/// Returns false, because Windows does not tell whether `file` is the file, device or pipe of standard output.
 ///
 /// # Errors
 /// Never fails.
@@ -140,7 +141,7 @@ pub fn expect_pages(_map: &Mmap, _range: Range<usize>) {}
 /// `map` must be backed by a file and not by anonymous memory, as on the other systems.
 pub unsafe fn release_pages(_map: &Mmap, _range: Range<usize>) {}
 
-/// Returns `None`: Windows gives no answer to whether reading the byte at `offset` needs disk access.
+/// Returns `None`, because Windows does not tell whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
     None
 }

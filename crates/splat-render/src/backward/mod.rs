@@ -31,13 +31,14 @@ use tile::{GradientSink, PixelGradients};
 /// projection.
 const SPAN: usize = 32 * BLOCK;
 
-/// Bytes of memory per visible Gaussian for a render and its gradient.
+/// Bytes of memory per visible Gaussian for a render and for the gradient of a loss of this render.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
 /// Maximum number of (splat, tile) pairs whose gradient sums are in memory. A strip of tiles with more pairs is
 /// processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
-/// Bytes of memory for the (splat, tile) pairs of a strip of tiles for a render and its gradient.
+/// Bytes of memory for the (splat, tile) pairs of a strip of tiles, for a render and for the gradient of a loss of this
+/// render.
 pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {
@@ -47,8 +48,7 @@ impl Renderer {
     /// `loss` gets the image and returns the loss and its derivative with respect to each value of the image. Returns
     /// the loss. If `view` renders a grid of pixels, the image has the size of the grid, and the derivatives are those
     /// of the loss of these pixels alone. Results have the same bits for any number of threads. A pixel whose color or
-    /// derivative is not finite
-    /// has no effect on gradients. Gaussians that are not visible get gradient 0.
+    /// derivative is not finite has no effect on gradients. Gaussians that are not visible get gradient 0.
     ///
     /// # Panics
     /// Panics if `out` has another number of Gaussians or a higher SH degree than `gaussians`, if the attributes of
@@ -96,8 +96,8 @@ impl Renderer {
     }
 
     /// Computes the gradient sums of every splat from the derivative `pixel_gradient` of the loss with respect to
-    /// `image`. If `SHAPE` is false, computes only the sums of its color. Tiles run in parallel, then splats; each
-    /// splat adds the sums of its tiles in a fixed order.
+    /// `image`. If `SHAPE` is false, computes only the sums for the gradients of colors. First, tiles are processed in
+    /// parallel; then, for each splat in parallel, the sums of its tiles are added in a fixed order.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();

@@ -1,12 +1,12 @@
 //! Derivative of the projection: computes the gradients of the stored attributes of Gaussians from the gradient sums of
 //! their splats.
 //!
-//! Blocks are processed like in the projection, in f64 where the projection uses f64. Offsets in a footprint are
-//! expressed in its standard deviations instead of inverting its covariance, so that very thin and very large Gaussians
-//! lose no digits that the projection kept (docs/method.md, section 8.1). Input: gradient sums of splats. Output:
-//! gradients of Gaussians. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker et al., "EWA
-//! Splatting",
-//! 2002. Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
+//! Blocks are processed like in the projection, in f64 where the projection uses f64. The covariance of a footprint is
+//! not inverted; instead, offsets in the footprint are expressed in its standard deviations. Very thin and very large
+//! Gaussians then lose no digits that the projection kept (docs/method.md, section 8.1). Input: gradient sums of
+//! splats. Output: gradients of Gaussians. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker
+//! et al., "EWA Splatting", 2002. Names that begin with `by_` hold derivatives of the loss with respect to the rest of
+//! the name.
 
 use std::ops::Range;
 
@@ -27,8 +27,8 @@ pub(super) fn add(
 ) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// Adds the gradients like [`add_blocks`], compiled for AVX2. Operations are not fused, so results have the
-        /// same bits as without AVX2.
+        /// Does the same as [`add_blocks`], compiled for AVX2. Multiply-adds are not fused, so results have the same
+        /// bits as without AVX2.
         #[target_feature(enable = "avx2")]
         fn add_avx2(
             gaussians: &Gaussians,
@@ -39,7 +39,7 @@ pub(super) fn add(
         ) {
             add_blocks(gaussians, splats, sums, view, out);
         }
-        /// Adds the gradients like [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
+        /// Does the same as [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
         #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
         fn add_avx512(
             gaussians: &Gaussians,
@@ -162,7 +162,7 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of the SH coefficients to `out`: the value of the basis function Y_k times the gradient of
+    /// Adds to `out` the gradients of the SH coefficients: the value of the basis function Y_k times the gradient of
     /// the color.
     #[inline(always)]
     fn add_harmonics(
@@ -187,7 +187,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the part of the gradients of positions that comes from the view direction, on which the color depends.
+    /// Adds to `out` the part of the gradients of positions that comes from the color, which depends on the view
+    /// direction.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -226,8 +227,8 @@ impl GradientBlock {
         }
     }
 
-    /// Adds the gradients of opacity, scale and rotation, and the part of the gradients of positions that comes from
-    /// the footprint.
+    /// Adds to `out` the gradients of opacity, scale and rotation, and the part of the gradients of positions that
+    /// comes from the footprint.
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
@@ -278,9 +279,9 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// Computes the gradient of one Gaussian from its stored attributes (`q` is the quaternion in the order w, x, y, z)
-    /// and from the gradient sums of its splat: `first` = [x, y] and `second` = [xx, xy, yy], the fields of
-    /// [`SplatSums`].
+    /// Computes the derivatives from the stored attributes of the Gaussian (`q` is the quaternion in the order w, x, y,
+    /// z) and from the gradient sums of its splat: `[x, y]` is [`SplatSums::first`], and `[xx, xy, yy]` is
+    /// [`SplatSums::second`].
     #[inline(always)]
     fn new(
         position: [f64; 3],
@@ -346,8 +347,8 @@ impl GeometryGradient {
 /// Returns ∂L/∂quaternion for a quaternion (w, x, y, z) of any length. `torque` is ∂L/∂angle for rotations about the
 /// world axes. The formula is 2·(0, torque) ⊗ q / ‖q‖².
 ///
-/// A rotation by a small angle changes a quaternion q by half the angle times q. A change of the length of q has no
-/// effect on the loss. The result is not finite for a zero quaternion.
+/// A rotation by a small vector δ (axis times angle) changes a quaternion q by ½·(0, δ) ⊗ q. A change of the length of
+/// q has no effect on the loss. The result is not finite for a zero quaternion.
 #[inline(always)]
 fn by_quaternion([w, x, y, z]: [f64; 4], torque: [f64; 3]) -> [f64; 4] {
     let twice = 2.0 / (w * w + x * x + y * y + z * z);

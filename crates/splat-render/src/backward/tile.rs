@@ -12,15 +12,15 @@ use super::super::project::Splat;
 use super::super::renderer::Image;
 use super::sums::SplatSums;
 
-/// Largest alpha below [`MAX_ALPHA`], to which larger alphas are clamped.
+/// Largest f32 below [`MAX_ALPHA`]. An alpha above it has been clamped to `MAX_ALPHA`, so its derivative counts as 0.
 const MAX_UNCLAMPED_ALPHA: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 
-/// Gradients ∂L/∂pixel of the loss with respect to the pixels of a tile, and the color that comes from behind the
-/// splats processed so far.
+/// Gradients ∂L/∂pixel of the loss with respect to the pixels of a tile, and for each pixel the color that comes from
+/// behind the splats processed so far.
 pub(super) struct PixelGradients {
     /// Derivatives ∂L/∂pixel of the loss L, one plane per color channel.
     pixel: [TilePlane; 3],
-    /// Scalar product of ∂L/∂pixel and the color that comes from behind the splats processed so far.
+    /// Scalar product, for each pixel, of ∂L/∂pixel and the color that comes from behind the splats processed so far.
     rest: TilePlane,
 }
 
@@ -47,8 +47,8 @@ impl PixelGradients {
     }
 }
 
-/// Receiver of weights that computes the gradient sums of the splats of a tile. If `SHAPE` is false, it computes only
-/// the sums of their colors.
+/// Receiver of weights (alpha · transmittance of each splat) that computes the gradient sums of the splats of a tile.
+/// If `SHAPE` is false, it computes only the sums for the gradients of colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
     /// Gradient sums of each splat of the tile.

@@ -60,7 +60,7 @@ const EXP2: [f32; 6] =
 pub(super) trait Lanes: Copy {
     /// Mask: one truth value per lane.
     type Mask: Copy;
-    /// Type of eight sums over groups: sum k adds lane k of every group.
+    /// Type of eight sums, one per lane: sum k is the total of lane k over all groups that were added.
     type Sums: Sums;
     /// Type of two sets of eight sums over groups: one over the groups with even index, one over those with odd index.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
@@ -74,14 +74,14 @@ pub(super) trait Lanes: Copy {
     fn splat(value: f32) -> Self;
     /// Returns a vector in which every group has the eight values of `group`.
     fn repeat(group: &[f32; LANES]) -> Self;
-    /// Returns a vector whose group k has entry `first + k` of `values` in all of its lanes, where `values` is read as
-    /// one list. `first` is a multiple of [`Lanes::GROUPS`].
+    /// Returns a vector in which all lanes of group k hold the value with index `first + k` in the flattened array
+    /// `values`. `first` is a multiple of [`Lanes::GROUPS`].
     fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Loads a vector from [`Lanes::GROUPS`] consecutive groups of `from` (arrays of eight values), the first of which
-    /// has index `first`, a multiple of [`Lanes::GROUPS`].
+    /// Loads a vector from `from`, an array of groups of eight values: the [`Lanes::GROUPS`] groups from index `first`
+    /// on. `first` is a multiple of [`Lanes::GROUPS`].
     fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Stores the vector to [`Lanes::GROUPS`] consecutive groups of `to` (arrays of eight values), the first of which
-    /// has index `first`, a multiple of [`Lanes::GROUPS`].
+    /// Stores the vector to `to`, an array of groups of eight values: to the [`Lanes::GROUPS`] groups from index
+    /// `first` on. `first` is a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
     /// Returns the sum `self + other` in each lane.
     fn add(self, other: Self) -> Self;
@@ -111,12 +111,12 @@ pub(super) trait Lanes: Copy {
     fn all_negative(self) -> bool;
     /// Returns the largest value of all lanes. No lane may be NaN.
     fn largest(self) -> f32;
-    /// Adds the groups of the vector, one after the other, to `sums` and returns the result.
+    /// Adds each group of the vector to `sums`, one group after the other, and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// Adds a group with even index to the even sums and one with odd index to the odd sums. A vector of one group is
-    /// added to the first sums.
+    /// Adds the groups with even index to the even sums and those with odd index to the odd sums, and returns the
+    /// result. A vector of one group is always added to the first of the two, see [`EvenOddSums`].
     fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
-    /// Returns `self · 2ⁿ` in each lane, where the low bits of `rounded` hold n, as after adding [`ROUND`].
+    /// Returns `self · 2ⁿ` in each lane. `rounded` is n + [`ROUND`], whose low bits hold n.
     fn scale(self, rounded: Self) -> Self;
 
     /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; for smaller x, the result is
@@ -136,23 +136,25 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Sums over the groups with even index, and separately over those with odd index.
+/// Two sums over groups: one over the groups with even index, one over the groups with odd index. Each has one value
+/// per lane.
 ///
-/// With separate sums, an addition waits for half as many earlier ones, because the two groups of a vector are added to
-/// different sums. A vector of one group is always added to the first sums; the caller swaps the two sums after all
-/// groups with even index.
+/// The two groups of an AVX-512 vector are added to different sums, so that neither addition waits for the other. A
+/// vector of one group is always added to the first sum; the caller swaps the two sums after all groups with even
+/// index, and again after all groups with odd index.
 pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
     /// Returns sums that are all 0.
     fn zero() -> Self;
-    /// Returns the even and odd sums in swapped order if vectors have one group, else unchanged.
+    /// Returns the two sums in swapped order if vectors have one group, so that the following groups are added to the
+    /// other sum. Returns them unchanged if vectors have two groups.
     fn swapped(self) -> Self;
-    /// Returns the sum of the even and the odd sums.
+    /// Returns the even sum plus the odd sum in each lane.
     fn combined(self) -> Self::Sums;
 }
 
-/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps
-/// the pair after all groups with even index, and again after all with odd index.
+/// Even and odd sums for vectors of one group. Groups are added to the first entry. The caller swaps the entries after
+/// all groups with even index, and again after all groups with odd index.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]

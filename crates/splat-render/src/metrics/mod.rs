@@ -60,7 +60,8 @@ pub fn temporal_error(a: [&Image; 2], b: [&Image; 2]) -> f64 {
     mean_square(before.zip(after).map(|((a0, b0), (a1, b1))| (a1 - a0) - (b1 - b0))).sqrt()
 }
 
-/// Iterates over the values of both images, clamped to [0, 1], in pairs. Panics if the sizes of the images differ.
+/// Returns an iterator over the pairs of corresponding values of `a` and `b`, clamped to [0, 1]. Panics if the sizes of
+/// the images differ.
 fn channels<'a>(a: &'a Image, b: &'a Image) -> impl ExactSizeIterator<Item = (f64, f64)> + 'a {
     assert_same_size(a, b);
     a.data.iter().zip(&b.data).map(|(&a, &b)| (clamped(a), clamped(b)))

@@ -124,7 +124,7 @@ struct Terms {
 }
 
 impl Terms {
-    /// Computes the factors from the windowed sums of a, b, a² + b² and a·b at a pixel.
+    /// Computes the factors A₁, A₂, B₁ and B₂ at a pixel from the windowed sums of a, b, a² + b² and a·b there.
     fn new([a, b, squares, products]: [f64; 4]) -> Terms {
         let (squared_means, means_product) = (a * a + b * b, a * b);
         Terms {

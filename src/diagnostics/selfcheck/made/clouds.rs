@@ -3,7 +3,8 @@
 use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
 
-/// Returns a camera near the origin that looks along +z, rotated a little so that no axis is special.
+/// Returns a camera near the origin that looks approximately along +z. It is rotated a little, so that its axes are not
+/// parallel to the world axes.
 pub fn tilted_camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
@@ -18,7 +19,8 @@ pub fn tilted_camera(width: u32, height: u32) -> Camera {
     }
 }
 
-/// Returns a camera at the origin whose axes are those of the world, with square images of `size` pixels.
+/// Returns a camera at the origin whose axes coincide with the world axes, with square images of `size` × `size`
+/// pixels.
 pub fn plain_camera(size: u32) -> Camera {
     Camera {
         width: size,
@@ -33,7 +35,7 @@ pub fn plain_camera(size: u32) -> Camera {
     }
 }
 
-/// Generator of pseudo-random numbers in [0, 1) (splitmix64).
+/// Generator of pseudo-random numbers in [0, 1) by splitmix64. The field is its state, at first the seed.
 pub struct Random(pub u64);
 
 impl Random {
@@ -52,8 +54,8 @@ impl Random {
     }
 }
 
-/// Returns `count` random Gaussians: among them needles, flat, very large and very small ones, some with quaternions
-/// that are not normalized, some off-screen.
+/// Returns `count` random Gaussians of the SH degree `degree`: among them needles, flat, very large and very small
+/// ones, some with quaternions that are not normalized, some off-screen. The same `seed` gives the same Gaussians.
 pub fn random_gaussians(seed: u64, count: usize, degree: usize) -> Gaussians {
     let mut random = Random(seed);
     let mut scene = Gaussians::zeros(count, degree);
@@ -71,7 +73,8 @@ pub fn random_gaussians(seed: u64, count: usize, degree: usize) -> Gaussians {
     scene
 }
 
-/// Returns one Gaussian with the color (1, ½, 0), on the axis of [`plain_camera`] at the distance `depth`.
+/// Returns one round Gaussian with the color (1, ½, 0), the standard deviation `scale` and the opacity `opacity`, on
+/// the optical axis of [`plain_camera`] at the distance `depth`.
 pub fn single_gaussian(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);

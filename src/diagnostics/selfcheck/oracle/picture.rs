@@ -1,25 +1,26 @@
-//! Oracle (slow reference) of the rasterizer: in f64 throughout, pixel by pixel, with full matrices. A Gaussian reaches
-//! all pixels of the tiles in which the original 3DGS kernel draws it, without any further limit.
+//! Oracle (slow reference) of the rasterizer: in f64 throughout, pixel by pixel, with full matrices. As in the original
+//! 3DGS kernel, a Gaussian reaches all pixels of the 16×16 tiles that its bounding square touches, without any further
+//! limit.
 
 use crate::model::{Camera, Gaussians};
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
-/// Render of one view by the oracle, the slow f64 reference.
+/// Render of one view by the oracle (slow f64 reference), with the contributions of all Gaussians to it.
 pub struct OracleRender {
-    /// Colors of the pixels row by row, `height · width` of them: red, green and blue.
+    /// Colors (red, green, blue) of the `height · width` pixels, row by row.
     pub rgb: Vec<[f64; 3]>,
-    /// Whether a comparison at the pixel was within a fraction of 1e-4 of its threshold, so that f32 may decide
-    /// differently.
+    /// For each pixel, whether f32 may decide differently from f64: alpha or transmittance of a Gaussian in the pixel
+    /// is so close to a threshold of the renderer that their relative difference is below 1e-4.
     pub doubtful: Vec<bool>,
-    /// Σ alpha · transmittance of each Gaussian over the sampled pixels.
+    /// Sum of alpha · transmittance over the sampled pixels, for each Gaussian.
     pub sum: Vec<f64>,
-    /// Maximum alpha · transmittance of each Gaussian over the sampled pixels.
+    /// Maximum of alpha · transmittance over the sampled pixels, for each Gaussian.
     pub max: Vec<f64>,
-    /// Number of pairs of Gaussian and pixel that were blended.
+    /// Number of pairs of a Gaussian and a pixel into which it was blended.
     pub events: u64,
 }
 
-/// A Gaussian projected to the image.
+/// Gaussian projected to the image, with the tiles in which it is drawn.
 struct Footprint {
     id: usize,
     depth: f32,
@@ -27,7 +28,7 @@ struct Footprint {
     inverse: DMat2,
     opacity: f64,
     rgb: DVec3,
-    /// Tiles that the Gaussian may cover: the first and one past the last, along x, then along y.
+    /// Ranges of the tiles that the Gaussian may cover, along x and along y: the first tile, and one past the last.
     tiles: [[i64; 2]; 2],
 }
 
@@ -38,7 +39,7 @@ impl Footprint {
     }
 }
 
-/// Returns the real spherical harmonics up to degree 3 in the direction `d`, as products of x, y and z.
+/// Returns the 16 real spherical harmonics up to degree 3 in the direction `d`, computed as polynomials in x, y and z.
 fn basis(d: DVec3) -> [f64; 16] {
     let DVec3 { x, y, z } = d;
     let pi = std::f64::consts::PI;
@@ -63,8 +64,8 @@ fn basis(d: DVec3) -> [f64; 16] {
     ]
 }
 
-/// Returns the depth of the position in the camera in f32, with the terms added in the same order as in the original
-/// 3DGS kernel.
+/// Returns the depth (z coordinate in camera axes) of a position, computed in f32 with the terms added in the same
+/// order as in the original 3DGS kernel.
 fn view_depth([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
     let row = camera.rotation.row(2).as_vec3();
     (row.x * x + row.y * y) + (row.z * z + camera.translation.z as f32)
@@ -116,12 +117,13 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     })
 }
 
-/// Renders a view of `gaussians`. Only the pixels of every `stride`-th column and row count for `sum` and `max`.
+/// Renders a view of `gaussians`. Only the pixels of every `stride`-th column and row count as sampled for
+/// [`OracleRender::sum`] and [`OracleRender::max`].
 pub fn render_view(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
     render_with(gaussians, camera, background, stride, |_, _| ())
 }
 
-/// Returns for each pixel the indices of the Gaussians that are blended there, nearest first. A small change of a
+/// Returns, for each pixel, the indices of the Gaussians that are blended there, nearest first. A small change of a
 /// Gaussian may change these lists.
 pub fn blended_indices(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
     let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
@@ -129,8 +131,8 @@ pub fn blended_indices(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>
     ids
 }
 
-/// Renders a view, blending in each pixel exactly the Gaussians listed in `blended`. With fixed lists, the image is a
-/// smooth function of the parameters.
+/// Renders a view and returns the colors of its pixels. In each pixel, blends exactly the Gaussians that `blended`
+/// lists for it. With fixed lists, the image is a smooth function of the parameters of the Gaussians.
 pub fn render_blended(
     gaussians: &Gaussians,
     camera: &Camera,

@@ -4,7 +4,9 @@
 use crate::model::{Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
-/// Statistics of one Gaussian by the oracle, the slow f64 reference.
+/// Statistics of one Gaussian by the oracle (slow f64 reference): trajectory magnitude D, curvature κ, opacity variance
+/// V, number of frames in which the Gaussian is alive, contribution C in pixels, and visibility (fraction of all views
+/// in which the Gaussian is alive and touches the image).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct OracleRow {
     pub(crate) d: f64,
@@ -15,7 +17,8 @@ pub(crate) struct OracleRow {
     pub(crate) vis: f64,
 }
 
-/// Returns the statistics of Gaussian `i` over `frames`, which are evenly spaced in time.
+/// Computes the statistics of Gaussian `i` over `frames`, which are evenly spaced in time. `schedule` lists the views
+/// of each frame.
 pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
@@ -54,7 +57,9 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan:
     OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 
-/// Returns the projected area of Gaussian `i` in px², computed by projecting its 3-D covariance.
+/// Returns the projected area of Gaussian `i` within the image, in px²: the area of its 3σ ellipse, times the fraction
+/// of the bounding box of this ellipse that lies inside the image. The ellipse is found by projecting the 3-D
+/// covariance. Returns 0 if the Gaussian is not beyond the near plane.
 pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
@@ -95,7 +100,7 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     9.0 * std::f64::consts::PI * (xx * yy - xy * xy).sqrt() * fraction
 }
 
-/// Returns the `k`-th unit vector e_k rotated by `q`: the quaternion product q e_k q*.
+/// Returns the unit vector e_k along axis `k`, rotated by the quaternion `q`: the quaternion product q e_k q*.
 fn rotated_unit_vector(q: [f64; 4], k: usize) -> [f64; 3] {
     let mut e = [0.0; 4];
     e[k + 1] = 1.0;

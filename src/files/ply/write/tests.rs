@@ -41,7 +41,7 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// Returns `len` Gaussians whose values are all different and exactly representable in an i16.
+/// Returns `len` Gaussians of SH degree `sh_degree` whose values are all different and exactly representable in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
     for (k, column) in Attributes::all().iter().enumerate() {
@@ -51,7 +51,7 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     out
 }
 
-/// Returns the bits of all values of an attribute, for comparisons in which NaN equals itself.
+/// Returns the bits of all values of the attribute `column`, for comparisons in which NaN equals itself.
 fn bits(column: &AttributeValues) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }

@@ -43,7 +43,8 @@ pub struct ModelPaths {
 }
 
 impl ModelPaths {
-    /// Finds the files of the model folder `root`, of the requested `iteration`, or of the largest one.
+    /// Finds the files of the model folder `root` that belong to the training iteration `iteration`; `None` selects the
+    /// largest iteration.
     ///
     /// # Errors
     /// Fails if a folder or a required file is missing.
@@ -129,8 +130,8 @@ impl ModelFolder {
         &self.notes
     }
 
-    /// Opens the model folder `root` at the requested `iteration`, or at the largest one. The returned model has no
-    /// frames yet.
+    /// Opens the model folder `root` at the training iteration `iteration`; `None` selects the largest iteration. The
+    /// returned model has no frames yet.
     ///
     /// # Errors
     /// Fails if a file is missing or damaged.
@@ -145,7 +146,7 @@ impl ModelFolder {
         Self::with_gaussians(paths, ply.whole()?, ply.sh_degree(), options.memory)
     }
 
-    /// Returns the memory limit that holds for reading the files of the model again.
+    /// Returns the maximum memory that may be used when files of the model are read again.
     pub(super) fn memory(&self) -> ReadLimit {
         self.memory
     }
@@ -158,10 +159,11 @@ impl ModelFolder {
         ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
     }
 
-    /// Returns the model with its deformation field rounded as storage in half precision rounds it.
+    /// Returns the model with the deformation field that results from storing the field in half precision and reading
+    /// it back.
     ///
     /// # Errors
-    /// Fails if the field can no longer be read.
+    /// Fails if the file of the field can no longer be read.
     pub(super) fn rounded(self) -> Result<Self> {
         let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
         let field = Field::new(&rounded(read_state_dict(path, self.memory)?), self.config.field(), degree, path)?;
@@ -202,7 +204,7 @@ impl ModelFolder {
         &self.field
     }
 
-    /// Returns the bytes that the tensors of the deformation field take in single precision.
+    /// Returns the number of bytes that the tensors of the deformation field take in single precision.
     pub(super) fn tensor_bytes(&self) -> u64 {
         self.tensor_bytes
     }

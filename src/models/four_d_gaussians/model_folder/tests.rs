@@ -209,7 +209,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     assert!(reader.read(1, Attributes::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
 }
 
-/// Creates a folder with the layout of a model, with `iterations` and placeholder files.
+/// Creates a model folder with one subfolder for each name in `iterations`. The files are placeholders without a model.
 fn folder(iterations: &[&str]) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     fs::write(root.path().join("cfg_args"), "Namespace()").unwrap();
