@@ -59,7 +59,7 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
 fn some_steps(content: &ArchiveContent, octave: i32) -> QuantizationSteps {
     let step = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
     let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), step(k)));
-    let mut steps = QuantizationSteps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
+    let mut steps = QuantizationSteps { cloud: [0; 8], columns: Vec::new(), field: FieldSteps(tensors.collect()) };
     steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
     steps
 }

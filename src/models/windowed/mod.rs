@@ -9,10 +9,13 @@ mod tsog;
 
 use std::path::{Path, PathBuf};
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::in_checkpoint::{ProxyRule, write_frames};
 use super::motion_model::{MotionModelFrames, propose_proxies};
 use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::{NO_ARCHIVE, state_bytes};
+use super::trajectories::state_bytes;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
@@ -28,6 +31,10 @@ use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
 pub(super) use tsog::TSOG;
 
+/// Error message for `.tsog` files, which cannot be written as an archive.
+const NO_TSOG: &str = "a .tsog holds compressed images, which an archive cannot make smaller\n  write a .tsog, or convert \
+                       the input to a .ftgs.ply and make the archive of that";
+
 /// Opened file of a player, whose Gaussians move as `L` says.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
@@ -41,6 +48,15 @@ struct WindowedModel<L: ProxyRule> {
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
+    /// How the file was opened; `None` for formats that have no archives.
+    reopener: Option<Reopener>,
+}
+
+impl<L: ProxyRule> WindowedModel<L> {
+    /// Returns how the file was opened.
+    fn reopener(&self) -> Result<&Reopener> {
+        self.reopener.as_ref().ok_or_else(|| Error::usage(NO_TSOG))
+    }
 }
 
 impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
@@ -127,13 +143,21 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
                 "a file of a player cannot be written as a trained model\n  write its own format, a .gseq or --as \
                  ply-sequence",
             )),
-            OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
+            OutputKind::Archive if self.reopener.is_none() => Err(Error::usage(NO_TSOG)),
             _ => Ok(()),
         }
     }
 
     fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener()?.content(self, reduction, "model.ftgs.ply", FileContent::from_name)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener()?.frames(content, &self.model.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

@@ -60,5 +60,5 @@ fn opened<L: ProxyRule + 'static>(
     notes: Vec<String>,
 ) -> Result<Box<dyn InputModel>> {
     let (path, own) = (path.to_owned(), OutputKind::Tsog);
-    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model }))
+    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model, reopener: None }))
 }

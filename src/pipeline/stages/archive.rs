@@ -38,6 +38,9 @@ use crate::scene::Scene;
 const NAME: &str = "archive";
 /// Maximum quantization step of a group, in standard deviations of its values; a coarser one would erase the values.
 const MAX_STEP: f64 = 4.0;
+/// Minimum standard deviation of the values of a column from which its quantization step follows, as a fraction of the
+/// largest magnitude of the values.
+const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this value the
 /// quantization of that many Gaussians costs 0.5 and 1.2 dB PSNR on two trained models.
@@ -83,11 +86,12 @@ impl Stage for ArchiveStage {
     }
 }
 
-/// Group of values that share one quantization step: an attribute (by index) or a tensor of the deformation field (by
-/// name).
+/// Group of values that share one quantization step: an attribute (by index), a further column of the Gaussians (by
+/// index and name) or a tensor of the deformation field (by name).
 #[derive(Debug, Clone)]
 enum ValueGroup {
     Attribute(usize),
+    Column(usize, String),
     Tensor(String),
 }
 
@@ -95,7 +99,7 @@ impl ValueGroup {
     fn name(&self) -> &str {
         match self {
             ValueGroup::Attribute(k) => ATTRIBUTES[*k],
-            ValueGroup::Tensor(name) => name,
+            ValueGroup::Column(_, name) | ValueGroup::Tensor(name) => name,
         }
     }
 
@@ -105,6 +109,7 @@ impl ValueGroup {
         match self {
             ValueGroup::Attribute(0) => 512.0,
             ValueGroup::Attribute(_) => 24.0,
+            ValueGroup::Column(..) => 64.0,
             ValueGroup::Tensor(name) if name.ends_with("bias") => 64.0,
             ValueGroup::Tensor(_) => 16.0,
         }
@@ -278,6 +283,8 @@ impl Grids {
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
                 ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
+                // The groups hold the columns in their order.
+                ValueGroup::Column(..) => steps.columns.push(nearest_step(octave + added)),
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
@@ -342,6 +349,13 @@ impl Grids {
                     content.cloud = before;
                     found
                 }
+                ValueGroup::Column(k, _) => {
+                    let before = content.columns[*k].clone();
+                    archive::round_column(&mut content.columns[*k], nearest_step(octave));
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
+                    content.columns[*k] = before;
+                    found
+                }
                 ValueGroup::Tensor(name) => {
                     let (before, role) = (content.tensors[name].clone(), content.field[name]);
                     let steps = self.tensor(name, octave);
@@ -360,8 +374,10 @@ impl Grids {
 fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
     let attributes = 4 + content.cloud.sh_degree() + 1;
     let tensors = content.field.iter().filter(|(_, role)| !matches!(role, TensorRole::Exact | TensorRole::Unread));
+    let columns = content.columns.iter().enumerate().map(|(k, column)| ValueGroup::Column(k, column.name.clone()));
     (0..attributes)
         .map(ValueGroup::Attribute)
+        .chain(columns)
         .chain(tensors.map(|(name, _)| ValueGroup::Tensor(name.clone())))
         .collect()
 }
@@ -381,6 +397,12 @@ fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     let found = match group {
         ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
         ValueGroup::Attribute(k) => deviation(&mut archive::attribute_values(&content.cloud, *k)),
+        ValueGroup::Column(k, _) => {
+            let values = content.columns[*k].values.planes();
+            let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
+            // Values that are all equal keep about the precision of f32.
+            deviation(&mut values.iter().copied()).max(f64::from(largest) * MIN_RELATIVE_DEVIATION)
+        }
     };
     found.max(1e-9)
 }

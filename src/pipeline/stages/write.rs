@@ -347,7 +347,7 @@ pub fn write_without_companions(
 }
 
 /// Writes the frames of `source` as a container to `path`, with values that err by at most `bounds`.
-fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
+pub(crate) fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);
     write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
