@@ -15,7 +15,7 @@ use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 
 const BLOCK: usize = 1024;
 
-/// Returns a value in [−1, 1), the same in every run.
+/// Returns the next pseudo-random number in [−1, 1) and updates `seed`. Every run gets the same numbers.
 fn noise(seed: &mut u64) -> f32 {
     *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0

@@ -33,7 +33,7 @@ const BLOCK: usize = 1024;
 const WIDTH: usize = 256;
 /// Number of copies of each Gaussian of SC-GS.
 const REPEATED: usize = 64;
-/// Number of encoded values of a position and of a time.
+/// Number of inputs of the network: the encoded position has 63 values, the encoded time 30.
 const INPUTS: usize = 63 + 30;
 
 /// Measurement of the processor time of this process.
@@ -69,13 +69,13 @@ impl Measurement for Processor {
     }
 }
 
-/// Returns a value in [−1, 1), the same in every run.
+/// Returns the next pseudo-random number in [−1, 1) and updates `seed`. Every run gets the same numbers.
 fn noise(seed: &mut u64) -> f32 {
     *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0
 }
 
-/// Returns the numbers of outputs and inputs of every layer.
+/// Returns for every layer of the network its number of outputs and its number of inputs.
 fn layers() -> Vec<[usize; 2]> {
     let inputs = |k: usize| if k == 0 { INPUTS } else { WIDTH + if k == 5 { INPUTS } else { 0 } };
     (0..8).map(|k| [WIDTH, inputs(k)]).collect()
@@ -102,7 +102,7 @@ fn network() -> Network {
     Network::new(&tensors, "", Path::new("synthetic")).expect("a well-formed network")
 }
 
-/// Computes y = W·x for `BLOCK` columns x.
+/// Computes the matrix product y = W·x for `BLOCK` columns of `x`. W is `weight`, `[outputs, inputs]`.
 fn product([outputs, inputs]: [usize; 2], weight: &[f32], x: &[f32], y: &mut [f32]) {
     assert!(weight.len() >= outputs * inputs && x.len() >= inputs * BLOCK && y.len() >= outputs * BLOCK);
     let (rows, columns) = (inputs as isize, BLOCK as isize);

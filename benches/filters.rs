@@ -28,7 +28,7 @@ struct Filter {
     level: i32,
 }
 
-/// Returns every candidate filter.
+/// Returns every candidate filter: three orders of differences, bytes gathered or not, two compression levels.
 fn filters() -> impl Iterator<Item = Filter> {
     let with = |order| {
         [(false, 1), (false, 3), (true, 1), (true, 3)].map(|(shuffled, level)| Filter { order, shuffled, level })
@@ -42,7 +42,7 @@ impl Filter {
         format!("order{}_{layout}_zstd{}", self.order, self.level)
     }
 
-    /// Encodes `bits`, which are frames of `plane` values.
+    /// Encodes the values `bits` (bits of f32), which are frames of `plane` values each.
     fn encode(&self, bits: &[u32], plane: usize) -> Vec<u8> {
         let mut residuals = bits.to_vec();
         if self.order > 0 {
@@ -91,23 +91,24 @@ impl Filter {
     }
 }
 
-/// Returns the bits of an f32 as an integer in numeric order.
+/// Converts the bits of an f32 to an integer. Integers are in the same order as the numbers.
 fn rank(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Extrapolates the line through two frames to the next; equal frames give the same value.
+/// Extrapolates the line through two frames to the next frame. `one` is the value one frame before, `two` the value two
+/// frames before. If both are equal, the result is the same value.
 fn predict(one: u32, two: u32) -> u32 {
     one.wrapping_mul(2).wrapping_sub(two)
 }
 
-/// Returns the frame before `frame` and the one before that; order 1 returns the first twice.
+/// Returns the two frames from which `frame` is predicted: the frame before it, and the frame `order` frames before it.
 fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u32], &[u32]) {
     let back = |k: usize| &before[(frame - k) * plane..][..plane];
     (back(1), back(order.min(frame)))
 }
 
-/// Returns the error bound of an attribute in the table of encodings within a bound.
+/// Returns the error bound of the attribute `column` in the table of encodings within a bound.
 fn bound(column: Attributes) -> f64 {
     match column {
         Attributes::POSITION => 1e-3,
@@ -117,8 +118,9 @@ fn bound(column: Attributes) -> f64 {
     }
 }
 
-/// Encodes the values as multiples of twice `bound` with gathered bytes: one bit per track, the first frame,
-/// differences.
+/// Encodes the values as multiples of twice `bound`: one bit per track, the first frame, then differences between
+/// frames. Bytes of equal weight are gathered. With `apart`, only tracks that move have differences; with `by_track`,
+/// differences are stored track by track instead of frame by frame.
 fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool) -> Vec<u8> {
     let multiple = |&bits: &u32| (f64::from(f32::from_bits(bits)) / (2.0 * bound)).round() as i32;
     let values: Vec<i32> = bits.iter().map(multiple).collect();

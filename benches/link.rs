@@ -23,7 +23,9 @@ fn uniform(k: u64) -> f32 {
     (hash_id(k) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Returns frames of a point cloud in which about `crowd` Gaussians lie within the size of each.
+/// Returns frames of a point cloud in shuffled order. About `crowd` Gaussians lie within the size of each Gaussian.
+/// `motion` is the angle in radians per frame on its circle, `noise` the noise of positions in sizes of a Gaussian;
+/// with `lives`, a seventh of the Gaussians is missing in each frame.
 fn frames(crowd: f32, motion: f32, noise: f32, lives: bool) -> Vec<Gaussians> {
     let size = (crowd / COUNT as f32).cbrt() * 0.5;
     let frame = |t: usize| {

@@ -39,7 +39,7 @@ use splatsieve::progress::Events;
 use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::source::FrameSource;
 
-/// Number of neighbors that the presets use.
+/// Maximum number of neighbors of a Gaussian that the presets use.
 const NEIGHBORS: usize = 32;
 
 fn random(k: usize) -> f32 {
@@ -61,7 +61,7 @@ fn evenly_distributed(n: usize) -> (Gaussians, f64) {
     (states, 1.2 * spacing)
 }
 
-/// Function that returns the total number of neighbors found, from positions and ε.
+/// Neighbor search that is measured: takes positions and the radius ε, returns the total number of neighbors found.
 type Find = fn(&AttributeValues, f64) -> usize;
 
 fn points(position: &AttributeValues) -> Vec<TreePoint> {
@@ -92,7 +92,7 @@ fn squared(a: [f32; 3], b: [f32; 3]) -> f64 {
     (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum()
 }
 
-/// Keeps the nearest [`NEIGHBORS`] of `near` (squared distance, index). Returns how many there are.
+/// Keeps the nearest [`NEIGHBORS`] entries of `near` (squared distance, index). Returns the number of entries kept.
 fn nearest(near: &mut Vec<(f64, u32)>) -> usize {
     near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBORS);
@@ -144,7 +144,8 @@ fn clustered(n: usize) -> AttributeValues {
     position
 }
 
-/// Returns the largest side of the box between the 1st and the 99th percentile, which is the extent of a scene.
+/// Returns the extent of a scene: the largest side of the box between the 1st and the 99th percentile of each
+/// coordinate.
 fn extent(position: &AttributeValues) -> f64 {
     let side = |c: usize| {
         let mut plane = position.plane(c).to_vec();
@@ -197,7 +198,8 @@ fn neighbors(criterion: &mut Criterion) {
     }
 }
 
-/// Returns pairs of each Gaussian with those of its eight nearest neighbors that have a higher index.
+/// Returns pairs of Gaussians, lower index first: each Gaussian with those of its eight nearest neighbors that have a
+/// higher index.
 fn neighbor_pairs(position: &AttributeValues) -> Vec<(u32, u32)> {
     let index = PointIndex::new(points(position), f64::INFINITY);
     let mut search = index.search();

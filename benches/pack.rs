@@ -26,7 +26,7 @@ use splatsieve::source::FrameSource;
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
-/// Returns every tile of the varying attributes, with its width.
+/// Returns every tile of the attributes that vary with time: its number of components per Gaussian, and its values.
 fn all_tiles(scene: &FramesInMemory) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
     let tiles_with_width = |column: Attributes| {

@@ -37,17 +37,17 @@ use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
-/// Number of renders, and of renders with gradients, over which the median times are taken that give the rates and the
-/// ratio.
+/// Number of renders for each median time. The medians give the printed rates, and the ratio of a render with gradients
+/// to a render without.
 const PICTURES: usize = 21;
 
-/// Operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20 for the
-/// power of 2, 10 from there to weight and transmittance, 6 for the color.
+/// Number of operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20
+/// for the power of 2, 10 from there to weight and transmittance, 6 for the color.
 const OPERATIONS: f64 = 42.0;
 /// Number of pixels in the widest vector.
 const LANES: f64 = 16.0;
 
-/// Renders and scores one view.
+/// Measures rendering, scoring and gradients of one view of the Gaussians `state`, as benchmark `name` of `group`.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
     let events = oracle::render_view(state, camera, [0.0; 3], 1).events;
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
@@ -140,8 +140,8 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
     );
 }
 
-/// Returns cycles per second, measured with a chain of exclusive ors and integer products, which take one and three
-/// cycles.
+/// Returns the clock rate in cycles per second. It is measured with a chain of exclusive ors and integer products,
+/// which take one and three cycles.
 fn clock() -> f64 {
     const LINKS: u32 = 10_000_000;
     fastest(|| {
@@ -151,7 +151,7 @@ fn clock() -> f64 {
     })
 }
 
-/// Returns the bytes per second read from memory that no cache holds.
+/// Returns the memory bandwidth in bytes per second, measured by reading more memory than the caches hold.
 fn bandwidth() -> f64 {
     let words = vec![1u64; 1 << 25];
     fastest(|| {
@@ -160,7 +160,7 @@ fn bandwidth() -> f64 {
     })
 }
 
-/// Returns the highest rate of several calls of `amount`, which returns the work it did.
+/// Calls `amount` several times, which works and returns the amount of its work. Returns the highest amount per second.
 fn fastest(amount: impl Fn() -> f64) -> f64 {
     let rate = |_| {
         let start = Instant::now();
@@ -193,10 +193,11 @@ fn pictures(criterion: &mut Criterion) {
     }
 }
 
-/// Splits every Gaussian into nine in a grid along its first two axes, which together are about as opaque.
+/// Splits every Gaussian into nine smaller ones in a grid along its first two axes. Together they are about as opaque
+/// as the original.
 fn split(state: &Gaussians) -> Gaussians {
-    /// Distance of the children in standard deviations of the parent; each child has √⅓ of one, so that the variances
-    /// add up.
+    /// Distance between the nine Gaussians, in standard deviations of the original. Each has √⅓ of its standard
+    /// deviation, so that the variances add up.
     const APART: f32 = 1.0;
     let parents: Vec<u32> = (0..9 * state.len() as u32).map(|child| child / 9).collect();
     let mut children = state.pick(&parents);
@@ -219,7 +220,7 @@ fn split(state: &Gaussians) -> Gaussians {
     children
 }
 
-/// Returns the same view in an image of `size` with the same field of view.
+/// Returns `camera` with an image of `size` pixels and the same field of view.
 fn enlarged(camera: &Camera, size: [u32; 2]) -> Camera {
     let times = f64::from(size[0]) / f64::from(camera.width);
     let [cx, cy] = size.map(|pixels| f64::from(pixels) / 2.0);

@@ -49,7 +49,7 @@ fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Smooth curves with 1e-4 of noise, about as compressible as trained models.
+/// Generated sequence: smooth curves with noise of 1e-4, about as compressible as trained models.
 struct Curves(SequenceInfo);
 
 impl FrameSource for Curves {
@@ -85,7 +85,8 @@ impl BlockReader for CurveReader {
     }
 }
 
-/// Decodes every tile that a scan reads: all tiles of a varying attribute, the first frame block of the others.
+/// Decodes every tile that a scan reads and passes its values to `take`: all tiles of attributes that vary with time,
+/// and the tiles of the first frame block of all others.
 fn each_tile(reader: &Reader, varying: Attributes, mut take: impl FnMut(&[f32])) {
     let mut buffer = TileBuffer::default();
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
@@ -180,7 +181,8 @@ fn wait_for(ready: Instant) {
     thread::sleep(ready.saturating_duration_since(Instant::now()));
 }
 
-/// Container that is read in one of the two ways, directly or through the simulated disk.
+/// Container that is read with stages on separate threads (`in_stages`) or by blocks, directly or through the simulated
+/// disk.
 struct BenchSource<'a> {
     container: &'a Container,
     in_stages: bool,
@@ -239,13 +241,13 @@ impl Prefetch for BenchSource<'_> {
     }
 }
 
-/// Reader that waits for the simulated disk: for the first frame block, and for the rest of the next one, which it
-/// requested in advance.
+/// Reader that waits for the simulated disk. It waits for the whole first frame block. Every later frame block was
+/// requested in advance, so it waits only for the time that is still missing.
 struct WaitingReader<'a> {
     fed: &'a BenchSource<'a>,
     gaussians: Range<usize>,
     reader: Box<dyn BlockReader + 'a>,
-    /// Next frame block, and the time at which it is available.
+    /// Frame block that was requested in advance, and the time at which it is available.
     coming: Option<(usize, Instant)>,
 }
 
@@ -313,7 +315,7 @@ fn read_ahead(criterion: &mut Criterion) {
     }
 }
 
-/// Copies every frame of raw tiles to a state of the caller.
+/// Measures copying every frame of raw tiles to a state of the caller.
 fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Attributes) {
     let columns: Vec<(u32, usize)> = Attributes::all()
         .iter()

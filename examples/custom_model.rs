@@ -1,5 +1,5 @@
-//! Adds a model format of one's own: implements [`FrameSource`] for a model that computes its frames, and writes it to a
-//! container, which every command of the program reads.
+//! Adds a model format that the library does not know: implements [`FrameSource`] for a model that computes its frames,
+//! and writes it to a container, which every command of the program reads.
 //!
 //! ```sh
 //! cargo run --release --example custom_model -- swing.gseq
@@ -15,7 +15,7 @@ use splatsieve::model::{Attributes, Gaussians, SequenceInfo, opacity};
 use splatsieve::outputs::container::write_container;
 use splatsieve::source::{BlockReader, FrameSource, Ids};
 
-/// A row of Gaussians that swings like a pendulum: position = (x, 0, -cos(a)), a = sin(2 pi t).
+/// Model that is a row of Gaussians and swings like a pendulum: position = (x, 0, -cos(a)), a = sin(2 pi t).
 struct Pendulum {
     info: SequenceInfo,
 }

@@ -1,5 +1,5 @@
-//! Reads frames from standard input and accumulates statistics of fixed size per Gaussian, in one pass: the number of frames
-//! in which a Gaussian is visible, and the length of its path.
+//! Reads frames from standard input and accumulates statistics of fixed size per Gaussian, in one pass: the number of
+//! frames in which a Gaussian is visible, and the length of its path.
 //!
 //! ```sh
 //! splatsieve convert scene.gseq - | cargo run --release --example statistics_from_stream
@@ -18,11 +18,11 @@ const MIN_OPACITY: f64 = 1.0 / 255.0;
 /// Statistics of one Gaussian.
 #[derive(Clone, Copy, Default)]
 struct PathStatistics {
-    /// Number of frames with at least [`MIN_OPACITY`].
+    /// Number of frames in which the opacity is at least [`MIN_OPACITY`].
     visible_frames: u32,
     /// Length of the path of the center, scene units.
     path_length: f64,
-    /// Center at the previous frame.
+    /// Center at the previous frame; `None` before the first frame.
     last: Option<[f32; 3]>,
 }
 

@@ -18,12 +18,12 @@ pub struct ReferenceFrame {
 /// Cluster of input Gaussians that are merged into one output Gaussian, the proxy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cluster {
-    /// Index of the proxy in the output.
+    /// Index in the output of the proxy that replaces this cluster.
     pub output: u32,
-    /// Id of the leader, the member to which the others were joined.
+    /// Id of the leader: the member of this cluster to which the others were joined.
     pub leader: u32,
-    /// Ids of all members in increasing order, including the leader, each with its weight in the proxy. Weights sum to
-    /// 1.
+    /// Id and weight of each member of this cluster, in increasing order of ids, including the leader. A weight is the
+    /// share of the member in the proxy; the weights sum to 1.
     pub members: Vec<(u32, f64)>,
 }
 
@@ -192,8 +192,8 @@ pub struct CompressedModel {
 }
 
 impl CompressedModel {
-    /// Returns a model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with the exact
-    /// deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
+    /// Returns the compressed model of the Gaussians `kept` (increasing ids of the input), unchanged and unmerged, with
+    /// the exact deformation field and all SH coefficients. `rule` is stored but unused, since nothing is merged.
     pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
         CompressedModel {
             kept,
@@ -237,8 +237,8 @@ impl CompressedModel {
         self.kept.is_empty()
     }
 
-    /// Returns a model of only the Gaussians at the output indices `places` (increasing). The model must have no
-    /// proxies.
+    /// Returns the compressed model that consists of only the output Gaussians with the indices `places` (increasing).
+    /// The model must have no proxies.
     ///
     /// # Panics
     /// Panics if there is a proxy.

@@ -18,7 +18,7 @@ pub struct Limits {
     pub gaussians_together: usize,
     /// Maximum number of pairs of Gaussians whose motion is compared at the same time; at least 1.
     pub pairs_together: usize,
-    /// Whether the statistics of the Gaussians are moved to a scratch file after scoring.
+    /// Whether the statistics of the Gaussians are moved from memory to a temporary file after they have been scored.
     pub statistics_on_disk: bool,
     /// Whether all decoded tiles of a container stay in memory. A tile holds some Gaussians and frames of one
     /// attribute.

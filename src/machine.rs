@@ -39,8 +39,8 @@ fn described(limit: MemoryLimit) -> (u64, String) {
     (limit.bytes, origin)
 }
 
-/// Adds the memory that a Slurm batch job requested on this node to `limits`. The node may enforce a lower limit, or
-/// none.
+/// Adds to `limits` the memory in bytes that a Slurm batch job requested on this node, read from the environment by
+/// `variable`. The node may enforce a lower limit, or none.
 fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, String)>) {
     let size = |name: &str| parse_slurm_size(&variable(name)?);
     if let Some(bytes) = size("SLURM_MEM_PER_NODE") {

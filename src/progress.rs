@@ -13,7 +13,7 @@ pub trait EventSink: Send + Sync {
         let _ = stages;
     }
 
-    /// Announces that the run of the last [`EventSink::run_begun`] has ended, with a result or an error.
+    /// Announces that the run which the last [`EventSink::run_begun`] announced has ended, with a result or an error.
     fn run_ended(&self) {}
 
     /// Announces a task. Returns the sink that receives the progress of the task and is dropped when the task ends, or
@@ -60,7 +60,7 @@ pub enum Message<'a> {
     Plan(&'a str),
     /// Problem that the user should solve before the run goes on, such as missing cameras.
     Warning(&'a str),
-    /// Notice that the computed result of a stage is not used.
+    /// Notice that a stage computed a result which is then not used.
     Discarded {
         /// Name of the stage whose result is not used.
         stage: &'a str,

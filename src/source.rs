@@ -43,25 +43,23 @@ impl Ids<'_> {
     }
 }
 
-/// Frames that a reader will be asked for. Knowing them, the reader decodes a tile (some Gaussians at consecutive
-/// frames) once and keeps only the frames that are needed.
-///
-/// The plan is advice: reading other frames, or reading in another order, gives the same values but takes more time.
+/// Plan of the frames that will be read from a reader. With the plan, the reader decodes a tile (some Gaussians at
+/// consecutive frames) once and keeps only the frames that will be read.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
-    /// Frames in increasing order; `None`: every frame.
+    /// Frames that will be read, in increasing order; `None` means every frame.
     frames: Option<Arc<[usize]>>,
     held: usize,
 }
 
 impl ReadPlan {
-    /// Creates the plan to read every frame in order. Readers without a plan assume it.
+    /// Creates the plan to read every frame in order. A reader that is given no plan assumes this one.
     pub fn all_frames() -> ReadPlan {
         ReadPlan { frames: None, held: usize::MAX }
     }
 
-    /// Creates the plan to read `frames` in increasing order, each once, whatever the order and repetitions in
-    /// `frames`.
+    /// Creates the plan to read each of `frames` once, in increasing order. The order of `frames` and repetitions in it
+    /// have no effect.
     pub fn new(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
@@ -69,8 +67,9 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Sets the maximum number of frames that a reader keeps of the frames decoded together, at least 1. A small
-    /// maximum saves memory but makes the reader decode tiles repeatedly.
+    /// Returns this plan with another maximum number of frames that a reader keeps in memory after it has decoded a
+    /// tile; at least 1. A tile holds several consecutive frames. A small maximum saves memory but makes the reader
+    /// decode tiles repeatedly.
     pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
@@ -134,7 +133,7 @@ impl Sub for Reads {
     }
 }
 
-/// Counter that many threads add to. A clone starts from zero, because it belongs to another source.
+/// Counter that many threads add to. A clone starts from zero, because a cloned source counts its own reads.
 #[derive(Debug, Default)]
 pub struct SharedCounter(AtomicU64);
 
@@ -190,7 +189,7 @@ pub trait FrameSource: Send + Sync {
         Reads::default()
     }
 
-    /// Returns the handle for fetching bytes before they are read. `None` if this saves no time.
+    /// Returns the object that fetches bytes from the disk before they are read; `None` if this saves no time.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }
@@ -202,7 +201,8 @@ pub trait Deformation: Sync {
     /// Returns the stored parameters of all Gaussians.
     fn stored(&self) -> &StoredParams;
 
-    /// Returns the attributes with derivatives: those that [`Deformation::jacobian`] can differentiate.
+    /// Returns the attributes of the stored parameters that an optimizer can change, because [`Deformation::jacobian`]
+    /// can differentiate by them.
     fn movable(&self) -> Attributes;
 
     /// Computes the state at `frame` of Gaussians with the parameters `stored`. Writes only the attributes `want` to
@@ -246,12 +246,12 @@ pub trait BlockReader: Send {
     /// Fails if the frame cannot be read.
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
-    /// Announces the frames that will be read from now on, and how many of them the reader may keep. Readers that keep
-    /// no frames ignore this.
+    /// Announces by a plan the frames that will be read from now on, and how many of them the reader may keep in
+    /// memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Decodes the attributes `_want` at `_frame`, and at the frames decoded with it, so that [`BlockReader::read`]
-    /// only has to copy. Does so only for frames that the reader may keep.
+    /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later
+    /// calls of [`BlockReader::read`] only have to copy values. Does so only for frames that the reader may keep.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }

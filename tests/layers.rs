@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Folders of the library; each uses only folders before it.
+/// Folders of the library in order. Each folder uses only folders before it.
 const FOLDERS: [&str; 27] = [
     "limits",
     "machine",
@@ -44,17 +44,17 @@ fn folder_index(folder: &str) -> Option<usize> {
     FOLDERS.iter().position(|name| *name == folder)
 }
 
-/// Path of names from the root of the library.
+/// Path of a name or module, as a list of names from the root of the library.
 type Names = Vec<String>;
 
-/// Paths that a file of the library imports, and its re-exports by name.
+/// Imports of a file of the library: all imported paths, and the paths of its re-exports by name.
 #[derive(Default)]
 struct Module {
     uses: Vec<Names>,
     passes_on: BTreeMap<String, Names>,
 }
 
-/// Map of all modules of the library by path, without tests.
+/// Modules of the library by path, without tests.
 struct Library(BTreeMap<Names, Module>);
 
 impl Library {
@@ -63,7 +63,7 @@ impl Library {
         Library(files.iter().map(read).collect())
     }
 
-    /// Returns the module that defines the last name of a path.
+    /// Returns the module that defines the last name of `path`; re-exports are followed.
     fn home(&self, path: &[String]) -> Names {
         self.follow(path, 0)
     }
@@ -85,7 +85,7 @@ impl Library {
         at
     }
 
-    /// Returns the modules that each module uses.
+    /// Returns for each module the modules that it uses.
     fn dependencies(&self) -> BTreeMap<Names, BTreeSet<Names>> {
         let used = |at: &Names, module: &Module| -> BTreeSet<Names> {
             let homes = module.uses.iter().map(|path| self.home(path));
@@ -124,7 +124,8 @@ impl Module {
     }
 }
 
-/// Returns whether an import is a re-export, and the tree of its imports.
+/// Parses the import `statement`. Returns whether it is a re-export, and its tree of paths; `None` for other
+/// statements.
 fn parse_import(statement: &str) -> Option<(bool, &str)> {
     let line = statement.lines().map(str::trim_start).position(|line| {
         line.starts_with("use ") || (line.starts_with("pub") && line.split_whitespace().nth(1) == Some("use"))
@@ -144,7 +145,7 @@ fn without_tests_and_comments(text: &str) -> String {
     parts.fold(first, |code, part| code + "pub(crate)" + part.split_once(')').map_or("", |(_, after)| after))
 }
 
-/// Returns every path of an import tree such as `crate::{a, b::{c, d}}`.
+/// Returns every path of an import tree. The tree `crate::{a, b::{c, d}}` has three paths.
 fn expand(tree: &str) -> Vec<Names> {
     let tree = tree.trim();
     let Some(open) = tree.find('{') else {
@@ -171,7 +172,8 @@ fn expand(tree: &str) -> Vec<Names> {
     branches.map(|branch| [&stem[..], &branch[..]].concat()).collect()
 }
 
-/// Returns the path from the root, as seen from the module `at`, if it leads into the library.
+/// Converts `path`, as written in the module `at`, to a path from the root of the library. Returns `None` if it leads
+/// outside of the library.
 fn from_root(at: &Names, path: &[String], files: &BTreeMap<Names, String>) -> Option<Names> {
     match path.first().map(String::as_str)? {
         "crate" => Some(path[1..].to_vec()),
@@ -187,7 +189,7 @@ fn from_root(at: &Names, path: &[String], files: &BTreeMap<Names, String>) -> Op
     }
 }
 
-/// Collects the text of every file below `folder` by module path, except tests.
+/// Collects the text of every file below `folder` in `found`, by module path, except tests.
 fn modules(folder: &Path, at: &Names, found: &mut BTreeMap<Names, String>) {
     let mut entries: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     entries.sort();
@@ -212,7 +214,7 @@ fn library() -> Library {
     Library::parse(&files)
 }
 
-/// Returns a cycle of modules if there is one.
+/// Returns a cycle of modules that use one another; `None` if there is none.
 fn cycle(dependencies: &BTreeMap<Names, BTreeSet<Names>>) -> Option<Vec<Names>> {
     let mut left = dependencies.clone();
     // A module that uses no remaining module is in no cycle.

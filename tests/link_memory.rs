@@ -16,7 +16,7 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 
 const LIVING: usize = 20_000;
 const FRAMES: usize = 40;
-/// Number of frames that each Gaussian is alive before another one begins elsewhere.
+/// Number of frames for which each Gaussian is alive, before another one begins elsewhere.
 const LIFE: usize = 5;
 
 /// Returns a number evenly distributed in [0, 1) that depends only on `seed`.
@@ -24,7 +24,7 @@ fn uniform(seed: usize) -> f32 {
     (hash_id(seed as u64) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Writes frames with equal numbers of Gaussians, each frame in its own order.
+/// Writes PLY frames with equal numbers of Gaussians to `folder`. Each frame has its Gaussians in another order.
 fn write_frames(folder: &Path) {
     for frame in 0..FRAMES {
         let mut out = Gaussians::zeros(LIVING, 1);

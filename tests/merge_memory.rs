@@ -1,5 +1,5 @@
-//! Test of the memory of measuring pairs of Gaussians, counted in allocated bytes: it is bounded by the number of pairs
-//! measured together, for any number of frames.
+//! Test of the memory for measuring the motion of pairs of Gaussians, counted in allocated bytes. The memory is bounded
+//! by the number of pairs measured together, for any number of frames.
 
 #[path = "corpus/memory.rs"]
 mod memory;
@@ -26,8 +26,8 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 const COUNT: usize = 20_000;
 const FRAMES_HELD: usize = 2;
 
-/// Measures the six nearest neighbors of every Gaussian. Returns the largest number of bytes allocated at once beyond
-/// those allocated before, and the number of pairs.
+/// Measures the pairs of every Gaussian with its six nearest neighbors. Returns the largest number of bytes allocated
+/// at any time, less the bytes allocated before, and the number of pairs.
 fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let path = folder.join(format!("{frames}.gseq"));
     if !path.exists() {

@@ -17,7 +17,7 @@ use splatsieve::source::{BlockReader, FrameSource, Ids, ReadPlan};
 const COUNT: usize = 20_000;
 const FRAMES: usize = 1200;
 
-/// Returns a line of `/proc/self/status` in bytes.
+/// Returns the value of an entry of `/proc/self/status` in bytes. `line` is the start of its line.
 fn status(line: &str) -> usize {
     let status = fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|found| found.strip_prefix(line)).unwrap();

@@ -12,7 +12,7 @@ use splatsieve::source::{FrameSource, Ids};
 mod models;
 
 const GAUSSIANS: usize = 4096;
-/// Number of frames of one tile, at the sampling of the training.
+/// Number of frames in a tile. They follow one another as the frames of the training do.
 const FRAMES: usize = 32;
 const TIMES: usize = 60;
 
@@ -23,8 +23,8 @@ pub(crate) fn scenes() -> Vec<(&'static str, FramesInMemory)> {
     std::iter::once(("curves", curves())).chain(models).collect()
 }
 
-/// Returns the states of a trained model for Gaussians evenly spread over the point cloud, without attributes that do
-/// not vary.
+/// Returns the states over [`FRAMES`] frames of the trained model `name`, for Gaussians evenly spread over the point
+/// cloud. Attributes that do not vary with time are left out.
 fn trained(folder: &Path, name: &str) -> FramesInMemory {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
@@ -61,7 +61,8 @@ fn curves() -> FramesInMemory {
     held
 }
 
-/// Returns the values of an attribute in the tiles of a container: for each block of Gaussians `[frames][width][len]`.
+/// Returns the values of the attribute `column` in the tiles of a container: one list `[frames, components, Gaussians]`
+/// for each block of Gaussians.
 pub(crate) fn tiles(scene: &FramesInMemory, column: Attributes) -> Vec<Vec<f32>> {
     const BLOCK: usize = splatsieve::outputs::container::GAUSSIAN_BLOCK;
     let mut state = Gaussians::zeros(0, scene.info().sh_degree);

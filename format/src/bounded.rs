@@ -32,7 +32,8 @@ const HEAD_BYTES: usize = 16;
 /// Minimum number of values per exception (value stored with its original bits). A tile with more exceptions is stored
 /// in another encoding.
 const VALUES_PER_EXCEPTION: usize = 16;
-/// Multiples of the step are smaller than this in magnitude, so that their second differences fit 32 bits.
+/// Limit of the magnitude of a multiple of the quantization step: multiples are smaller, so that their second
+/// differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
 /// zstd level of the trial that decides whether static tracks use half the step. Half the step makes more tracks
 /// static, but each of them takes a bit more space.
@@ -89,10 +90,11 @@ fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
-/// Returns the quantization step for an error of at most `max_error`: twice the bound, less what rounding the largest
-/// value to f32 may add to the error.
+/// Returns the quantization step for an error of at most `max_error`: twice `max_error`, minus the error that rounding
+/// the largest value to f32 may add.
 ///
-/// Values so large that their f32 spacing exceeds half the bound do not count; they may become exceptions.
+/// Values so large that their f32 spacing exceeds half of `max_error` do not count as the largest value. They may be
+/// stored unquantized, as exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -105,17 +107,20 @@ struct Multiples {
     plane: usize,
     step: f64,
     halvings: u32,
-    /// Multiples, in the order of the tile's values. Those of static tracks are multiples of [`static_step`].
+    /// Multiples, in the order of the tile's values. For a static track (all values stored as one multiple), the step
+    /// is that of [`static_step`].
     values: Vec<u32>,
-    /// Whether each track (one component of one Gaussian over all frames) is moving, that is, not static.
+    /// Whether each track (one component of one Gaussian over all frames) is moving. A track that is not moving is
+    /// static: all of its values are stored as one multiple.
     moves: Vec<bool>,
     /// Values stored as they are: index of the value and its original bits, in the order of the indices.
     exceptions: Vec<(u32, u32)>,
 }
 
 impl Multiples {
-    /// Quantizes `values`. A track is static if one multiple of the step, halved `halvings` times (0 or 1), is within
-    /// the error bound of all its values.
+    /// Quantizes `values`: frames of `plane` values each, with an error of at most `max_error`. A track (one component
+    /// of one Gaussian over all frames) is static if one multiple of `step`, halved `halvings` times (0 or 1), is
+    /// within the error bound of all its values.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);
         // Returns the multiple of `step` nearest to `x`, if it is within the error bound of all of `values`.
@@ -157,14 +162,14 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Returns the multiples of the first frame only.
+    /// Returns the multiples and exceptions of the first frame only.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
         self
     }
 
-    /// Returns the bits of all values as they are after decoding.
+    /// Returns the bits of all values as a decoder of the tile gets them.
     fn decoded(&self) -> Vec<u32> {
         let steps = [static_step(self.step, self.halvings), self.step];
         let tracks = self.moves.iter().cycle();
@@ -189,7 +194,8 @@ impl Multiples {
         moving.flat_map(move |track| (1..frames).map(move |frame| self.residual(order, track, frame)))
     }
 
-    /// Returns the order of prediction (number of earlier frames: 1 or 2) whose prediction errors take fewer bits.
+    /// Returns the order of prediction whose prediction errors take fewer bits: 1 or 2, the number of earlier frames
+    /// that predict a value.
     fn order(&self) -> u8 {
         let cost = |order| self.residuals(order).map(|residual| u64::from(32 - residual.leading_zeros())).sum::<u64>();
         if cost(2) < cost(1) { 2 } else { 1 }
@@ -279,7 +285,7 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns the multiples of all tracks in the first frame, zigzag-coded.
+    /// Returns the multiples of the quantization step of all tracks in the first frame, zigzag-coded.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
@@ -293,8 +299,9 @@ impl BoundedTracks {
         moving.map(move |(nth, track)| (track, shuffled_value(&bytes[from..], values, nth * after_first + frame - 1)))
     }
 
-    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile. `multiples` holds
-    /// the quantized value of each track in this frame, in quantization steps; `bytes` are the decompressed bytes of the tile.
+    /// Writes the f32 values of frame `frame`, as bits, to `out`, one per scalar sequence ("track") of the tile.
+    /// `multiples` holds the quantized value of each track in this frame, in quantization steps; `bytes` are the
+    /// decompressed bytes of the tile.
     pub(crate) fn values(&self, bytes: &[u8], frame: usize, multiples: &[u32], out: &mut [u32]) {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);

@@ -31,7 +31,7 @@ use crate::bounded::{self, BoundedTracks};
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
 
-/// How [`encode_tile`] stores the values of a tile.
+/// Storage method of the values of a tile, chosen by the caller of [`encode_tile`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
     /// Raw: plain f32 values, which readers use in place from the memory map.
@@ -49,7 +49,7 @@ pub enum Compression {
     },
 }
 
-/// How the stored bytes of a tile encode its values.
+/// Encoding of the values of a tile in its stored bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
     /// Raw: little-endian f32.
@@ -317,8 +317,8 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes the multiples of the next frame of a tile in the lossy encoding. Those of static tracks do not change
-    /// after the first frame.
+    /// Decodes the multiples of the next frame of a tile in the lossy encoding. The multiples of static tracks, which
+    /// are stored once, do not change after the first frame.
     fn step_multiples(&mut self) {
         let [before, second_before] = &mut self.recent;
         if self.next == 0 {
@@ -384,7 +384,8 @@ pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
-/// Returns the order of prediction (number of earlier frames) whose differences take fewer bits.
+/// Returns the order of prediction (number of earlier frames that predict a value) whose differences take fewer bits: 1
+/// or 2, or 0 if there is only one frame.
 ///
 /// Compares every fourth value only: comparing all would take as long as the filter itself, and where the results are
 /// close, either order is good.

@@ -20,9 +20,9 @@ pub enum Error {
         path: PathBuf,
         /// Offset of the first wrong byte from the start of the file.
         offset: u64,
-        /// What a valid file contains at this offset.
+        /// Content that a valid file has at this offset.
         expected: String,
-        /// What this file contains at this offset.
+        /// Content that this file has at this offset.
         found: String,
         /// Advice to the user on what to do next; may be empty.
         hint: &'static str,
@@ -43,7 +43,7 @@ pub enum Error {
     Usage(String),
 }
 
-/// Shows the advice of an error message on a line of its own; shows nothing if the advice is empty.
+/// Advice of an error message, displayed on a line of its own. Empty advice displays as nothing.
 struct Advice<'a>(&'a str);
 
 impl fmt::Display for Advice<'_> {

@@ -68,8 +68,8 @@ impl MappedFile {
         })
     }
 
-    /// Reads `range` in successive chunks and calls `each` with the offset and the bytes of each. Every chunk has
-    /// [`CHUNK_BYTES`] bytes except the last one, which may be shorter. `chunk` is a buffer.
+    /// Reads `range` in successive chunks and calls `each` with the offset and the bytes of every chunk. Every chunk
+    /// has [`CHUNK_BYTES`] bytes except the last one, which may be shorter. `chunk` is a buffer.
     pub(crate) fn read_chunks(
         &self,
         range: std::ops::Range<u64>,
@@ -93,8 +93,8 @@ impl MappedFile {
         }
     }
 
-    /// Tells the operating system that the bytes of `range` will be read soon. If it ignores this, later reads wait for
-    /// the disk.
+    /// Tells the operating system that the bytes of `range` will be read soon. If the system ignores this advice, later
+    /// reads wait for the disk.
     pub(crate) fn will_need(&self, range: std::ops::Range<u64>) {
         if !range.is_empty() {
             splat_platform::expect_pages(&self.map, range.start as usize..range.end as usize);

@@ -78,7 +78,8 @@ impl Index {
 
     /// Checks and hashes all entries in one pass, in which it remembers only the last constant tile (all frames equal)
     /// of each column and Gaussian block. Returns for every column whether its values differ between frames, and
-    /// whether the pass has shown that no two tiles overlap. It shows this if the tiles lie in the order of the index.
+    /// whether the pass has shown that no two tiles overlap. The pass shows this only if the tiles lie in the file in
+    /// the order of the index.
     fn check_entries(
         &self,
         file: &MappedFile,

@@ -55,7 +55,7 @@ pub struct TileBuffer {
     zstd: Option<Decompressor<'static>>,
 }
 
-/// How much tile data a reader has read so far.
+/// Counts of the tile data that a reader has read so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileReadCounts {
     /// Number of bytes of stored tile data that were read from the file.
@@ -77,7 +77,7 @@ pub struct Tile<'a> {
 /// Entry of a tile in the index (table of tiles) of a container.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileInfo {
-    /// How the stored bytes encode the tile's values.
+    /// Encoding of the tile's values in its stored bytes.
     pub encoding: Encoding,
     /// Whether all frames of the tile are equal, so that only one is stored.
     pub constant: bool,

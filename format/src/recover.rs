@@ -24,8 +24,8 @@ pub struct RecoverReport {
     pub frames_seen: u64,
     /// Number of intact tiles that were found in the damaged file.
     pub tiles_seen: u64,
-    /// Number of tiles in the new container. The other intact tiles belong to an incomplete frame block or to one after
-    /// it.
+    /// Number of tiles in the new container. The other intact tiles belong to an incomplete frame block or to a frame
+    /// block after an incomplete one.
     pub tiles_saved: u64,
     /// Number of bytes of the damaged file that belong to no intact record.
     pub bytes_skipped: u64,

@@ -42,7 +42,8 @@ pub struct Writer {
     times: Vec<f64>,
     /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
     index: File,
-    /// Number of tiles in the frame blocks appended so far; `written` is how many of them have been written.
+    /// Number of tiles in the frame blocks appended so far; `written` is the number of these tiles that have been
+    /// written.
     tiles: u64,
     written: u64,
     /// Last constant tile (all frames equal) written for each column and Gaussian block; empty before the first frame
@@ -190,8 +191,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if it was written
-    /// before.
+    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if the tile was
+    /// written before.
     fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
@@ -212,8 +213,8 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error the writer is at
-    /// `start` again.
+    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error, the next record
+    /// is written at `start` again.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
@@ -294,8 +295,9 @@ impl Writer {
         Ok(digest.value())
     }
 
-    /// For a constant tile, returns the offset of equal stored bytes that are in the file already, if there are some.
-    /// Equal checksums are only a hint; the bytes are read back and compared.
+    /// Returns the offset in the file of stored bytes that equal `bytes`, if `record` is a constant tile (all frames
+    /// equal) and the last constant tile of `slot` (its column and Gaussian block) has such bytes. Equal checksums are
+    /// only a hint; the bytes are read back and compared.
     fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
         let Some(earlier) = self.constants[slot] else { return Ok(None) };
         if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {

@@ -1,5 +1,5 @@
-//! Code of every fuzz target: passes bytes to the entry of its name, and then the same bytes with repaired checksums. A
-//! panic, a message with Rust debug text or too much memory ends the run.
+//! Code of every fuzz target. Passes the bytes of the fuzzer to a reader of user-supplied bytes (an entry), and then
+//! the same bytes with repaired checksums. A panic, a message with Rust debug text or too much memory ends the run.
 
 #[path = "../../tests/corpus/entries.rs"]
 #[allow(dead_code, reason = "libFuzzer is told where the corpus lies")]
@@ -24,7 +24,7 @@ thread_local! {
     static FOLDER: OnceCell<InputFolder> = const { OnceCell::new() };
 }
 
-/// Runs the entry `name` on `bytes`.
+/// Runs the reader of the entry `name` on `bytes`.
 ///
 /// # Panics
 /// Panics if `Entry::check` does.
@@ -35,7 +35,7 @@ pub fn run(name: &str, bytes: &[u8]) {
     FOLDER.with(|folder| entry.check(bytes, folder.get_or_init(InputFolder::new)));
 }
 
-/// Defines the fuzz target of an entry.
+/// Defines the fuzz target that runs the entry with the given name.
 #[macro_export]
 macro_rules! target {
     ($name:literal) => {

@@ -20,13 +20,14 @@ use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coe
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
-/// Quantization step of each attribute of [`ATTRIBUTES`], as an exponent; see [`super::step_size()`].
+/// Quantization step number `k` of each attribute, in the order of [`ATTRIBUTES`]. The step is 2^(k/8); see
+/// [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
 /// Number of known values from which a value is predicted: the value of the previous Gaussian, the mean of the previous
 /// four, and the values of the same Gaussian in the two previous planes (scalar components).
 const NEIGHBORS: usize = 4;
-/// Number of bits per axis of an index along the Morton curve.
+/// Number of bits per axis from which an index along the Morton curve is made.
 const CURVE_BITS: u32 = 21;
 
 /// Further values of the Gaussians, which only some model formats have, such as coefficients of a motion. The values of
@@ -50,7 +51,7 @@ pub(super) struct ColumnShape {
     pub(super) step: i32,
 }
 
-/// Parameters that are needed to decode the symbols of encoded Gaussians.
+/// Parameters of encoded Gaussians that a decoder needs besides the symbols.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PointCloudShape {
@@ -62,10 +63,10 @@ pub(super) struct PointCloudShape {
     pub(super) lowest: [i64; 3],
     /// Number of low bits of each coordinate that are stored as plain bits and not used by the Morton curve.
     pub(super) loose: u32,
-    /// Mean of every plane (scalar component) after the three of the position, in quantization steps.
+    /// Mean of every plane (scalar component), in quantization steps. The three planes of the position have none.
     pub(super) means: Vec<i64>,
-    /// Predictor weights (with which a value is predicted from known values) of every plane (scalar component) after
-    /// the three of the position.
+    /// Predictor weights (with which a value is predicted from known values) of every plane (scalar component), except
+    /// the three planes of the position.
     pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
@@ -155,7 +156,7 @@ pub(crate) fn spread(x: u64) -> u64 {
     x
 }
 
-/// Inverse of [`spread`]: returns every third bit of `x`, packed together.
+/// Returns every third bit of `x`, packed together; the inverse of [`spread`].
 fn gather(x: u64) -> u64 {
     let mut x = x & 0x1249_2492_4924_9249;
     for (shift, mask) in [
@@ -170,8 +171,9 @@ fn gather(x: u64) -> u64 {
     x
 }
 
-/// Returns every position relative to the minimum on each axis, that minimum, and the number of low bits that the
-/// Morton curve does not use. Positions and minimum are in quantization steps.
+/// Rounds all positions to `grid`. Returns three things: every position less the minimum on each axis; this minimum;
+/// and the number of low bits of a coordinate that the Morton curve does not use. Positions and minimum are in
+/// quantization steps.
 fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
@@ -180,16 +182,17 @@ fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u
     (above, lowest, (64 - most.leading_zeros()).saturating_sub(CURVE_BITS))
 }
 
-/// Returns the index along the Morton curve of a position in quantization steps. The `loose` lowest bits of each
-/// coordinate are left out.
+/// Returns the index along the Morton curve of the position `place`, which is in quantization steps. The `loose` lowest
+/// bits of each coordinate are left out.
 fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
     let [x, y, z] = place.map(|x| spread(x >> loose));
     x | y << 1 | z << 2
 }
 
-/// Encodes Gaussians with the quantization steps `steps` of their attributes and `column_steps` of `columns`. Returns
-/// the parameters for decoding, the symbols, and the original index of each Gaussian in the new order. Adds the
-/// approximate number of bits of every attribute and column to `bits`.
+/// Encodes the Gaussians `cloud` with the quantization steps `steps` of their attributes, and the further values
+/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for each
+/// Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and column to
+/// `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     columns: &[Column],
@@ -348,9 +351,10 @@ impl PlaneCoder {
         PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
     }
 
-    /// Visits every Gaussian of one plane (scalar component) in coding order. `code` receives the index of the
-    /// Gaussian, the known values to predict from, the expected absolute error in quantization steps, and the entropy
-    /// models. It returns the quantized value as a multiple of the step, and that multiple less the predicted one.
+    /// Visits every Gaussian of one plane (scalar component) in coding order. `code` encodes or decodes one value. It
+    /// receives the index of the Gaussian, the known values to predict from, the expected absolute prediction error in
+    /// quantization steps, and the entropy models. It returns the quantized value as a multiple of the step, and the
+    /// prediction error (this multiple less the predicted one).
     #[inline(always)]
     fn plane(
         &mut self,
@@ -388,7 +392,8 @@ fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usiz
     }))
 }
 
-/// Rounds the values of the attributes with the indices `attributes` in [`ATTRIBUTES`] to their quantization grids.
+/// Rounds values in place to the quantization grids of `steps`. Only attributes whose index in [`ATTRIBUTES`] is in
+/// `attributes` are rounded.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     for (column, c, attribute) in components(cloud.sh_degree()) {
         if attributes.contains(&attribute) {
@@ -403,7 +408,8 @@ pub(super) fn round_all(values: &mut [f32], step: i32) {
     values.iter_mut().for_each(|value| *value = grid.round(*value));
 }
 
-/// Returns the values of all scalar components of the attribute [`ATTRIBUTES`]`[attribute]`, component by component.
+/// Returns the values of the attribute [`ATTRIBUTES`]`[attribute]`: all Gaussians' first scalar component, then their
+/// second, and so on.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
     let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == attribute);
     own.flat_map(|(column, c, _)| cloud.column(column).plane(c).iter().copied())

@@ -7,22 +7,24 @@
 
 /// Number of bits of a probability: probabilities are multiples of 1/2^15.
 const PRECISION: u32 = 15;
-/// Sum of all probabilities of a model less one, in units of 1/2^15; the sum itself does not fit into i16.
+/// Upper end of the cumulative probabilities of a model, in units of 1/2^15. It is one less than their sum 2^15, which
+/// does not fit into i16.
 const TOTAL: i16 = i16::MAX;
 /// Number of different symbols that a model predicts.
 pub(super) const SYMBOLS: usize = 16;
 /// Minimum probability of a symbol, in units of 1/2^15. It keeps every symbol possible.
 const MIN_PROBABILITY: i16 = 8;
-/// Lower bound of the 64-bit state of the ANS coder; below it, the decoder reads another word.
+/// Lower bound of the 64-bit state of the ANS coder; when the state is below it, the decoder reads another 32-bit word.
 const MIN_STATE: u64 = 1 << 31;
-/// Initial learning rate: each symbol moves the probabilities by 1/2^rate of the way to those of a model that was
-/// certain of this symbol. The rate grows every 8 symbols, so the model changes more slowly.
+/// Initial value of `rate`, the learning rate of a model. After each symbol, the model's probabilities move by
+/// 1/2^`rate` of the way to the probabilities of a model that is certain of this symbol. `rate` grows by one every 8
+/// symbols, so the model changes more slowly.
 const FIRST_RATE: u32 = 3;
-/// Final learning rate: each symbol then moves the probabilities by 1/2^7 of the way to those of a model that was
-/// certain of this symbol.
+/// Final value of the learning rate ([`FIRST_RATE`]): after each symbol, the probabilities move by 1/2^7 of the way.
 const LAST_RATE: u32 = 7;
 
-/// For each symbol, the cumulative probabilities of a model that is certain of this symbol, in units of 1/2^15.
+/// Cumulative probabilities of a model that is certain of a symbol, for each symbol, in units of 1/2^15. All other
+/// symbols have the probability [`MIN_PROBABILITY`].
 const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
     let mut known = [[0; SYMBOLS]; SYMBOLS];
     let mut symbol = 0;
@@ -61,15 +63,17 @@ impl SymbolModel {
         SymbolModel { starts, seen: 0 }
     };
 
-    /// Returns the sum of the probabilities of all lower symbols, and the probability of `symbol`, in units of 1/2^15.
+    /// Returns the interval of `symbol`, in units of 1/2^15: its start, which is the sum of the probabilities of all
+    /// lower symbols, and its length, which is the probability of `symbol`.
     fn interval(&self, symbol: usize) -> (u32, u32) {
         let start = self.starts[symbol] as u32;
         let end = self.starts.get(symbol + 1).map_or(1 << PRECISION, |&end| end as u32);
         (start, end - start)
     }
 
-    /// Updates the probabilities after `symbol` was coded. They stay at least `MIN_PROBABILITY`, because neighboring
-    /// entries of `starts` move by the same fraction toward targets that are at least that far apart.
+    /// Updates the probabilities after `symbol` was coded. Every probability stays at least `MIN_PROBABILITY`:
+    /// neighboring entries of `starts` move by the same fraction toward targets that are at least `MIN_PROBABILITY`
+    /// apart.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);
@@ -86,17 +90,17 @@ pub(super) struct SymbolEncoder {
     bits: Vec<u8>,
     pending: u64,
     pending_bits: u32,
-    /// Approximate number of bits written so far, of symbols and plain bits.
+    /// Approximate number of bits written so far, for symbols and plain bits together.
     cost: f64,
 }
 
 impl SymbolEncoder {
-    /// Returns the approximate number of bits written so far, of symbols and plain bits.
+    /// Returns the approximate number of bits written so far, for symbols and plain bits together.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
-    /// Writes a symbol with the probability that `model` gives it, then updates the model.
+    /// Writes `symbol`, coded with the probability that `model` gives it. Then updates the model.
     pub(super) fn symbol(&mut self, model: &mut SymbolModel, symbol: usize) {
         let (start, interval) = model.interval(symbol);
         self.cost += f64::from(PRECISION) - f64::from(interval).log2();
@@ -131,7 +135,8 @@ impl SymbolEncoder {
         self.bits(value >> 32, count - low);
     }
 
-    /// Returns the encoded bytes: the length in bytes of the ANS coder's 32-bit words, these words, and the plain bits.
+    /// Returns the encoded bytes: a u64 with the total length in bytes of the ANS coder's 32-bit words, these words,
+    /// and the plain bits.
     pub(super) fn finish(mut self) -> Vec<u8> {
         if self.pending_bits > 0 {
             self.bits.push(self.pending as u8);
@@ -165,13 +170,13 @@ pub(super) struct SymbolDecoder<'a> {
     bits: &'a [u8],
     pending: u64,
     pending_bits: u32,
-    /// Whether more words were needed than the input has.
+    /// Whether the decoder has needed more 32-bit words than the input has.
     is_short: bool,
 }
 
 impl<'a> SymbolDecoder<'a> {
-    /// Returns a decoder of `bytes`; `None` if the stored length of the words exceeds `bytes` or is not a multiple of
-    /// 4, or if there are fewer than two words.
+    /// Returns a decoder of `bytes`. Returns `None` if the stored length of the ANS coder's 32-bit words exceeds
+    /// `bytes` or is not a multiple of 4, or if there are fewer than two of these words.
     pub(super) fn new(bytes: &'a [u8]) -> Option<SymbolDecoder<'a>> {
         let (length, rest) = bytes.split_first_chunk::<8>()?;
         let (words, bits) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).ok()?)?;
@@ -181,7 +186,7 @@ impl<'a> SymbolDecoder<'a> {
         Some(SymbolDecoder { state, words: words.iter(), bits, pending: 0, pending_bits: 0, is_short: false })
     }
 
-    /// Reads the next symbol, which `model` predicts, and updates the model.
+    /// Reads the next symbol, which is coded with the probabilities of `model`. Then updates the model.
     #[inline(always)]
     pub(super) fn symbol(&mut self, model: &mut SymbolModel) -> usize {
         let place = (self.state & ((1 << PRECISION) - 1)) as i16;

@@ -18,21 +18,22 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Eighths of an octave by which the quantization step of a texel becomes finer when its squared read weights, summed
-/// over the Gaussians, double. The squared error of the texel counts in proportion to this sum.
+/// Refinement of the quantization step of a texel that is read more, in eighths of an octave: the step becomes finer by
+/// this much when the squared interpolation weights, summed over the Gaussians that read the texel, double. The squared
+/// error of the texel counts in proportion to this sum.
 const FINER_PER_OCTAVE: i32 = 4;
 
-/// Class of a weight whose quantization step has no offset. Another class differs from it by its offset, in eighths of
-/// an octave.
+/// Class of a weight whose quantization step has no offset. The class of another weight is this number plus its offset
+/// in eighths of an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
-/// Way in which the deformation field uses a tensor. It decides how an archive stores the tensor.
+/// Use of a tensor by the deformation field. It decides how an archive stores the tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TensorRole {
-    /// Feature plane `[1, channels, size_b, size_a]` over two spatial axes (a, b).
+    /// Feature plane `[1, channels, size_b, size_a]` over two spatial axes (a, b): 0 is x, 1 is y, 2 is z.
     Plane([usize; 2]),
-    /// Feature plane `[1, channels, times, size]` over one spatial axis and time.
+    /// Feature plane `[1, channels, times, size]` over one spatial axis (0 is x, 1 is y, 2 is z) and time.
     TimePlane(usize),
     /// Weights of a layer: a matrix `[outputs, inputs]`, or a tensor of any other shape.
     Weights,
@@ -49,13 +50,13 @@ pub(super) struct TensorEntry {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     pub(super) role: TensorRole,
-    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step_size()`].
+    /// Exponent `k` of the quantization step 2^(k/8) of the tensor; see [`super::step_size()`].
     pub(super) step: i32,
-    /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
-    /// column; any other tensor of weights has one per element. Empty if there are no corrections.
+    /// Offsets that are added to the exponent `k` in `step`. A plane has one per channel; a matrix has one per row,
+    /// followed by one per column; any other tensor of weights has one per element. Empty if no offset is needed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
-    /// Mean of the values, in quantization steps.
+    /// Mean of the values of the tensor, in quantization steps.
     pub(super) mean: i64,
     /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
     pub(super) parts: PredictorWeights<NEIGHBORS>,
@@ -68,14 +69,15 @@ pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 /// Quantization step of a tensor, with offsets for its channels, or for its rows and columns.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TensorSteps {
-    /// Quantization step `k` of the tensor: 2^(k/8); see [`super::step_size()`].
+    /// Exponent `k` of the quantization step 2^(k/8) of the tensor; see [`super::step_size()`].
     pub step: i32,
-    /// Corrections of the exponent `k` in `step`. A plane has one per channel; a matrix has one per row, followed by one per
-    /// column; any other tensor of weights has one per element. Empty if there are no corrections.
+    /// Offsets that are added to the exponent `k` in `step`. A plane has one per channel; a matrix has one per row,
+    /// followed by one per column; any other tensor of weights has one per element. Empty if no offset is needed.
     pub channels: Vec<i8>,
 }
 
-/// Positions of the Gaussians and range of times at which the feature planes are read.
+/// Places and times at which the deformation field is evaluated: canonical positions of the Gaussians, the box of space
+/// that the feature planes cover, and the range of times. They determine which texels are read.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
     pub(super) position: &'a AttributeValues,
@@ -85,7 +87,7 @@ pub(super) struct Readers<'a> {
 }
 
 impl TensorEntry {
-    /// Returns the table entry of a tensor; its mean and predictor weights are still zero.
+    /// Returns the table entry of the tensor `name`; its mean and predictor weights are still zero.
     pub(super) fn new(name: &str, tensor: &Tensor, role: TensorRole, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
@@ -97,7 +99,7 @@ impl TensorEntry {
         self.shape.iter().try_fold(1usize, |product, &extent| product.checked_mul(extent))
     }
 
-    /// Returns the numbers of channels, rows and columns as which the tensor is coded.
+    /// Returns the shape with which the tensor is coded: numbers of channels, rows and columns.
     fn extents(&self) -> [usize; 3] {
         match (self.role, &self.shape[..]) {
             (TensorRole::Plane(_) | TensorRole::TimePlane(_), &[_, channels, rows, columns]) => {
@@ -108,7 +110,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns whether shape, role and steps are consistent. Applies to entries from untrusted files.
+    /// Returns whether shape, role and quantization steps fit together. An entry from an untrusted file must pass this
+    /// check.
     pub(super) fn is_sound(&self) -> bool {
         let plane = |axes: &[usize]| {
             self.shape.len() == 4
@@ -132,8 +135,8 @@ impl TensorEntry {
         fits && channels && super::STEP_NUMBERS.contains(&self.step)
     }
 
-    /// Returns the key of the family of tensors that share entropy models: planes of the same kind and size, matrices,
-    /// or vectors.
+    /// Returns the key of the family of tensors with which this tensor shares entropy models. Families are planes of
+    /// the same kind and size, matrices, and vectors.
     fn family(&self) -> (u8, usize) {
         match self.role {
             TensorRole::Plane(_) => (0, self.shape[3]),
@@ -143,8 +146,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the quantization grid for the values of channel `channel` in the class `class`: of a weight, the sum of
-    /// its row and column offsets; of a texel, the octave of its summed squared read weights.
+    /// Returns the quantization grid for values of class `class` in channel `channel`. The class of a weight is the sum
+    /// of its row and column offsets, the class of a texel its octave of summed squared interpolation weights.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             TensorRole::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -174,8 +177,8 @@ impl TensorEntry {
         (0..rows).flat_map(|row| (0..columns).map(move |column| class_at(row, column))).collect()
     }
 
-    /// Calls `with` with the tensor's quantization grids and returns the result; `None` if the tensor has no quantized
-    /// values.
+    /// Calls `with` with the shape and the quantization grids of the tensor and returns its result. Returns `None`
+    /// without a call if the tensor has no quantized values.
     fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;
@@ -212,7 +215,7 @@ impl TensorEntry {
     }
 }
 
-/// Entropy models by key ([`TensorEntry::family`]) of the family of tensors that share them.
+/// Entropy models for each family of tensors that share them, with the key of the family ([`TensorEntry::family`]).
 struct SharedModels(Vec<((u8, usize), Residuals)>);
 
 impl SharedModels {
@@ -227,9 +230,9 @@ impl SharedModels {
     }
 }
 
-/// Encodes the tensors of `entries`, and sets the means and predictor weights in the entries. Returns the symbols of
-/// the quantized tensors and the values of tensors with [`TensorRole::Exact`]. Adds the approximate number of bits of every
-/// tensor to `bits`.
+/// Encodes the tensors of `entries`, and sets the means and predictor weights in the entries. Returns the entropy-coded
+/// symbols of the quantized tensors, and the values of tensors with [`TensorRole::Exact`]. Adds the approximate number
+/// of bits of every quantized tensor to `bits`.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
     tensors: &Tensors,
@@ -259,8 +262,8 @@ pub(super) fn encode(
     (encoder.finish(), exact)
 }
 
-/// Decodes the tensors of `entries` from the symbols `bytes` and the values `exact`; `None` if these do not match the
-/// entries. The caller has checked the shapes.
+/// Decodes the tensors of `entries` from the symbols `bytes` and the unquantized values `exact`; returns `None` if
+/// symbols or values do not match the entries. The caller has checked the shapes.
 pub(super) fn decode(
     entries: &[TensorEntry],
     bytes: &[u8],
@@ -288,8 +291,9 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// Returns a tensor rounded with `steps`, as an archive would restore it. The only difference: rows of a plane over
-/// time that are read at no time keep their values.
+/// Returns `tensor` rounded to the quantization grids of `steps`, as an archive would restore it. `position` holds the
+/// canonical positions, `space` is the box that the feature planes cover. One difference to an archive: rows of a plane
+/// over time that are read at no time keep their values.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

@@ -27,14 +27,14 @@ pub const HEADER_BYTES: usize = 12 + SECTIONS * 24 + 8;
 /// Compression level of zstd for the table of contents and the plain bytes (`blobs`), which are small sections.
 const ZSTD_LEVEL: i32 = 19;
 /// Maximum number of bytes of content per byte of the file. The contents of trained models are 20 to 60 times as large
-/// as their archives. Symbols could stand for 800 bytes each, and texels that are not stored for any number, but a file
-/// of 300 KB must not cost gigabytes.
+/// as their archives. In a malicious file, one bit of symbols could stand for about 800 bytes, and texels that are not
+/// stored for any number, but a file of 300 KB must not cost gigabytes.
 const MAX_CONTENT_PER_BYTE: u64 = 512;
 /// Number of bytes that may be allocated while decoding even if the file is short.
 const ALWAYS_ALLOWED_BYTES: u64 = 64 << 20;
 
-/// Maximum length in bytes of the table of contents. That of a trained model has about 50 KB. The values parsed from it
-/// take up to 16 times its bytes.
+/// Maximum length in bytes of the table of contents. The table of a trained model has about 50 KB. The values parsed
+/// from a table take up to 16 times its bytes.
 const MAX_TABLE_BYTES: u64 = 1 << 20;
 
 /// Contents of the four sections, before compression.
@@ -53,17 +53,17 @@ pub(super) struct Sections {
 /// Size of an archive in bytes, divided by purpose.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ArchiveSize {
-    /// Bytes of the Gaussians.
+    /// Number of bytes that the Gaussians take.
     pub cloud: u64,
-    /// Bytes of the deformation field.
+    /// Number of bytes that the deformation field takes.
     pub field: u64,
-    /// All other bytes.
+    /// Number of bytes of everything else: header, table of contents, and bytes without entropy coding (`blobs`).
     pub rest: u64,
 }
 
 impl ArchiveSize {
-    /// Divides an archive of `total` bytes: `cloud` bytes for Gaussians, `field` bytes for the deformation field, and
-    /// the rest.
+    /// Creates the division of an archive of `total` bytes: `cloud` bytes for Gaussians, `field` bytes for the
+    /// deformation field, and the rest.
     fn new(total: u64, cloud: u64, field: u64) -> ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
@@ -74,7 +74,7 @@ impl ArchiveSize {
     }
 }
 
-/// Defect of an archive: where it is, what was expected and what was found. Lacks the path of the file.
+/// Defect of an archive: where it is, what was expected and what was found. Does not know the path of the file.
 #[derive(Debug)]
 pub(super) struct Damage {
     place: String,
@@ -91,7 +91,7 @@ const WRITE_AGAIN: &str = "write the archive again from its model with this vers
                            version that wrote it";
 
 impl Damage {
-    /// Returns a defect at `place`, a part of the file such as a section.
+    /// Creates a defect. `place` is a part of the file, such as a section.
     pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into(), advice: COPY_AGAIN }
     }
@@ -102,10 +102,10 @@ impl Damage {
     }
 }
 
-/// Returns the bytes of an archive, and its size by purpose.
+/// Returns the bytes of an archive with the contents `sections`, and its size by purpose.
 ///
 /// # Errors
-/// Fails if the compression fails.
+/// Fails if the compression of a section fails.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let pack = |bytes: &[u8]| {
         zstd::bulk::compress(bytes, ZSTD_LEVEL)
@@ -129,7 +129,7 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     Ok((out, parts))
 }
 
-/// Header of an archive.
+/// Header of an archive file: its lengths and checksums.
 pub(super) struct ArchiveHeader {
     /// Length of the whole file in bytes.
     whole: u64,
@@ -139,8 +139,8 @@ pub(super) struct ArchiveHeader {
 }
 
 impl ArchiveHeader {
-    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more, or the
-    /// whole file if it is shorter.
+    /// Parses the header of a file of `whole` bytes. `head` holds the first [`HEADER_BYTES`] bytes of the file or more,
+    /// or the whole file if it is shorter.
     pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
@@ -180,20 +180,21 @@ impl ArchiveHeader {
         Ok(ArchiveHeader { whole, sections })
     }
 
-    /// Returns the bytes of memory that decoding takes: the file and the contents of its sections, each counted twice
-    /// (as a whole and in parts).
+    /// Returns the number of bytes of memory for decoding, as far as the header tells: the bytes of the file and of the
+    /// `blobs`, each counted twice (as a whole and in parts), and 16 times the table of contents.
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;
         2 * self.whole + 16 * table + 2 * blobs
     }
 
-    /// Fails if reading the archive at `path` takes more than `memory`.
+    /// Checks that the archive at `path` can be decoded within the memory limit `memory`. Fails otherwise.
     pub(super) fn check_memory(&self, path: &Path, memory: ReadLimit) -> Result<()> {
         memory.check(path, "head", "the archive and its content", self.bytes())
     }
 }
 
-/// Returns the sections of an archive with header `head`, after verifying their checksums, and its size by purpose.
+/// Returns the sections of the archive `bytes`, decompressed, and its size by purpose. `head` is its parsed header.
+/// Fails if a checksum or a length is wrong.
 pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
     let mut rest = &bytes[HEADER_BYTES..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
@@ -221,8 +222,8 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Checks that `bytes` may be allocated for reading an archive of `length` bytes. Fails if they are too many, or if
-/// `bytes` is `None`, which stands for a number that overflowed.
+/// Checks that `bytes` bytes may be allocated for reading an archive of `length` bytes. Fails if they are too many.
+/// `None` stands for a number that overflowed, and fails as well.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
     let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {

@@ -17,14 +17,15 @@ use crate::model::AttributeValues;
 const GAUSSIANS: usize = 256;
 /// Number of times at which the field is sampled for each sampled Gaussian.
 const TIMES: usize = 4;
-/// Offsets are multiples of this many eighths of an octave, which is half an octave.
+/// Unit of the offsets, in eighths of an octave. Offsets are multiples of half an octave.
 const OFFSET_UNIT: f64 = 4.0;
 /// Maximum absolute offset, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
-/// Returns for each tensor the offsets added to its quantization step, in eighths of an octave: one per channel of a
-/// plane; for a matrix one per row, followed by one per column. Returns an empty map if the field has no planes or an
-/// unknown structure.
+/// Returns for each tensor the offsets that are added to the exponent of its quantization step, in eighths of an
+/// octave: one per channel of a plane; for a matrix one per row, followed by one per column. `position` holds the
+/// canonical positions, `space` is the box that the planes cover, `times` are the first and last time. Returns an empty
+/// map if the field has no planes or an unknown structure.
 pub fn step_offsets(
     field: &BTreeMap<String, TensorRole>,
     tensors: &Tensors,
@@ -83,15 +84,16 @@ pub fn step_offsets(
     found
 }
 
-/// Adds the offsets of a layer to `found`. `rows` holds the importance of each output (effect of its errors on the
-/// result), `columns` the mean square of each input.
+/// Adds the offsets of the weights and of the bias of `layer` to `found`. `rows` holds the importance of each output
+/// (effect of its errors on the result), `columns` the mean square of each input.
 fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
 }
 
-/// Returns offsets, in eighths of an octave, such that quantization steps are proportional to 1/√importance and their
-/// factors have a geometric mean of one. Importance below 1e-4 of the largest counts as 1e-4 of the largest.
+/// Returns offsets of quantization steps, in eighths of an octave. With them, steps are proportional to 1/√importance,
+/// and the factors of all steps have a geometric mean of one. Importance below 1e-4 of the largest counts as 1e-4 of
+/// the largest.
 fn importance_offsets(importance: &[f64]) -> Vec<i8> {
     let most = importance.iter().copied().fold(0.0, f64::max);
     let octaves: Vec<f64> = importance.iter().map(|x| -0.5 * (x.max(1e-4 * most) / most).log2()).collect();
@@ -104,7 +106,7 @@ fn importance_offsets(importance: &[f64]) -> Vec<i8> {
     units.map(|units| (units * OFFSET_UNIT) as i8).collect()
 }
 
-/// Returns the names of the heads (output networks) that the field uses.
+/// Returns the names of the heads (output networks) that the deformation field `field` uses.
 fn heads(field: &BTreeMap<String, TensorRole>) -> Vec<String> {
     let head_name = |(name, role): (&String, &TensorRole)| {
         let head = name
@@ -115,7 +117,7 @@ fn heads(field: &BTreeMap<String, TensorRole>) -> Vec<String> {
     field.iter().filter_map(head_name).collect()
 }
 
-/// Tensors of a deformation field, for finding its layers.
+/// Tensors of a deformation field, among which layers are found by name.
 struct FieldWeights<'a> {
     tensors: &'a Tensors,
 }
@@ -170,7 +172,8 @@ impl WeightLayer<'_> {
     }
 
     /// Returns the importance of each input of the layer (effect of its errors on the result). `outputs` is the
-    /// importance of each output; `active` is the fraction of samples in which each input is above zero.
+    /// importance of each output; `active` is the fraction of samples in which each input is above zero, that is,
+    /// passes the preceding ReLU.
     fn backward(&self, outputs: &[f64], active: &[f64]) -> Vec<f64> {
         let mut inputs = vec![0.0; self.inputs()];
         for (row, output_importance) in self.weight.data.chunks_exact(self.inputs()).zip(outputs) {
@@ -181,7 +184,7 @@ impl WeightLayer<'_> {
     }
 }
 
-/// Returns the mean square over all samples of each of the `width` values of a sample.
+/// Returns, for each of the `width` values that a sample has, its mean square over all samples.
 fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     let mut sums = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
@@ -191,7 +194,8 @@ fn mean_squares(samples: &[f32], width: usize) -> Vec<f64> {
     sums.iter().map(|sum| sum / count).collect()
 }
 
-/// Returns for each of the `width` values of a sample the fraction of samples in which it is above zero.
+/// Returns, for each of the `width` values that a sample has, the fraction of the samples in which this value is above
+/// zero.
 fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
     let mut counts = vec![0.0; width];
     for sample in samples.chunks_exact(width) {
@@ -216,7 +220,8 @@ struct Samples {
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the planes for some Gaussians at some times; `None` if the planes are missing or malformed.
+    /// Evaluates the planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each; `None` if the planes are
+    /// missing or malformed.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
@@ -266,7 +271,8 @@ impl Samples {
     }
 }
 
-/// Returns the values of all channels of a plane at the point `at` (x, y, z, time), interpolated bilinearly.
+/// Returns the values of all channels of a plane over the axes `axes` at the point `at` (x, y, z, time), interpolated
+/// bilinearly.
 fn read(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
     let [channels, rows, columns] = [plane.shape[1], plane.shape[2], plane.shape[3]];
     let (a, b): (Tap, Tap) = (tap(at[axes[0]], columns), tap(at[axes[1]], rows));

@@ -1,10 +1,10 @@
 //! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
 //! that keep the renders good, and entropy coded.
 //!
-//! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the
-//! content. Every quantized value is restored with an error of at most half a quantization step, every other byte
-//! exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of their neighbors;
-//! tensors that nothing reads are restored as zeros.
+//! Input: [`ArchiveContent`] and [`QuantizationSteps`]. Output: bytes in the format of `format/ARCHIVE.md`, and back.
+//! Memory: twice the content. Every quantized value is restored with an error of at most half a quantization step,
+//! every other byte exactly. Texels that no Gaussian reads are restored as the nearest stored texels or an average of
+//! their neighbors; tensors that nothing reads are restored as zeros.
 
 mod cloud;
 mod entropy;
@@ -41,7 +41,7 @@ use file::{ArchiveHeader, Damage, Sections};
 /// Name of the tensor that holds the box of space that the feature planes cover.
 pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 
-/// Everything that an archive stores, in decoded form.
+/// Content of an archive, in decoded form.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ArchiveContent {
     /// Canonical Gaussians.
@@ -52,19 +52,19 @@ pub struct ArchiveContent {
     pub field: BTreeMap<String, TensorRole>,
     /// Tensors of the deformation field, by name.
     pub tensors: Tensors,
-    /// First and last time at which the deformation field is evaluated.
+    /// First and last time at which the deformation field is evaluated. They determine which texels are stored.
     pub times: [f32; 2],
-    /// Extra bytes of every Gaussian that are no attributes (for example, other PLY properties). Each Gaussian has the
-    /// same number of them; they are stored one Gaussian after another.
+    /// Extra bytes of every Gaussian that belong to no attribute (for example, other PLY properties). Each Gaussian has
+    /// the same number of extra bytes; they are stored one Gaussian after another.
     pub beside: Vec<u8>,
-    /// Copied files and other bytes, by name.
+    /// Files of the model that are stored without change, such as `cfg_args`, and other bytes, by name.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
 /// Quantization steps for encoding a [`ArchiveContent`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct QuantizationSteps {
-    /// Quantization step of each attribute of the Gaussians.
+    /// Quantization step number of each attribute of the Gaussians.
     pub cloud: CloudSteps,
     /// Quantization step of each of [`ArchiveContent::columns`], as an exponent; see [`step_size()`].
     pub columns: Vec<i32>,
@@ -72,7 +72,7 @@ pub struct QuantizationSteps {
     pub field: FieldSteps,
 }
 
-/// Encoded archive and how its bytes are used.
+/// Encoded archive, with a list of what its bytes are used for.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct EncodedArchive {
     /// Bytes of the archive file.
@@ -93,9 +93,10 @@ struct Table {
     /// Bit patterns of the first and the last time (f32); decimal text would round them.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Number of extra bytes per Gaussian that are no attributes.
+    /// Number of extra bytes per Gaussian that belong to no attribute.
     beside: usize,
-    /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are stored.
+    /// Name and length in bytes of each entry of [`ArchiveContent::files`], in the order in which their bytes are
+    /// stored.
     files: Vec<(String, usize)>,
 }
 
@@ -143,11 +144,11 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
     Ok(EncodedArchive { bytes, parts, order, bits })
 }
 
-/// Decodes the archive `bytes`, read from `path`.
+/// Decodes the archive `bytes`, which was read from `path`. Returns its content and its size by purpose.
 ///
 /// # Errors
-/// Fails if the bytes are not an archive, are truncated or damaged, have another version, or declare more than they can
-/// hold or than `memory` allows. Declared sizes are checked before anything is allocated.
+/// Fails if the bytes are not an archive, are truncated or damaged, have another version, or declare more content than
+/// the file can hold or than `memory` allows. Declared sizes are checked before anything is allocated.
 pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveContent, ArchiveSize)> {
     let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
     head.check_memory(path, memory)?;
@@ -160,16 +161,18 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
-/// Checks the first [`HEADER_BYTES`] bytes of the archive at `path`, which has `whole` bytes, before the rest is read.
+/// Checks the header of the archive at `path` before the rest is read. `head` holds the first [`HEADER_BYTES`] bytes of
+/// the file, `whole` is the length of the file in bytes.
 ///
 /// # Errors
-/// Fails if these bytes are not the header of an archive of this length, or if the archive and its content exceed
+/// Fails if `head` is not the header of an archive of this length, or if decoding the archive takes more memory than
 /// `memory`.
 pub fn check_header(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
     ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.check_memory(path, memory)
 }
 
-/// Parses the table of contents of an archive of `length` bytes and checks that its numbers are consistent.
+/// Parses the table of contents of an archive of `length` bytes. Fails if its numbers are inconsistent or too large for
+/// a file of this length.
 fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
     let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
@@ -188,7 +191,8 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-/// Decodes the sections of an archive, whose table of contents has been checked, into its content.
+/// Decodes the contents of the archive sections `sections`, whose table of contents `table` has been checked. Returns
+/// the content, and `parts` (its size by purpose) unchanged. Fails if the sections do not match the table.
 fn decoded(
     sections: Sections,
     table: Table,
@@ -241,13 +245,14 @@ fn decoded(
     Ok((content, parts))
 }
 
-/// Returns the box of space that the feature planes of the deformation field cover; `None` without such a field.
+/// Returns the box of space that the feature planes of the deformation field cover; `None` if there are no feature
+/// planes.
 pub fn field_box(content: &ArchiveContent) -> Option<Box3> {
     content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
 }
 
-/// Rounds the attributes with the indices `attributes` in [`ATTRIBUTES`] to their quantization grids, as an archive
-/// would, but without changing the order of the Gaussians.
+/// Rounds values in place to the quantization grids of `steps`, as an archive would, but without changing the order of
+/// the Gaussians. Only attributes whose index in [`ATTRIBUTES`] is in `attributes` are rounded.
 pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     cloud::round(cloud, steps, attributes);
 }
@@ -262,7 +267,8 @@ pub fn attribute_values(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32
     cloud::values(cloud, k)
 }
 
-/// Checks that every value is finite and that every quantization step is within [`STEP_NUMBERS`].
+/// Checks that every value that will be quantized is finite and that every quantization step is within
+/// [`STEP_NUMBERS`]. The error names the value or the step.
 fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
     for column in Attributes::all().iter() {
         let values = content.cloud.column(column);

@@ -4,15 +4,16 @@
 /// Denominator of the predictor weights, which are multiples of 1/64.
 const WEIGHT_DENOMINATOR: f32 = 64.0;
 
-/// Predictor weights of `N` differences, in 64ths: from −128 (weight −2) to 127.
+/// Weights with which a value is predicted from `N` differences (known neighboring values less their means), in 64ths:
+/// from −128 (weight −2) to 127.
 pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
-/// Returns the predictor weights as plain factors (64 becomes 1).
+/// Returns the predictor weights as f32 factors: a weight of 64 becomes 1.0.
 pub(super) fn factors<const N: usize>(parts: &PredictorWeights<N>) -> [f32; N] {
     parts.map(|part| f32::from(part) / WEIGHT_DENOMINATOR)
 }
 
-/// Returns the predicted value: `mean` plus the sum of `differences` times `factors`, added in order.
+/// Returns the predicted value: `mean` plus each of `differences` times its factor, added in order.
 #[inline(always)]
 pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], differences: &[f32; N]) -> f32 {
     let mut sum = mean;
@@ -22,7 +23,8 @@ pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], difference
     sum
 }
 
-/// Least-squares fit of the weights with which a value is predicted from `N` differences.
+/// Least-squares fit of predictor weights, with which a value is predicted from `N` differences (known neighboring
+/// values less their means).
 #[derive(Debug)]
 pub(super) struct PredictorFit<const N: usize> {
     /// For each pair of differences, the sum of their products over all samples (lower triangle).
@@ -48,9 +50,9 @@ impl<const N: usize> PredictorFit<N> {
         }
     }
 
-    /// Returns the fitted weights in 64ths. Solves the normal equations by Cholesky factorization, with a ridge of 1e-4
-    /// times the mean diagonal so that they are solvable. All weights are 0 if the differences of all samples
-    /// (neighboring values less their means) are 0, or if one of them is not finite.
+    /// Returns the fitted predictor weights in 64ths. Solves the normal equations by Cholesky factorization, with a
+    /// ridge of 1e-4 times the mean diagonal so that they are solvable. Returns zeros if the differences of all samples
+    /// are 0, or if a difference is not finite.
     pub(super) fn parts(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {

@@ -1,8 +1,8 @@
-//! Codes a tensor as channels of rows of values; each value is predicted from its neighbors to the left and above.
+//! Codes a tensor as channels of rows of values. Each value is predicted from its neighbors to the left and above.
 //!
 //! Input: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the
-//! quantization step of the place or marks it as never read. Output: symbols, and the restored values. Memory: three
-//! rows.
+//! quantization step of the place or marks it as never read. Output: symbols, and the values that a decoder restores.
+//! Memory: three rows.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
@@ -13,32 +13,32 @@ use super::step::QuantizationGrid;
 /// above.
 pub(super) const NEIGHBORS: usize = 6;
 
-/// Class of a place (row and column) that the deformation field never reads.
+/// Class that marks a place (row and column) which the deformation field never reads.
 pub(super) const UNREAD: u8 = u8::MAX;
 
-/// Shape of a tensor with the quantization grids of its values.
+/// Shape of a tensor and the quantization grids of its values.
 pub(super) struct QuantizedTensor<'a> {
     pub(super) channels: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
     /// Range of rows that are stored. Rows before and after it are restored as copies of the nearest stored row.
     pub(super) stored: std::ops::Range<usize>,
-    /// Class of every place of a channel, `[rows, columns]`, or of one row that holds for all rows, `[columns]`. The
-    /// class selects the quantization grid.
+    /// Class of every place (row and column), which selects the quantization grid. Either `[rows, columns]`, or
+    /// `[columns]` if all rows have the same classes. All channels have the same classes.
     pub(super) classes: &'a [u8],
-    /// Function that returns the quantization grid of the values of a channel whose places have the given class.
+    /// Function that returns a quantization grid, given the index of a channel and the class of a place in it.
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
     /// Number of classes that select a quantization grid.
     pub(super) class_count: usize,
-    /// Mean value, from which predictions start.
+    /// Mean of all values of the tensor, from which predictions start.
     pub(super) mean: f32,
 }
 
 /// Known values from which the value at a place (row and column) is predicted.
 struct Context {
-    /// Values of the neighbors less the mean of the tensor.
+    /// Values of the neighbors of the place, less the mean of the tensor.
     values: [f32; NEIGHBORS],
-    /// Mean absolute prediction error of the neighbors, in quantization steps of this place.
+    /// Mean absolute prediction error of the neighbors of the place, in quantization steps of the place.
     size: f32,
 }
 
@@ -67,7 +67,8 @@ impl QuantizedTensor<'_> {
         }
     }
 
-    /// Returns the predictor weights with the least squared prediction error. Rounds `data` to the quantization grids.
+    /// Fits the weights with which a value is predicted from its neighbors, for the least squared prediction error.
+    /// Rounds `data` in place to the quantization grids.
     pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBORS> {
         let mut fit = PredictorFit::new();
         self.visit(data, |_, value, context, grid| {
@@ -78,7 +79,8 @@ impl QuantizedTensor<'_> {
         fit.parts()
     }
 
-    /// Encodes the values `data` and replaces them by the values that a decoder restores.
+    /// Encodes the values `data` with the predictor weights `parts` and the entropy models `models`, and writes the
+    /// symbols to `to`. Replaces `data` by the values that a decoder restores.
     pub(super) fn encode(
         &self,
         parts: &PredictorWeights<NEIGHBORS>,
@@ -95,7 +97,8 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Decodes the values into `data`.
+    /// Decodes values from `from` into `data`. `parts` and `models` must be those that [`QuantizedTensor::encode`]
+    /// used.
     pub(super) fn decode(
         &self,
         parts: &PredictorWeights<NEIGHBORS>,
@@ -112,9 +115,10 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Visits every place (row and column) that is read, row by row. `code` returns the restored value at the place and
-    /// the absolute prediction error; later places are predicted from both. Places that are never read get the mean of
-    /// their neighbors.
+    /// Visits every place (row and column) that is read, row by row. `code` encodes or decodes one value. It receives
+    /// the index of the place in its channel, the value in `data`, the known neighbors and the quantization grid. It
+    /// returns the restored value and the absolute prediction error; later places are predicted from both. Places that
+    /// are never read get the mean of their neighbors.
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;

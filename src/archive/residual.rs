@@ -1,12 +1,13 @@
-//! Codes prediction errors with entropy models, which are chosen by the size of neighboring errors.
+//! Codes prediction errors, in quantization steps. The expected size of an error, known from neighboring errors,
+//! selects the entropy model.
 //!
 //! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. Its position within the
 //! class and its sign are plain bits, because probabilities within a class hardly differ.
 
 use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 
-/// Smallest magnitude of each class of errors, and number of bits of a position in the class; the last class is
-/// unlimited.
+/// Classes of error magnitudes: the smallest magnitude of each class, and the number of plain bits for the position of
+/// a magnitude in the class. The last class has no upper limit.
 const CLASSES: [(u64, u32); SYMBOLS] = [
     (0, 0),
     (1, 0),
@@ -26,11 +27,12 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
     (128, 0),
 ];
 
-/// Number of entropy models. Each is for half an octave of the expected error, beginning at a quarter of a quantization
-/// step.
+/// Number of entropy models. Each model is for half an octave of expected error sizes; the first begins at a quarter of
+/// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Entropy models of prediction errors that similar planes or tensors share, by the expected size of the error.
+/// Entropy models of prediction errors, one for each range of the expected error size. Similar planes or tensors share
+/// them.
 #[derive(Debug, Clone)]
 pub(super) struct Residuals([SymbolModel; CONTEXTS]);
 
@@ -40,16 +42,16 @@ impl Residuals {
         Residuals([SymbolModel::NEW; CONTEXTS])
     }
 
-    /// Returns the entropy model for errors of the expected size `size`: the mean magnitude of neighboring errors, in
-    /// quantization steps. Its index consists of the exponent of `size` and the first bit of the mantissa.
+    /// Returns the entropy model for the expected error size `size`: the mean magnitude of neighboring errors, in
+    /// quantization steps. The index of the model consists of the exponent of `size` and the first bit of its mantissa.
     #[inline(always)]
     fn model_for_size(&mut self, size: f32) -> &mut SymbolModel {
         let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
         &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Writes the prediction error `residual` (in quantization steps). `size` is the expected magnitude, which selects
-    /// the model.
+    /// Writes the prediction error `residual`, in quantization steps, to `to`. `size` is its expected magnitude, which
+    /// selects the entropy model.
     pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut SymbolEncoder) {
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
@@ -65,7 +67,8 @@ impl Residuals {
         }
     }
 
-    /// Reads a prediction error, in quantization steps. `size` is the expected magnitude, which selects the model.
+    /// Reads a prediction error, in quantization steps. `size` is its expected magnitude, which selects the entropy
+    /// model.
     #[inline(always)]
     pub(super) fn decode(&mut self, size: f32, from: &mut SymbolDecoder<'_>) -> i64 {
         let class = from.symbol(self.model_for_size(size));

@@ -1,4 +1,4 @@
-//! Steps of uniform quantization grids. Each is given by a whole number, so that every machine computes the same
+//! Steps of uniform quantization grids. Each step is given by a whole number, so that every machine computes the same
 //! values.
 //!
 //! Step `k` is 2^(k/8). A value `v` on the grid with step `s` is stored as the whole number `round(v / s)` and restored
@@ -32,8 +32,8 @@ pub fn step_size(k: i32) -> f64 {
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size` must be
-/// positive.
+/// Returns the number `k` in [`STEP_NUMBERS`] whose step 2^(k/8) is closest to `size` on a logarithmic scale; `size`
+/// must be positive.
 pub fn nearest_step_number(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
@@ -65,19 +65,19 @@ impl QuantizationGrid {
         (x + ROUNDING - ROUNDING) as i64
     }
 
-    /// Returns `multiple` times the step.
+    /// Returns the value that the whole number `multiple` stands for: `multiple` times the step.
     #[inline(always)]
     pub(super) fn value(self, multiple: i64) -> f32 {
         (multiple as f64 * self.step) as f32
     }
 
-    /// Returns `size` divided by the step.
+    /// Returns the length `size` in units of the step.
     #[inline(always)]
     pub(super) fn in_steps(self, size: f32) -> f32 {
         size * self.inverse as f32
     }
 
-    /// Returns the step, which is the distance of neighboring grid values.
+    /// Returns the step, which is the distance between neighboring grid values.
     #[inline(always)]
     pub(super) fn size(self) -> f32 {
         self.step as f32

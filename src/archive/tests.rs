@@ -151,7 +151,8 @@ proptest! {
     }
 }
 
-/// Updates the checksums of an archive to its present bytes, as far as its lengths are valid.
+/// Recomputes the checksums of an archive after its bytes were changed. Sections whose stored length exceeds the file
+/// end with the file.
 fn reseal(bytes: &mut [u8]) {
     let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
     let head: usize = 12 + 4 * 24 + 8;

@@ -1,21 +1,22 @@
 //! Determines which texels of a feature plane are read by some Gaussian, and with what total weight.
 //!
 //! Input: canonical positions as they are stored, the box of space that the plane covers, its axes and its size.
-//! Output: a class for each texel. Writer and reader of an archive both compute the classes, so they are not stored.
+//! Output: a class for each texel. Writer and reader of an archive both compute the classes, so classes are not stored.
 //! Sums and products of f32 in a fixed order give the same classes on every machine.
 
 use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};
 use crate::model::AttributeValues;
 
-/// Exponent of class 0: floor of log2 of the squared weights with which Gaussians read a texel, summed. Smaller sums
-/// also belong to class 0.
+/// Exponent of class 0. The exponent of a texel is the floor of log2 of its squared interpolation weights, summed over
+/// the Gaussians that read it. Texels with a smaller exponent also belong to class 0.
 const MIN_EXPONENT: i32 = -8;
-/// Number of classes of texels; each class is an octave of the summed squared read weights.
+/// Number of classes of texels. Each class is one octave of the squared interpolation weights, summed over the
+/// Gaussians that read a texel.
 pub(super) const CLASSES: usize = 16;
 
-/// Returns the summed squared read weight of a class as an exponent of 2; 0 for a texel that is read once with weight
-/// 1.
+/// Returns log2, rounded down, of the squared interpolation weights of a texel of class `class`, summed over the
+/// Gaussians that read it. A texel that is read once with weight 1 has 0.
 pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
@@ -30,8 +31,8 @@ fn class(squared_weight: f32) -> u8 {
     (exponent - MIN_EXPONENT).clamp(0, CLASSES as i32 - 1) as u8
 }
 
-/// Returns the class (which selects the quantization grid) of each texel, `[size_b, size_a]`, of a feature plane over
-/// two spatial axes (a, b).
+/// Returns the class (which selects the quantization grid) of each texel of a feature plane over two spatial axes (a,
+/// b), as `[size_b, size_a]`. `position` holds the canonical positions, `space` is the box that the plane covers.
 pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
@@ -48,7 +49,7 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
 }
 
 /// Returns the class (which selects the quantization grid) of each column, `[size]`, of a feature plane over one
-/// spatial axis and time.
+/// spatial axis and time. `position` holds the canonical positions, `space` is the box that the plane covers.
 pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {
@@ -60,7 +61,8 @@ pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis:
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the rows of a plane over time that are read at times from `first` to `last`; the plane has `size` rows.
+/// Returns the range of rows that a plane over time needs for times from `first` to `last`. Rows are times; the plane
+/// has `size` of them.
 pub(super) fn time_rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
     let (first, last) = (tap(first, size), tap(last, size));
     let end = if last.fraction > 0.0 { last.high } else { last.low };

@@ -150,7 +150,7 @@ impl Write for EntryWriter {
     }
 }
 
-/// Returns a copy of `error`, which has no `clone`.
+/// Returns a copy of `error`: the standard type cannot be cloned.
 fn copied_error(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
 }

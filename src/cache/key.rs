@@ -10,7 +10,7 @@ use xxhash_rust::xxh3::Xxh3;
 pub struct CacheKey(Option<u128>);
 
 impl CacheKey {
-    /// Key of a run without a work folder: no result is looked up under it.
+    /// Key of every result in a run without a work folder, in which no results are stored or looked up.
     pub const NONE: CacheKey = CacheKey(None);
 
     /// Returns the digest of the bits of `value`.

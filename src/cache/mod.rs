@@ -45,7 +45,8 @@ pub struct CacheRequest {
     pub part: Option<Shard>,
 }
 
-/// Cache of stage results, if there is a work folder, and the shard (part of a divided stage) that this run computes.
+/// Cache of stage results in a work folder, and the shard (part of a divided stage) that this run computes. Without a
+/// work folder, nothing is stored.
 #[derive(Debug, Default)]
 pub struct Cache {
     dir: Option<CacheDir>,
@@ -158,9 +159,9 @@ impl Cache {
         }
     }
 
-    /// Returns the result of `stage`, which is computed in shards (ranges of its `units` units of work), by this run or
-    /// by others. `compute` returns the result of a range; `join` combines the results of all ranges in order. The
-    /// combined result must not depend on how the units are divided.
+    /// Returns the result of `stage`, which is computed in shards (ranges of its `units` units of work). Other runs may
+    /// have computed some of the shards. `compute` returns the result of a range; `join` combines the results of all
+    /// ranges in order. The combined result must not depend on how the units are divided.
     ///
     /// # Errors
     /// Fails if `compute` or `join` fails or the folder cannot be used. A run that computes only one shard ends with
@@ -191,9 +192,9 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the result of
-    /// a range of units. Without a work folder the results go to a scratch file in the folder `scratch`. Returns the
-    /// units of every shard with the file content that holds their result.
+    /// Computes a stage in shards like [`Cache::compute_in_shards`], for results that stay on disk. `write` writes the
+    /// result of a range of units. Without a work folder the results go to a scratch file in the folder `scratch`.
+    /// Returns the units of every shard with the file content that holds their result.
     ///
     /// # Errors
     /// Fails where [`Cache::compute_in_shards`] fails.
@@ -226,8 +227,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. In a run that computes only shard 1/1 returns [`Error::ShardDone`]
-    /// instead.
+    /// Returns `whole`, the full result of `stage`. In a run that computes only shard 1 of 1, fails with
+    /// [`Error::ShardDone`] instead.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -237,12 +238,12 @@ impl Cache {
         }
     }
 
-    /// Returns the number n of shards from which the full result of `stage`, which is not stored, is joined. The caller
-    /// computes each of the n shards that is not stored yet. If n is 1, the caller computes the whole stage undivided.
+    /// Decides how the caller obtains the result of `stage`, whose full result is not stored, and returns the number n
+    /// of shards to join. The caller computes those of the n shards that are not stored. n = 1 is the whole stage.
     ///
-    /// A run that is limited to one of several shards gets a number only if all shards are stored or there is no cache.
-    /// Otherwise the function computes and stores that shard, unless it is stored already, and fails with
-    /// [`Error::ShardDone`].
+    /// If the run is limited to one of several shards, this function returns n only if all n shards are stored, or 1 if
+    /// there is no work folder. Otherwise it computes and stores the requested shard with `make`, unless `find` finds
+    /// it stored, and fails with [`Error::ShardDone`].
     fn divide<T>(
         &self,
         stage: &str,
@@ -314,7 +315,7 @@ impl Cache {
     }
 }
 
-/// Returns the indices of the shards, of `count`, that are not in `stored`, as text.
+/// Returns the indices (1 to `count`) of the shards that are not in `stored`, as text such as `3, 10-20`.
 fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
     format_ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }

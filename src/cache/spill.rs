@@ -26,7 +26,7 @@ pub struct Spill {
 /// Writer of a [`Spill`] (data on disk that is written once and read in pieces).
 pub struct SpillWriter {
     writer: EntryWriter,
-    /// Path shown in error messages: the file itself, or the folder of an unnamed file.
+    /// Path shown in error messages: the path of the file itself or, for an unnamed file, of its folder.
     path: PathBuf,
     /// Temporary file that gets its final name when all data is written; `None` for an unnamed file.
     staged: Option<StagedFile>,

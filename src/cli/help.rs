@@ -1,4 +1,5 @@
-//! Help of the program and of each command: description, examples, options in groups. Also writes it as manual pages.
+//! Help of the program and of each command: description, examples, options in groups. Manual pages are written from the
+//! same texts.
 
 use std::fs;
 use std::path::Path;
@@ -168,7 +169,7 @@ pub(super) fn write_pages(folder: &Path) -> Result<usize> {
     written.map(|()| pages.len())
 }
 
-/// Returns the file name and the text of every page.
+/// Returns the file name and the text of every manual page.
 fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     let mut command = command().disable_help_subcommand(true);
     command.build();
@@ -188,7 +189,7 @@ fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     std::iter::once(&command).chain(subcommands).map(page).collect()
 }
 
-/// Writes pages to a new folder.
+/// Writes the manual pages `pages` (file name and text) to the new folder `folder`.
 fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     check_target(folder, TargetKind::Folder, &[], Replace::Never)?;
     let staged = StagedFolder::new(folder, Replace::Never)?;
@@ -199,7 +200,8 @@ fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     staged.commit()
 }
 
-/// Writes pages to an existing folder, beside its other files.
+/// Writes the manual pages `pages` (file name and text) to the existing folder `folder`, beside its other files.
+/// Replaces earlier manual pages of this program; fails if another file has the name of a page.
 fn write_beside(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     let mut staged = Vec::new();
     for (name, text) in pages {

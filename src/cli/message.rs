@@ -1,4 +1,4 @@
-//! Messages on standard error. Only this module writes there; lints reject other places.
+//! Messages on standard error. Only this module writes to standard error; lints reject other places.
 
 use std::io::{self, IsTerminal, Write};
 

@@ -55,12 +55,13 @@ pub(crate) fn main() -> ExitCode {
     }
 }
 
-/// Parses the words of a command line, the name of the program first.
+/// Parses the words of a command line. The first word is the name of the program.
 fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
     help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found))
 }
 
-/// Prints why a run failed and returns its exit code. Returns success if only the reader of standard output has ended.
+/// Prints the error that ended a run and returns its exit code. Returns success without a message if the run ended
+/// because the reader of standard output did.
 fn ended_by(error: Error) -> ExitCode {
     if output::has_no_reader(&error) {
         return ExitCode::SUCCESS;

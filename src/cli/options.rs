@@ -34,8 +34,8 @@ use splatsieve::progress::Events;
 use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
-/// Returns the request of `compress`. For options that the command line does not give, the values are taken that the
-/// recipe file records of an earlier run.
+/// Returns the request of `compress`. Options that the command line does not give are taken from the recipe file, if it
+/// records the options of an earlier run.
 ///
 /// # Errors
 /// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal
@@ -122,10 +122,10 @@ pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> 
     })
 }
 
-/// Returns the options of `render` without `--video`.
+/// Returns the library's options for `render` without `--video`.
 ///
 /// # Errors
-/// Fails if an option of `--video` is given.
+/// Fails if an option that needs `--video` is given.
 pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
     // The parser accepts these options without --video.
     let video_flags =
@@ -155,7 +155,7 @@ pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOpti
     })
 }
 
-/// Returns the options of `render --video`, with the video written to `output`.
+/// Returns the library's options for `render --video`. The video is written to `output`.
 pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> VideoOptions {
     let (path, views) = match args.path {
         Some(views) => (VideoCamera::Path(views), ViewSet::HeldOut),
@@ -176,7 +176,7 @@ pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> V
     }
 }
 
-/// Returns the options of a comparison, without a file for the scores.
+/// Returns the library's options for comparing two models, without a file for the scores.
 pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
@@ -199,7 +199,7 @@ pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOp
     }
 }
 
-/// Returns the options of `view`.
+/// Returns the library's options for `view`.
 pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
     let mut original = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut original);
@@ -249,7 +249,7 @@ pub(super) fn result_page_options(request: &Request, output: Option<PathBuf>) ->
     Ok(options)
 }
 
-/// Returns the options of `sweep`.
+/// Returns the library's options for `sweep`.
 pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
     let mut input = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut input);
@@ -268,7 +268,7 @@ pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
     }
 }
 
-/// Returns the options of `precision`.
+/// Returns the library's options for `precision`.
 ///
 /// # Errors
 /// Fails if the recipe is invalid.
@@ -289,7 +289,7 @@ pub(super) fn precision_options(args: PrecisionArgs, events: &Events) -> Result<
     })
 }
 
-/// Returns the options of `demo`.
+/// Returns the library's options for `demo`.
 pub(super) fn demo_options(args: Demo, events: &Events) -> DemoOptions {
     DemoOptions {
         gaussians: args.gaussians as usize,
@@ -302,7 +302,7 @@ pub(super) fn demo_options(args: Demo, events: &Events) -> DemoOptions {
     }
 }
 
-/// Returns the options of `test-scene`.
+/// Returns the library's options for `test-scene`.
 ///
 /// # Errors
 /// Fails if the recipe is invalid.
@@ -319,7 +319,7 @@ pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<Tes
     })
 }
 
-/// Returns how `convert` stores the values of a container.
+/// Returns how precisely and with which compression `convert` stores the values of a container.
 pub(super) fn storing(args: &Convert) -> StoragePrecision {
     match (args.raw, args.max_error.clone()) {
         (true, _) => StoragePrecision::Exact(Compression::Raw),
@@ -328,10 +328,10 @@ pub(super) fn storing(args: &Convert) -> StoragePrecision {
     }
 }
 
-/// Returns the output format that the arguments name; `None`: by the name of the output.
+/// Returns the output format that `--as` and `--spz-version` name; `None` if the name of the output decides.
 ///
 /// # Errors
-/// Fails if a version of `.spz` is named for another output.
+/// Fails if a version of `.spz` is named for an output of another format.
 pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Option<OutputKind>> {
     let kind = format.kind.map(output_kind);
     let Some(version) = format.spz_version else { return Ok(kind) };
@@ -341,7 +341,7 @@ pub(super) fn requested_kind(format: &OutputFormat, output: &Path) -> Result<Opt
     Ok(if version == 4 { Some(OutputKind::Spz4) } else { kind })
 }
 
-/// Returns the output format that the argument names.
+/// Returns the library's name of the output format `kind`.
 fn output_kind(kind: OutputKindArg) -> OutputKind {
     match kind {
         OutputKindArg::Model => OutputKind::Model,
@@ -361,7 +361,7 @@ fn output_kind(kind: OutputKindArg) -> OutputKind {
     }
 }
 
-/// Returns the split that the argument names; `None` for all views.
+/// Returns the library's name of the split `named`; `None` for all views.
 fn split(named: SplitArg) -> Option<Split> {
     match named {
         SplitArg::Train => Some(Split::Train),
@@ -371,18 +371,18 @@ fn split(named: SplitArg) -> Option<Split> {
     }
 }
 
-/// Returns the set of views that the argument names.
+/// Returns the set of views of the split `named`.
 fn view_set(named: SplitArg) -> ViewSet {
     split(named).map_or(ViewSet::All, ViewSet::Split)
 }
 
-/// Returns the cache folder and the shard of a run; `None` without `--cache`.
+/// Returns the cache folder and the shard that the arguments name; `None` without `--cache`.
 pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }
 
-/// Returns the memory limit, and whether the memory plan is printed. If a limit is given, freed memory is returned to the
-/// system from now on.
+/// Returns the memory limit, and whether the memory plan is printed. If a limit is given, the process returns freed
+/// memory to the system from this call on.
 fn memory_budget(memory: Memory) -> Budget {
     if memory.memory.is_some() {
         return_freed_memory();
@@ -390,7 +390,7 @@ fn memory_budget(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
-/// Returns the facts about the training that the command line states.
+/// Returns the facts about the training of the model that the command line states.
 fn conventions(trained: &Trained) -> TrainingConventions {
     let zero_rotation = trained.zero_rotation.map(|handling| match handling {
         ZeroRotationArg::Drop => ZeroRotation::Drop,
@@ -400,8 +400,8 @@ fn conventions(trained: &Trained) -> TrainingConventions {
     TrainingConventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
-/// Returns the options by which an input is opened. Temporary files go to `--scratch-dir`, otherwise beside `output`.
-/// Without `cameras`, the cameras and the split keep their defaults.
+/// Returns the library's options for opening an input. Temporary files go to `--scratch-dir`, otherwise beside
+/// `output`. If `cameras` is `None`, the cameras and the split keep their defaults.
 pub(super) fn input_options(
     input: Input,
     cameras: Option<Cameras>,
@@ -424,7 +424,7 @@ pub(super) fn input_options(
 }
 
 impl CameraFile {
-    /// Sets cameras, resolution, times and number of frames of `options`.
+    /// Sets cameras, resolution, times and number of frames of `options` to those of the arguments.
     fn apply_to(self, options: &mut InputOptions) {
         options.cameras = self.cameras;
         options.size = self.resolution;

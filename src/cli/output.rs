@@ -1,4 +1,4 @@
-//! Standard output: data and results of commands. Only this module opens it.
+//! Standard output: data and results of commands. Only this module writes to standard output.
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -16,7 +16,7 @@ pub(super) fn stdout() -> io::Stdout {
     io::stdout()
 }
 
-/// Writes `text`, with control characters replaced by their codes.
+/// Writes `text` to standard output, with control characters replaced by their codes.
 ///
 /// # Errors
 /// Fails if standard output cannot be written; see [`has_no_reader`].
@@ -24,7 +24,8 @@ pub(super) fn print(text: &str) -> Result<()> {
     write(printable(text).as_bytes())
 }
 
-/// Writes the result of `json`, with control characters as JSON escapes, if `is_json`; else prints that of `text`.
+/// Prints a result as JSON if `is_json`, else as text. The functions `json` and `text` return the result; only one of
+/// them is called. In JSON, control characters are written as escapes.
 ///
 /// # Errors
 /// Fails as [`print`].
@@ -32,7 +33,8 @@ pub(super) fn print_as(is_json: bool, json: impl FnOnce() -> String, text: impl 
     if is_json { write(json_escaped(&json()).as_bytes()) } else { print(&text()) }
 }
 
-/// Writes `bytes` unchanged. If a result was written to standard output, writes them to standard error instead.
+/// Writes `bytes` unchanged to standard output. If the command wrote its result (such as a frame stream) to standard
+/// output, writes them to standard error instead.
 ///
 /// # Errors
 /// Fails as [`print`].
@@ -46,7 +48,8 @@ pub(super) fn write(bytes: &[u8]) -> Result<()> {
     out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", Path::new(NAME)))
 }
 
-/// Prints a message of clap: help and version to standard output, argument errors to standard error.
+/// Prints a message of the argument parser clap: help and version to standard output, argument errors to standard
+/// error.
 ///
 /// # Errors
 /// Fails as [`print`]. A failure to write to standard error is ignored.
@@ -57,7 +60,8 @@ pub(super) fn print_clap(error: &clap::Error) -> Result<()> {
     if error.use_stderr() { Ok(()) } else { done.map_err(Error::io("write", Path::new(NAME))) }
 }
 
-/// Returns whether `error` means that the reader of standard output has ended, as `head` does after its last line.
+/// Returns whether `error` means that the reader of standard output has ended, as `head` does after it has read enough
+/// lines.
 pub(super) fn has_no_reader(error: &Error) -> bool {
     match error {
         Error::Io { source, path, .. } => source.kind() == io::ErrorKind::BrokenPipe && path == Path::new(NAME),
@@ -70,8 +74,8 @@ pub(super) fn is_terminal() -> bool {
     stdout().is_terminal()
 }
 
-/// Returns a JSON text in which every character that [`printable`] replaces is escaped. Such characters occur only
-/// inside its strings.
+/// Escapes every character of a JSON text that [`printable`] replaces. Such characters occur only inside the strings of
+/// the JSON text.
 fn json_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

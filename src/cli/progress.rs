@@ -17,19 +17,20 @@ use super::message::{is_terminal, show};
 use splatsieve::error::printable;
 use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, format_duration};
 
-/// Minimum seconds between two log lines of one task.
+/// Minimum time between two log lines of one task, seconds.
 const LOG_INTERVAL_SECONDS: u64 = 60;
 
-/// Assumed width of a terminal that does not report its width, columns.
+/// Assumed width of a terminal that does not report its width, in columns (characters).
 const DEFAULT_COLUMNS: u16 = 80;
-/// Maximum columns of a bar.
+/// Maximum width of a progress bar, in columns (characters).
 const MAX_BAR_COLUMNS: usize = 30;
-/// Minimum columns of a bar; a shorter bar shows no more than the percentage.
+/// Minimum width of a progress bar, in columns (characters). A shorter bar shows no more than the percentage does.
 const MIN_BAR_COLUMNS: usize = 8;
 
-/// Display of events on standard error.
+/// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
-    /// Whether to hide progress and discarded results. Plans are always shown, because the user requests them.
+    /// Whether to hide progress and the messages about discarded results. Plans are always shown, because the user
+    /// requests them.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -39,14 +40,15 @@ pub(super) struct Display {
 struct Shared {
     /// Bars of all running tasks; the bar of a nested task is below that of the outer task.
     bars: MultiProgress,
-    /// Number of running tasks in a log.
+    /// Number of running tasks whose progress is written as log lines.
     logs: AtomicUsize,
-    /// Position in the current run; `None` outside a run.
+    /// Running stage and start of the current run; `None` outside a run.
     run: Mutex<Option<RunPosition>>,
 }
 
 impl Shared {
-    /// Locks the position in the current run. Ignores poisoning: a panicked thread cannot leave it inconsistent.
+    /// Locks the field `run` and returns its content. Ignores poisoning: a panicked thread cannot leave it
+    /// inconsistent.
     fn run(&self) -> MutexGuard<'_, Option<RunPosition>> {
         self.run.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -59,7 +61,7 @@ impl Display {
         Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
     }
 
-    /// Adds a bar for `task`, labeled `name`.
+    /// Adds a progress bar for `task`, labeled `name`.
     fn bar(&self, task: Task<'_>, name: String) -> Bar {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
@@ -83,7 +85,8 @@ impl Display {
 }
 
 impl EventSink for Display {
-    /// Starts a run of `stages`. Labels of its stages then show `[k/n]`, and bars show the time left of the run.
+    /// Begins a run with the stages `stages`. From now on, labels of stages show `[k/n]`, and bars show the time left
+    /// of the run.
     fn run_begun(&self, stages: &[ExpectedStage]) {
         *self.shared.run() = Some(RunPosition { stages: stages.to_vec(), start: Instant::now(), current: None });
     }
@@ -147,19 +150,19 @@ impl Drop for Bar {
     }
 }
 
-/// Position in a run: the stage that is running, and the time since it began.
+/// Progress of a run: its stages, its start, and the stage that is running.
 #[derive(Debug)]
 struct RunPosition {
     /// Name and expected duration, in seconds, of each stage.
     stages: Vec<(&'static str, f64)>,
     start: Instant,
-    /// Index of the running stage and its start; `None` before the first stage.
+    /// Index of the running stage and the time of its start; `None` before the first stage.
     current: Option<(usize, Instant)>,
 }
 
 impl RunPosition {
-    /// Marks the stage `name` as running and returns its name with its number, `[k/n] name`. Returns other names
-    /// unchanged.
+    /// Notes that the task `name` begins. If it is a stage of the run, marks it as running and returns its label `[k/n]
+    /// name`. Otherwise returns `name` unchanged.
     fn enter(&mut self, name: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
         if self.current.is_none_or(|(stage, _)| stage != place) {
@@ -168,8 +171,9 @@ impl RunPosition {
         format!("[{}/{}] {name}", place + 1, self.stages.len())
     }
 
-    /// Estimates the seconds until the end of the run, if the current task takes `step` more seconds. The expected
-    /// times of the current and later stages are scaled by actual over expected time of the stages before.
+    /// Returns the estimated time until the end of the run, seconds. `step` is the estimated time until the end of the
+    /// current task, seconds. The expected times of the current and later stages are scaled by the ratio of actual to
+    /// expected time of the earlier stages.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -184,7 +188,7 @@ impl RunPosition {
     }
 }
 
-/// Data that a progress bar shows.
+/// Data that a progress bar shows at one moment.
 struct BarSnapshot<'a> {
     name: &'a str,
     unit: &'a str,
@@ -198,7 +202,7 @@ struct BarSnapshot<'a> {
 }
 
 impl<'a> BarSnapshot<'a> {
-    /// Returns the contents of a bar in state `state`; `run` is given if the task is a stage of a run.
+    /// Returns the data of a bar whose progress is `state`. `run` is given if the task is a stage of a run.
     fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // The rate is unknown before the first unit is done.
@@ -207,8 +211,8 @@ impl<'a> BarSnapshot<'a> {
         BarSnapshot { name, unit, done, total, per_second: state.per_sec(), left, run }
     }
 
-    /// Returns a line of at most `columns` columns. The name is always shown; the other parts are added while they fit,
-    /// in this order: percentage, time left, count, rate, time left of the run, bar.
+    /// Returns the text of the bar, at most `columns` characters long. The name is always shown; the other parts are
+    /// added while they fit, in this order: percentage, time left, count, rate, time left of the run, bar.
     fn line(&self, columns: usize) -> String {
         let BarSnapshot { name, unit, done, total, per_second, left, run } = self;
         let is_shown = |seconds: &&f64| **seconds >= 1.0;
@@ -248,7 +252,7 @@ impl<'a> BarSnapshot<'a> {
     }
 }
 
-/// Returns an estimated time as text, rounded down to whole seconds.
+/// Formats an estimated time, rounded down to whole seconds.
 fn whole_seconds(seconds: f64) -> String {
     if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { format_duration(seconds.floor()) }
 }
@@ -261,7 +265,7 @@ struct Log {
     total: Option<u64>,
     start: Instant,
     done: AtomicU64,
-    /// Seconds from the start of the task to the next log line.
+    /// Time of the next log line, in seconds from the start of the task.
     next: AtomicU64,
     /// Whether another task was running when this one began.
     is_nested: bool,
@@ -269,7 +273,7 @@ struct Log {
 }
 
 impl Log {
-    /// Returns a log of `task`, labeled `name`, that starts now.
+    /// Begins a log of `task` now. Its lines start with `name`.
     fn new(name: String, task: Task<'_>, shared: Arc<Shared>) -> Log {
         let (done, next) = (AtomicU64::new(0), AtomicU64::new(LOG_INTERVAL_SECONDS));
         let is_nested = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;
@@ -285,8 +289,8 @@ impl Log {
         }
     }
 
-    /// Returns the log line at `elapsed` after the start of the task: count, rate, and the time left, or the elapsed
-    /// time if `ended`.
+    /// Returns the log line of the task at the time `elapsed` after its start: count, rate, and the time left. If the
+    /// task has ended (`ended`), the line shows the elapsed time instead of the time left.
     fn line(&self, elapsed: Duration, ended: bool) -> String {
         let done = self.done.load(Ordering::Relaxed);
         let per_second = done as f64 / elapsed.as_secs_f64().max(1e-9);
@@ -329,7 +333,7 @@ impl Drop for Log {
     }
 }
 
-/// Returns a rate as text with two or three digits, or the time per unit if it is below 0.5 units per second.
+/// Formats a rate with two or three digits. Below 0.5 units per second, the text is the time per unit.
 fn rate(per_second: f64, unit: &str) -> String {
     if per_second > 0.0 && per_second < 0.5 {
         return format!("{} each", format_duration(1.0 / per_second));

@@ -13,7 +13,7 @@ use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 /// Heading of the recipe options in the help.
 const HEADING: &str = "Recipe";
 
-/// Maximum size of a recipe file, bytes. A recipe that splatsieve writes has about 4,000.
+/// Maximum size of a recipe file that is read, bytes. A recipe that splatsieve writes has about 4,000 bytes.
 const MAX_RECIPE_BYTES: u64 = 1 << 20;
 
 /// Key of the list of merge passes, the only parameter whose value is not a single number or word.
@@ -22,13 +22,14 @@ const PASSES: &str = "passes";
 /// Value of one `--set KEY=VALUE`.
 #[derive(Debug, Clone, PartialEq)]
 enum RecipeSetting {
-    /// Parameter with its section, key and value.
+    /// Parameter of the recipe with its section, key and value.
     Parameter { section: String, key: String, value: String },
-    /// Merge pass. Passes on the command line replace all passes of the recipe.
+    /// Merge pass. If the command line has merge passes, they replace all merge passes of the recipe.
     Pass(MergePass),
 }
 
-/// Recipe options of a command line: a preset or a file, then an effort, then single parameters.
+/// Recipe options of a command line. They apply in this order: a preset or a file, then an effort, then single
+/// parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct RecipeFlags {
     preset: Option<String>,
@@ -39,8 +40,8 @@ pub(super) struct RecipeFlags {
 }
 
 impl RecipeFlags {
-    /// Returns what the recipe file records of the run that wrote it: program, input and options; empty if no recipe
-    /// file is given.
+    /// Returns the record in the recipe file of the run that wrote the file: program, input and options. The record is
+    /// empty if no recipe file is given.
     ///
     /// # Errors
     /// Fails if the file cannot be read or its record is invalid.
@@ -51,10 +52,10 @@ impl RecipeFlags {
         RecipeRecord::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
     }
 
-    /// Checks that the path that the recipe file records for `option` exists.
+    /// Checks that `path`, the value of `option` that the recipe file records, exists.
     ///
     /// # Errors
-    /// Fails if the path does not exist.
+    /// Fails if the path does not exist; the message names the recipe file and the option.
     pub(super) fn check_recorded_path(&self, option: &str, path: &Path) -> Result<()> {
         if path.exists() {
             return Ok(());
@@ -68,7 +69,7 @@ impl RecipeFlags {
         )))
     }
 
-    /// Returns the recipe after all options are applied.
+    /// Returns the recipe that results from all recipe options.
     ///
     /// # Errors
     /// Fails if the file cannot be read, or if a parameter is unknown or out of range.
@@ -157,7 +158,7 @@ impl FromArgMatches for RecipeFlags {
     }
 }
 
-/// Parser of `KEY=VALUE`. Lists the keys for completion in shells.
+/// Argument parser of `KEY=VALUE`. It also lists the keys, for completion in shells.
 #[derive(Clone)]
 struct SettingParser;
 
@@ -180,7 +181,7 @@ impl TypedValueParser for SettingParser {
     }
 }
 
-/// Parses `key=value` or `section.key=value`.
+/// Parses a recipe setting, `key=value` or `section.key=value`.
 fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     let (name, value) =
         text.split_once('=').ok_or_else(|| format!("expected KEY=VALUE such as mu=2, found {}", quoted(text)))?;

@@ -62,7 +62,7 @@ pub(super) fn run(cli: Cli) -> Result<()> {
     }
 }
 
-/// Runs `compress`; with `--list-stages` or `--dry-run`, prints the stages or the plan instead.
+/// Runs `compress`. With `--list-stages` or `--dry-run`, prints the stages or the plan instead and compresses nothing.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
     let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Most };
@@ -89,7 +89,8 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     printed
 }
 
-/// Runs `score`.
+/// Runs the command `score`, which writes a table of statistics and scores. Prints its notes and the number of
+/// Gaussians that the recipe keeps.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
@@ -102,7 +103,8 @@ fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
     ))
 }
 
-/// Runs `render`, with or without `--video`.
+/// Runs the command `render`, which writes images, or with `--video` a video. Prints its notes and a description of the
+/// output.
 fn run_render(mut args: Render, events: &Events) -> Result<()> {
     if let Some(output) = args.video.take() {
         let options = video_options(args, output, events);
@@ -124,7 +126,7 @@ fn run_render(mut args: Render, events: &Events) -> Result<()> {
     print(&format!("{}: {} view{plural}\n", options.output.shown(), rendered.views))
 }
 
-/// Runs `evaluate`.
+/// Runs the command `evaluate` and prints the comparison of the two models.
 fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     let as_json = args.json;
     let mut options =
@@ -135,21 +137,21 @@ fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
     print_as(as_json, || json_text(&found), || found.text())
 }
 
-/// Runs `sweep`.
+/// Runs the command `sweep` and prints its measurements and the path of its page.
 fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(trade_off::PAGE_FILE));
     let found = sweep::sweep(&sweep_options(args, events))?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
-/// Runs `precision`.
+/// Runs the command `precision` and prints its measurements and the path of its page.
 fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
     let (as_json, page) = (args.json, args.output.join(report::precision::PAGE_FILE));
     let found = precision::precision(&precision_options(args, events)?)?;
     print_as(as_json, || found.json(), || format!("{}{}\n", found.text(), page.shown()))
 }
 
-/// Runs `report`.
+/// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     let page = args.output.join(report::PAGE_FILE);
     let mut evaluate = evaluate_options(args.models, events);
@@ -176,7 +178,7 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
     print(&format!("{verdicts}{}\n", page.shown()))
 }
 
-/// Writes an HTML page and returns a line with its path, number of frames and size.
+/// Writes the HTML page that plays a model. Returns a line of text with its path, its number of frames and its size.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     tell_notes(&found.notes);
@@ -184,7 +186,8 @@ fn write_page(options: &ViewOptions) -> Result<String> {
     Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
 }
 
-/// Runs `convert`: writes an input in another format and prints what was written.
+/// Runs the command `convert`: writes an input in another format and prints a description of the output. A frame stream
+/// on standard output is written without a description.
 fn run_convert(args: Convert, events: &Events) -> Result<()> {
     let path =
         args.output.clone().or(args.output_option.clone()).ok_or_else(|| Error::internal("convert has no output"))?;
@@ -228,7 +231,7 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     print_as(args.json, || json_text(&converted), || converted.text())
 }
 
-/// Runs `info`: prints what an input holds, or checks or repairs a container.
+/// Runs `info`: prints the content of an input, or checks or repairs a container.
 fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
     let path = args.input.input.clone();
     if let Some(output) = args.repair {
@@ -273,13 +276,13 @@ fn run_cache(args: &CacheFolder) -> Result<()> {
     print_as(args.json, || json_text(&listed), || cache::format_list(&listed))
 }
 
-/// Runs `demo`.
+/// Runs the command `demo` and prints its results.
 fn run_demo(args: Demo, events: &Events) -> Result<()> {
     let options = demo_options(args, events);
     print(&demo::run(&options)?.text(&options.output))
 }
 
-/// Runs `test-scene`.
+/// Runs the command `test-scene` and prints its results.
 fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
     let options = test_scene_options(args, events)?;
     print(&test_scene::run(&options)?.text())?;
@@ -289,7 +292,7 @@ fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
     Ok(())
 }
 
-/// Runs `selfcheck`. Fails if a case fails; the table is printed before.
+/// Runs `selfcheck`. Prints the table of its cases, then fails if a case failed.
 fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     let found = selfcheck::run();
     let printed = print_as(args.json, || json_text(&found), || found.text());
@@ -297,20 +300,20 @@ fn run_selfcheck(args: &Selfcheck) -> Result<()> {
     printed
 }
 
-/// Runs `completions`.
+/// Runs the command `completions`, which prints a completion script for a shell.
 fn run_completions(args: &Completions) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
     output::write(&script)
 }
 
-/// Runs `man`.
+/// Runs the command `man`, which writes manual pages. Prints their number.
 fn run_man(args: &Man) -> Result<()> {
     let pages = help::write_pages(&args.folder)?;
     print(&format!("{}: {pages} pages\n", args.folder.shown()))
 }
 
-/// Returns the result of a complete run. For a run of one shard, prints which shard was computed and returns `None`.
+/// Returns the result of a complete run. If the run computed only one shard, prints the shard and returns `None`.
 fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
     match completion {
         Completion::Whole(found) => Ok(Some(found)),

@@ -1,11 +1,11 @@
-//! Interruption of a run: signals, and input files that other programs truncate.
+//! Handling of events that interrupt a run: signals, and input files that other programs truncate.
 
 use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps};
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::remove_unfinished;
 
-/// Installs the handlers. A signal that ends the process then removes unfinished outputs first. A mapped input file
-/// that is truncated ends the process with a message that names the file.
+/// Installs handlers for two events. A signal that ends the process first removes unfinished outputs. Truncation of a
+/// mapped input file ends the process with a message that names the file.
 pub(super) fn install() {
     end_on_signals(remove_unfinished, |signal| ErrorKind::Interrupted { signal }.exit_code());
     report_cut_short_maps(TruncatedMapMessage {

@@ -119,6 +119,16 @@ pub struct TruthComparison {
     pub original: Comparison,
 }
 
+/// Mean scores of the compressed model against the original, separately for views inside the rig of the training
+/// cameras and outside it ([`RigCone`](crate::scene::outside::RigCone)).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct RigSides {
+    /// Means over the views at the training cameras and between them; `None` if there are no such views.
+    pub inside: Option<QualityMeans>,
+    /// Means over the views outside.
+    pub outside: QualityMeans,
+}
+
 /// Result of an evaluation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
@@ -139,6 +149,10 @@ pub struct Evaluation {
     /// Scores of the compressed model against the original.
     #[serde(flatten)]
     pub loss: Comparison,
+    /// Mean scores of the views from directions between the training cameras, and of the views outside; `None` if no
+    /// view is outside, or if the cameras have no training views.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rig_sides: Option<RigSides>,
     /// Scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
@@ -214,6 +228,19 @@ impl Comparison {
     }
 }
 
+impl RigSides {
+    /// Averages the scores `views` on each side of the rig. `is_outside` states for each view whether it is outside.
+    /// Returns `None` if no view is outside.
+    pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<RigSides> {
+        let side = |outside: bool| -> Option<QualityMeans> {
+            let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);
+            let scores: Vec<ImageScore> = chosen.map(|(view, _)| view.loss).collect();
+            (!scores.is_empty()).then(|| QualityMeans::from_scores(&scores))
+        };
+        Some(RigSides { inside: side(false), outside: side(true)? })
+    }
+}
+
 impl Evaluation {
     /// Returns the evaluation with only the last component of every path, for writing to a file.
     pub fn without_folders(mut self) -> Evaluation {
@@ -256,6 +283,12 @@ impl Evaluation {
             let _ = writeln!(out, "  {label:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
         };
         line("compressed against original", &self.loss.overall);
+        if let Some(RigSides { inside, outside }) = self.rig_sides {
+            if let Some(inside) = inside {
+                line(&format!("{} views inside the training rig", inside.pairs), &inside);
+            }
+            line(&format!("{} views outside the training rig", outside.pairs), &outside);
+        }
         if let Some(truth) = &self.ground_truth {
             line("compressed against ground truth", &truth.compressed.overall);
             line("original against ground truth", &truth.original.overall);
@@ -347,6 +380,7 @@ mod tests {
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
             loss: Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap(),
+            rig_sides: None,
             ground_truth: truth.map(|comparison| TruthComparison {
                 folder: String::new(),
                 of: 2,
@@ -358,6 +392,20 @@ mod tests {
             work_notes: Vec::new(),
             views: pictures,
         }
+    }
+
+    #[test]
+    fn sides_of_the_rig_are_averaged_apart() {
+        let views = [picture(0, 1, 30.0, None), picture(0, 2, 20.0, None), picture(1, 1, 40.0, None)];
+        let sides = RigSides::from_views(&views, &[false, true, false]).unwrap();
+        assert_eq!((sides.inside.unwrap().psnr, sides.outside.psnr, sides.outside.pairs), (35.0, 20.0, 1));
+        assert!(RigSides::from_views(&views, &[true; 3]).unwrap().inside.is_none());
+        assert!(RigSides::from_views(&views, &[false; 3]).is_none());
+        let mut found = evaluation(views.to_vec());
+        found.rig_sides = Some(sides);
+        let text = found.text();
+        assert!(text.contains("2 views inside the training rig"), "{text}");
+        assert!(text.contains("1 views outside the training rig"), "{text}");
     }
 
     #[test]

@@ -23,7 +23,7 @@ use serde::de::DeserializeOwned;
 use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
-use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, TruthComparison, ViewScores};
+use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, RigSides, TruthComparison, ViewScores};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::records::RenderTime;
 use crate::limits::Limits;
@@ -35,6 +35,7 @@ use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
+use crate::scene::outside::{RigCone, training_cameras};
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
@@ -188,7 +189,8 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and ends.
+    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and
+    /// ends.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -304,12 +306,20 @@ impl ModelPair {
             },
             background: self.background,
             loss: Comparison::from_views(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
+            rig_sides: RigSides::from_views(&scores, &self.outside_views()),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
             views: scores,
         })
+    }
+
+    /// Returns for every view whether it is outside the rig of the training cameras; `false` for all if there are none.
+    fn outside_views(&self) -> Vec<bool> {
+        let rig = &self.scene.rig;
+        let cone = RigCone::new(&training_cameras(rig));
+        self.views.iter().map(|view| cone.is_outside(&rig.cameras[view.camera as usize])).collect()
     }
 
     /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.

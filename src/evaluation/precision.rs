@@ -34,8 +34,8 @@ pub struct PrecisionDiagram {
     pub kept: usize,
     /// Number of threads, except where the number of threads is varied.
     pub threads: usize,
-    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::max_setting_seconds`] seconds in
-    /// all.
+    /// Maximum number of runs of each setting; fewer where the runs so far took
+    /// [`PrecisionDiagram::max_setting_seconds`] seconds in all.
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
     #[serde(rename = "enough")]
@@ -127,7 +127,7 @@ pub struct ObservedOrder {
     pub error: String,
     /// Slope of log error against log step, by least squares.
     pub observed: f64,
-    /// Order that theory predicts; `None` if it predicts none.
+    /// Order of convergence that theory predicts; `None` if it predicts none.
     pub expected: Option<f64>,
 }
 

@@ -22,7 +22,8 @@ use crate::model::{AttributeValues, Gaussians, color_from_sh, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
 const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
-/// Maximum error of positions and scales, as a fraction of the scene size.
+/// Error of positions and scales that is allowed for every Gaussian, however small it is, as a fraction of the scene
+/// size.
 const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
 /// Maximum error of a scale, as a fraction of its value.
 const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
@@ -102,7 +103,8 @@ pub struct CodingErrors {
 }
 
 impl CodingErrors {
-    /// Creates the record for a file of Gaussians at `positions`. No Gaussian has been compared yet.
+    /// Returns a record without errors. `positions` holds the positions of all Gaussians of the file; they determine
+    /// the scene size.
     pub fn new(positions: &AttributeValues) -> CodingErrors {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
@@ -154,8 +156,8 @@ impl CodingErrors {
         self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
-    /// Compares an error with the allowed maximum `bound`. Records it if it exceeds `bound` by the largest factor so
-    /// far.
+    /// Compares `error` with its maximum `bound`. Keeps the error if it exceeds `bound`, and exceeds it by the largest
+    /// factor so far. `quantity` names the attribute of Gaussian `id` for messages.
     fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
         let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };
@@ -206,8 +208,8 @@ mod tests {
         RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Returns the record for six Gaussians: five at distances of 2 from one another and one far away. The scene size
-    /// is 2.
+    /// Returns a record for six Gaussians on a line: five at distances of 2 from the next, and one far away. The scene
+    /// size is 2.
     fn accuracy() -> CodingErrors {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);

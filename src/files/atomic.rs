@@ -2,8 +2,8 @@
 //!
 //! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` syncs it to disk and
 //! publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an output
-//! without `commit` removes it. When a signal ends the process, [`remove_unfinished`] removes all outputs that have not been
-//! published. The workspaces of killed runs are repaired and removed by the next run with the same output
+//! without `commit` removes it. When a signal ends the process, [`remove_unfinished`] removes all outputs that have not
+//! been published. The workspaces of killed runs are repaired and removed by the next run with the same output
 //! ([`leftovers`]). Runs in different containers and on different machines may share folders.
 //!
 //! [`Replace`] determines which existing outputs are overwritten. Only regular files, folders and links to regular
@@ -107,8 +107,8 @@ pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], re
     Ok(())
 }
 
-/// Output file that is written under a hidden name. [`StagedFile::commit`] moves it to its own name, or copies it into
-/// a device or FIFO.
+/// Output file that is first written under a hidden name. [`StagedFile::commit`] moves it to the output path, or copies
+/// it into the device or FIFO at this path.
 #[derive(Debug)]
 pub struct StagedFile {
     target: PathBuf,
@@ -154,7 +154,8 @@ impl StagedFile {
     }
 }
 
-/// Output file with companion files beside it. [`StagedFiles::commit`] gives all of them their final names together.
+/// Output file with companion files beside it, all first written under hidden names. [`StagedFiles::commit`] moves all
+/// of them to their output paths together.
 #[derive(Debug)]
 pub struct StagedFiles {
     file: StagedFile,
@@ -164,7 +165,7 @@ pub struct StagedFiles {
 impl StagedFiles {
     /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
     /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
-    /// the summary.
+    /// the summary (JSON file that describes the result).
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -220,7 +221,7 @@ fn companion_name(index: usize) -> String {
     format!("companion-{index}")
 }
 
-/// Output folder that is written under a hidden name. [`StagedFolder::commit`] moves it to its own name.
+/// Output folder that is first written under a hidden name. [`StagedFolder::commit`] moves it to the output path.
 #[derive(Debug)]
 pub struct StagedFolder {
     target: PathBuf,
@@ -247,8 +248,8 @@ impl StagedFolder {
         &self.content
     }
 
-    /// Adds the list of its files to the summary of the folder, if it has a summary, syncs everything to disk and gives
-    /// the folder its final name.
+    /// Adds the list of its files to the summary of the folder (`summary.json`), if it has a summary, syncs everything
+    /// to disk and gives the folder its final name.
     ///
     /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
     /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the
@@ -327,7 +328,9 @@ impl ScratchFolder {
     }
 }
 
-/// Replaces, in an error of the system, a path in a hidden workspace by the output path that the user gave.
+/// Returns `error` with the output path that the user gave in place of a path in a hidden workspace. For a scratch
+/// file, the error then names the folder that holds it. Only errors of system calls contain such paths; other errors
+/// are returned unchanged.
 pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {

@@ -28,7 +28,7 @@ use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
 /// Maximum size in bytes of the pickle of a checkpoint. A pickle that describes ten thousand tensors has about one
-/// million.
+/// million bytes.
 const MAX_PICKLE: u64 = 1 << 23;
 /// Maximum number of files in the zip archive of a checkpoint.
 const MAX_ENTRIES: u64 = 1 << 16;
@@ -84,7 +84,7 @@ impl ValueType {
         })
     }
 
-    /// Returns the name that PyTorch gives the type.
+    /// Returns PyTorch's name of the value type, such as `float16`.
     pub(crate) fn name(self) -> &'static str {
         match self {
             ValueType::F16 => "float16",
@@ -151,7 +151,7 @@ pub(crate) struct TensorView {
 /// Byte ranges in the pickle at which the numbers that describe a tensor are written.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NumberRanges {
-    /// Number of values of the storage.
+    /// Byte range of the number of values of the storage.
     pub(crate) numel: Range<usize>,
     pub(crate) offset: Range<usize>,
     pub(crate) shape: Vec<Range<usize>>,
@@ -275,7 +275,8 @@ impl Checkpoint {
         Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
     }
 
-    /// Checks that `bytes` of memory may be used for reading `what`; `place` is its place in the file for messages.
+    /// Checks that `bytes` bytes of memory may be taken for reading `what`. `place` is the place of `what` in the file,
+    /// for messages. Fails if the memory limit for reading is exceeded.
     pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
         self.memory.check(&self.path, place, what, bytes)
     }
@@ -351,7 +352,8 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the integers of the tuple or list at node `id` and their byte ranges in the pickle.
+    /// Returns the non-negative integers in the tuple or list at node `id`, and the byte range of each in the pickle;
+    /// `None` for other nodes.
     fn numbers(&self, id: NodeId) -> Option<(Vec<usize>, Vec<Range<usize>>)> {
         self.pickle.elements(id)?.iter().map(|&id| self.number(id)).collect()
     }
@@ -369,7 +371,7 @@ impl Checkpoint {
     }
 
     /// Checks that the storage of `tensor` holds all of its elements, and that the tensor has at most 4
-    /// ([`MAX_EXPANSION`]) elements per stored value.
+    /// ([`MAX_EXPANSION`]) elements per stored value. The error describes the tensor and its storage.
     pub(crate) fn check(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
         self.check_extent(tensor)?;
@@ -379,7 +381,7 @@ impl Checkpoint {
         }
     }
 
-    /// Checks that the storage of `tensor` holds all of its elements.
+    /// Checks that the storage of `tensor` holds all of its elements. The error describes the tensor and its storage.
     pub(crate) fn check_extent(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
             return Err(format!("no file data/{}", tensor.storage));
@@ -396,8 +398,8 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the maximum number of elements that all tensors in the storage `key` may have together, for values of
-    /// type `kind`.
+    /// Returns the maximum number of elements, of type `kind`, that all tensors in the storage `key` may have together:
+    /// 4 ([`MAX_EXPANSION`]) times the number of stored values; 0 if the storage is missing.
     pub(crate) fn max_values(&self, key: &str, kind: ValueType) -> usize {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
@@ -485,15 +487,15 @@ pub(crate) enum CheckpointFile<'a> {
 const PICKLE: &str = "data.pkl";
 
 /// Returns `name`, the path of a file in the archive, without its first folder. PyTorch calls this folder `archive` or
-/// like the file.
+/// names it after the checkpoint file.
 fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
-/// Name of the archive's list of files in error messages.
+/// Name that error messages use for the list of files in the archive.
 const LIST: &str = "list of files";
 
-/// Returns whether the file contains the text "big" at byte `at`.
+/// Returns whether the text "big" is at byte `at` of the file. PyTorch stores it if the values are big-endian.
 fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     let (mut file, mut text) = (file.clone(), [0; 3]);
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"

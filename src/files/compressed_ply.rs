@@ -21,14 +21,14 @@ use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
 
-/// Property by which the format is recognized.
+/// Name of a property that only this format has; the format is recognized by it.
 pub const MARKER_PROPERTY: &str = "packed_position";
 /// Number of Gaussians per row of the element `chunk`.
 const CHUNK: usize = 256;
-/// Range of SH coefficients above degree 0 that a byte stands for: −4 to 4.
+/// Width of the range of SH coefficients above degree 0 that a byte can store: −4 to 4.
 const SH_RANGE: f32 = 8.0;
 
-/// Rows of an element in the mapped file.
+/// Element of the PLY file: its description in the header, and the bytes of its rows in the mapped file.
 struct Table<'a> {
     element: &'a Element,
     bytes: &'a [u8],
@@ -36,7 +36,7 @@ struct Table<'a> {
 }
 
 impl<'a> Table<'a> {
-    /// Returns the property called `name`, which must have the type `scalar`.
+    /// Returns the property called `name`. Fails if there is no such property or if its type is not `scalar`.
     fn property(&self, name: &str, scalar: Scalar) -> Result<&'a Property> {
         let place = format!("element {}", quoted(&self.element.name));
         let expected = format!("a property {} {name}", scalar.name());
@@ -54,13 +54,14 @@ impl<'a> Table<'a> {
     }
 }
 
-/// Ranges of the Gaussians of one chunk: smallest and largest value of each of three components.
+/// Ranges of three components over the Gaussians of one chunk: for each component, its smallest and its largest value.
 type Ranges = [[f32; 2]; 3];
 
 /// Reads the Gaussians of the `.compressed.ply` file at `path`.
 ///
 /// # Errors
-/// Fails if the file is damaged, lacks a property, holds a range that is not finite, or needs more memory than `memory`.
+/// Fails if the file is damaged, lacks a property, holds a range that is not finite, or needs more memory than
+/// `memory`.
 pub fn read_compressed_ply(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let map = FileMap::open(path)?;
     let header = PlyHeader::parse(path, &map)?;
@@ -106,7 +107,8 @@ pub fn read_compressed_ply(path: &Path, memory: ReadLimit) -> Result<Gaussians> 
     Ok(gaussians)
 }
 
-/// Decodes the packed words of the Gaussians.
+/// Decodes the packed position, rotation, scale and color of every row of `vertices` into `gaussians`. `chunks` holds
+/// the ranges of 256 successive Gaussians in each row. Fails if a property is missing or a range is not finite.
 fn decode_vertices(chunks: &Table, vertices: &Table, gaussians: &mut Gaussians) -> Result<()> {
     let names = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
     let mut offsets = [0; 4];
@@ -135,7 +137,8 @@ fn decode_vertices(chunks: &Table, vertices: &Table, gaussians: &mut Gaussians) 
     Ok(())
 }
 
-/// Returns the ranges `min_*` and `max_*` of row `chunk`.
+/// Returns the ranges of three components that row `chunk` of the element `chunk` holds: the properties `min_NAME` and
+/// `max_NAME` for each NAME in `names`. Fails if one of them is missing or not finite.
 fn ranges(chunks: &Table, chunk: usize, names: [&str; 3]) -> Result<Ranges> {
     let mut found = [[0.0; 2]; 3];
     for (range, name) in found.iter_mut().zip(names) {
@@ -151,18 +154,19 @@ fn ranges(chunks: &Table, chunk: usize, names: [&str; 3]) -> Result<Ranges> {
     Ok(found)
 }
 
-/// Returns the values at the fractions `at` (0 to 1) of the ranges.
+/// Returns, for each of three components, the value at the fraction `at` (0 to 1) of the way from the smallest to the
+/// largest value of its range.
 fn between(ranges: &Ranges, at: [f32; 3]) -> [f32; 3] {
     [0, 1, 2].map(|c| ranges[c][0] * (1.0 - at[c]) + ranges[c][1] * at[c])
 }
 
-/// Returns the fractions (0 to 1) that are stored with 11, 10 and 11 bits.
+/// Returns the three fractions (0 to 1) that `word` holds with 11, 10 and 11 bits, from the highest bits.
 fn unpack_11_10_11(word: u32) -> [f32; 3] {
     let fraction = |value: u32, most: u32| (value & most) as f32 / most as f32;
     [fraction(word >> 21, 2047), fraction(word >> 11, 1023), fraction(word, 2047)]
 }
 
-/// Returns the unit quaternion wxyz of a packed rotation.
+/// Returns the unit quaternion wxyz that `word` stores as three components with 10 bits each.
 fn unpack_rotation(word: u32) -> [f32; 4] {
     let largest = (word >> 30) as usize;
     let mut q = [0f64; 4];
@@ -174,7 +178,8 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     q.map(|x| (x / length) as f32)
 }
 
-/// Returns the SH degree of the element `sh`, which must have a row for each of `count` Gaussians.
+/// Returns the SH degree to which the number of properties `f_rest_*` of the element `sh` belongs. Fails if there is no
+/// such degree, or if the element does not have one row for each of `count` Gaussians.
 fn sh_degree(table: &Table, count: usize) -> Result<usize> {
     let coefficients = table.element.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
     let degree = (1..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == coefficients);
@@ -187,7 +192,8 @@ fn sh_degree(table: &Table, count: usize) -> Result<usize> {
     })
 }
 
-/// Decodes the SH coefficients above degree 0: those of red, then those of green, then those of blue.
+/// Decodes the SH coefficients above degree 0 of the element `sh` into `gaussians`. A row holds all coefficients of
+/// red, then all of green, then all of blue.
 fn decode_sh(table: &Table, gaussians: &mut Gaussians) -> Result<()> {
     let coefficients = gaussians.sh.width() / 3 - 1;
     for rest in 0..3 * coefficients {
@@ -209,7 +215,8 @@ fn decode_sh(table: &Table, gaussians: &mut Gaussians) -> Result<()> {
 mod tests {
     use super::*;
 
-    /// Returns a file of one Gaussian with SH degree 1. `edit` may change the header.
+    /// Returns the bytes of a `.compressed.ply` file of one Gaussian with SH degree 1. `edit` receives the text of the
+    /// header and returns the text to be used.
     fn file(edit: impl Fn(&str) -> String) -> Vec<u8> {
         let bounds = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
         let mut header = "ply\nformat binary_little_endian 1.0\nelement chunk 1\n".to_owned();

@@ -1,22 +1,35 @@
 //! `gseq` container (this project's sequence file) as a source of frames.
 //!
 //! Input: the file. Output: the attributes of any Gaussians at any frame. A tile holds the values of one attribute for
-//! a block of consecutive Gaussians and a block of consecutive frames. Memory: each reader has the buffers of a
-//! `TileReader`, all readers share the decoded tiles in `HeldTiles`, and each decoding thread has one `Scratch`.
+//! a block of consecutive Gaussians and a block of consecutive frames. Memory: buffers for each reader (`TileReader`),
+//! decoded tiles that all readers share (`HeldTiles`), and decoding buffers for each thread (`TileScratch`).
 //!
 //! Raw (uncompressed) tiles are read in place from the memory-mapped file; compressed tiles are decoded directly from
-//! the mapping. Touched pages count as resident until they are released, so a reader releases the pages of a frame
-//! block when it enters another one. If it may keep less than a frame block, it uses positioned reads, because
-//! releasing page by page per frame costs more than the copy. Throughput of reading raw frames into the caller's
-//! buffers (`cargo bench --bench scan`, `raw_frames`; two threads on two cores of a busy EPYC, so compare the figures
-//! only with one another): 1.5 GB/s with release per frame block, 0.6 with release per frame, 1.4 with positioned
-//! reads, 2.3 if pages stay mapped.
+//! the mapping. Mapped pages that were read count as memory of the process until they are released, so a reader
+//! releases the pages of a frame block when it enters another one. A reader that may keep less than a frame block in
+//! memory copies the values with positioned reads instead, because releasing pages after every frame costs more than
+//! the copy. Throughput of reading raw frames into the caller's buffers (`cargo bench --bench scan`, `raw_frames`; two
+//! threads on two cores of a busy EPYC, so compare the figures only with one another):
 //!
-//! A file that is in the page cache is read block by block, and the system reads ahead on advice: when a reader that
-//! decodes whole frame blocks enters one, it announces the next one. A file that is not in the page cache is scanned in
-//! stages ([`FrameSource::ahead`]). Times on the same machine for blocks and stages: cold page cache 95 and 71 ms
-//! (raw), 222 and 232 ms (compressed); simulated disk of 300 MB/s 158 and 162, 216 and 206; warm page cache 46 and 45,
-//! 152 and 223. In the last case a compressed scan never waits for the disk, but its stages wait for one another.
+//! | method | GB/s |
+//! |---|---|
+//! | pages released after each frame block | 1.5 |
+//! | pages released after each frame | 0.6 |
+//! | positioned reads | 1.4 |
+//! | pages never released | 2.3 |
+//!
+//! A file that is in the page cache is read one frame block after another. When a reader that decodes whole frame
+//! blocks enters a block, it tells the system which block comes next, so that the system reads it ahead. A file that is
+//! not in the page cache is scanned in stages ([`FrameSource::ahead`]). Times of a scan on the same machine, by frame
+//! blocks and in stages:
+//!
+//! | file | raw tiles, ms | compressed tiles, ms |
+//! |---|---|---|
+//! | not in the page cache | 95 and 71 | 222 and 232 |
+//! | on a simulated disk of 300 MB/s | 158 and 162 | 216 and 206 |
+//! | in the page cache | 46 and 45 | 152 and 223 |
+//!
+//! In the page cache, a scan of compressed tiles never waits for the disk, but its stages wait for one another.
 
 mod held;
 mod store;
@@ -47,8 +60,8 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Returns the prefetcher of the file, or `None` if the file is in the page cache; the module documentation gives
-    /// the measurements behind this.
+    /// Returns the prefetcher of the file; `None` if the file is in the page cache, where a scan in stages is not
+    /// faster (times: see the module documentation).
     fn ahead(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,

@@ -3,10 +3,10 @@
 
 /// Maximum number of row indices that a note to the user lists per kind of defect.
 const LISTED_ROWS: usize = 5;
-/// Fraction of dropped rows above which the note with the totals is the first one about the file.
+/// Fraction of dropped rows above which the note with the totals comes before the notes about single kinds of defects.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
-/// Counts of the defective rows of a file, and of those that the reader dropped.
+/// Counts of the rows of a file that have defects, and of the rows that the reader dropped because of defects.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
     /// Number of rows of the file, without padding.
@@ -19,7 +19,7 @@ pub struct Defects {
     pub kinds: Vec<DefectCount>,
 }
 
-/// Rows of a file that have one kind of defect.
+/// Count of the rows of a file that have one kind of defect.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DefectCount {
     /// Name of the defect, such as "zero quaternion".
@@ -35,13 +35,13 @@ pub struct DefectCount {
 }
 
 impl Defects {
-    /// Returns the record for a file of `rows` rows, with no defects counted yet.
+    /// Returns the counts for a file of `rows` rows, with no defects counted yet.
     pub fn new(rows: usize) -> Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts the defects `found` in row `row`. Each defect has a name, whether the row is dropped because of it, and
-    /// the reason.
+    /// Counts the defects `found` in row `row`. Each defect is given by its name, whether the row is dropped because of
+    /// it, and the reason.
     pub fn add(&mut self, row: u32, found: &[(&str, bool, &str)]) {
         self.defective += usize::from(!found.is_empty());
         self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));

@@ -22,12 +22,13 @@ pub(crate) fn digest_of_files<'a>(paths: impl IntoIterator<Item = &'a Path>) -> 
     Ok(format!("{:032x}", hash.digest128()))
 }
 
-/// Adds the bytes of the file at `path` to `hash`.
+/// Adds the bytes of the file at `path` to `hash`. Fails if the file cannot be read.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
     hash_rest(&mut open_file(path)?, path, hash)
 }
 
-/// Adds the bytes of `file`, which was opened from `path`, from its current position to its end.
+/// Adds the bytes of `file`, from its current position to its end, to `hash`. `path` is the path of the file, for
+/// messages.
 pub(crate) fn hash_rest(file: &mut File, path: &Path, hash: &mut Xxh3) -> Result<()> {
     let mut chunk = vec![0; CHUNK_BYTES];
     loop {

@@ -23,26 +23,28 @@ pub const CENTER: usize = 0;
 pub const LOG_DEVIATION: usize = 1;
 /// First of three indices in [`StoredParams::format_specific`] of the velocity along x, y, z, per unit of time.
 pub const VELOCITY: usize = 2;
-/// Number of parameters in [`StoredParams::format_specific`] of a Gaussian with linear motion in a Gaussian window of time.
+/// Number of parameters in [`StoredParams::format_specific`] of a Gaussian with linear motion in a Gaussian window of
+/// time.
 pub const PARAMS_PER_GAUSSIAN: usize = 5;
 
-/// Minimum standard deviation of a time window that the player shows, as a fraction of the sequence.
+/// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the sequence.
+/// Narrower windows are shown with this one.
 pub const MIN_DEVIATION: f64 = 0.02;
 /// Minimum opacity of a Gaussian at any time.
 const OPACITY_FLOOR: f64 = 1e-4;
-/// Properties that an INRIA PLY does not have, in the order of [`StoredParams::format_specific`].
+/// Names of the properties that an INRIA PLY does not have, in the order of [`StoredParams::format_specific`].
 const OWN_PROPERTIES: [&str; PARAMS_PER_GAUSSIAN] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
-/// Comment by which a file of this format is recognized.
+/// First word of the header comment by which a file of this format is recognized.
 pub const MARKER_COMMENT: &str = "ftgs_version";
 
-/// Frames of a sequence whose time runs from 0 to 1.
+/// Mapping of the times of a sequence to the range from 0 to 1, and the number and rate of its frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClipTimes {
-    /// Time of the original sequence at the time 0.
+    /// Time of the original sequence that is mapped to 0.
     pub first: f64,
-    /// Time of the original sequence at the time 1; above `first`.
+    /// Time of the original sequence that is mapped to 1; greater than `first`.
     pub last: f64,
-    /// Number of frames T if it is known. Frame i is at the time i/max(T − 1, 1).
+    /// Number of frames T, if it is known. The mapped time of frame i is i/max(T − 1, 1).
     pub frames: Option<usize>,
     /// Frame rate of the playback, in frames per second. A `.ftgs.ply` does not store it.
     pub frame_rate: f64,
@@ -52,10 +54,11 @@ pub struct ClipTimes {
 pub const FRAME_RATE: f64 = 30.0;
 
 impl ClipTimes {
-    /// Times of a sequence that is not mapped, with an unknown number of frames.
+    /// Mapping for a sequence whose times run from 0 to 1 already and whose number of frames is not known.
     pub const UNIT_INTERVAL: ClipTimes = ClipTimes { first: 0.0, last: 1.0, frames: None, frame_rate: FRAME_RATE };
 
-    /// Returns the mapping of `times`, which increase, to the range from 0 to 1.
+    /// Returns the mapping of the increasing `times`, one per frame, to the range from 0 to 1. If there are fewer than
+    /// two times, the range of time that is mapped has length 1.
     pub fn from_times(times: &[f64]) -> ClipTimes {
         let first = times.first().copied().unwrap_or(0.0);
         let last = times.last().copied().filter(|&last| last > first).unwrap_or(first + 1.0);
@@ -67,38 +70,42 @@ impl ClipTimes {
         (time - self.first) / (self.last - self.first)
     }
 
-    /// Returns the times of a sequence from `first` to `last`; `None` if they are not finite or do not increase.
+    /// Returns the mapping of the times from `first` to `last`, for an unknown number of frames; `None` if the two
+    /// times are not finite or do not increase.
     pub(crate) fn from_range(first: f64, last: f64) -> Option<ClipTimes> {
         let is_range = first.is_finite() && last.is_finite() && last - first > 1e-12 * first.abs().max(last.abs());
         is_range.then_some(ClipTimes { first, last, ..ClipTimes::UNIT_INTERVAL })
     }
 }
 
-/// Settings in the header of a file.
+/// Settings in the header of a `.ftgs.ply` file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FtgsHeader {
-    /// Times of the frames.
+    /// Mapping of the times of the frames to the range from 0 to 1.
     pub clip: ClipTimes,
-    /// Minimum standard deviation of a time window.
+    /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the
+    /// sequence.
     pub min_deviation: f64,
-    /// Minimum opacity of a Gaussian at any time.
+    /// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower.
     pub opacity_floor: f64,
     /// Whether the velocities are used; if not, the Gaussians do not move.
     uses_velocity: bool,
 }
 
-/// Opened file: the parameters of its Gaussians, and the Gaussians that were repaired or left out.
+/// Content of a `.ftgs.ply` file: the parameters of its Gaussians, and counts of the Gaussians that were repaired or
+/// left out.
 #[derive(Debug)]
 pub struct Ftgs {
     /// Settings of the header.
     pub header: FtgsHeader,
     /// Parameters of the Gaussians that were read.
     pub params: StoredParams,
-    /// Rows (Gaussians) with defects.
+    /// Counts of the rows (Gaussians) with defects.
     pub defects: Defects,
 }
 
-/// Defects of a row (Gaussian): name, whether the row is left out, and the reason.
+/// Defect of a row (Gaussian) with a value that is not finite: its name, whether the row is left out, and the reason.
+/// The next two constants describe zero quaternions in the same form.
 const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
 const ZERO_QUATERNION: (&str, bool, &str) = (
     "zero quaternion",
@@ -109,7 +116,9 @@ const KEPT_ZERO_QUATERNION: (&str, bool, &str) =
     ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
 
 impl FtgsHeader {
-    /// Parses the comments of the PLY file at `path`. `sh_degree` is the SH degree of its properties.
+    /// Parses the settings in `comments`, the comment lines in the header of the PLY file at `path`. `sh_degree` is the
+    /// SH degree of the properties of the file. Fails if a setting is invalid, or if the comments state another SH
+    /// degree, version or unit of time.
     fn parse(path: &Path, comments: &[String], sh_degree: usize) -> Result<FtgsHeader> {
         let value = |name: &str| {
             let of = |comment: &String| Some(comment.strip_prefix(name)?.strip_prefix([' ', '\t'])?.trim().to_owned());
@@ -195,7 +204,8 @@ impl Ftgs {
     }
 }
 
-/// Returns the defects of the rows (Gaussians) of `params`, and the indices of the rows that are kept.
+/// Returns the defects of the rows (Gaussians) of `params`, and the indices of the rows that are kept. `zero_rotation`
+/// determines whether rows with a zero quaternion are kept.
 fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<u32>) {
     let mut defects = Defects::new(params.len());
     let columns: Vec<&AttributeValues> = Attributes::all()
@@ -221,8 +231,8 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
     (defects, kept)
 }
 
-/// Writes the Gaussians `params` with linear motion in time windows to the file `path`. Their times are those of the
-/// player, from 0 to 1, and `clip` gives the frames.
+/// Writes the Gaussians `params` with linear motion in time windows to the file `path`. The times in `params` are those
+/// of the player, from 0 to 1. The header also states the number of frames and the original times of `clip`.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
@@ -306,7 +316,7 @@ mod tests {
         ));
     }
 
-    /// Writes a file, replaces `from` by `to` in it, and reads it.
+    /// Writes a file of Gaussians, replaces the text `from` in it by `to`, and reads the file.
     fn read_changed(from: &str, to: &str) -> Result<Ftgs> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ftgs.ply");

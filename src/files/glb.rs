@@ -18,7 +18,7 @@ pub mod write;
 
 /// First word of a `.glb` file, "glTF".
 pub const MAGIC: u32 = 0x4654_6c67;
-/// Version of glTF.
+/// Version of glTF that is read and written.
 const VERSION: u32 = 2;
 /// Type of the chunk that holds the JSON text, and (`BINARY`) of the chunk that holds the values.
 const JSON: u32 = 0x4e4f_534a;

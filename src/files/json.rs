@@ -21,13 +21,13 @@ use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::CheckedReader;
 
-/// Error of a seed (builder of the value). It is stored here while the parser unwinds, because the error type of the
-/// parser cannot hold it.
+/// Place for the error with which a seed (builder of a value) stops the parser, because the error type of the parser
+/// cannot hold this error.
 #[derive(Debug, Default)]
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
 impl ParseAbort {
-    /// Stores `error` and returns a parser error, which ends the reading.
+    /// Stores `error` and returns a parser error, which the seed returns to stop the parser.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")

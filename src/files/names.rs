@@ -23,8 +23,8 @@ pub fn shown_name(path: &Path) -> String {
     Path::new(&name_of(path)).shown().to_string()
 }
 
-/// Returns `path` relative to `folder`, which need not exist yet. Returns only the last component of `path` if the two
-/// have too few folders in common ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
+/// Returns `path` relative to `folder`, which need not exist yet. Returns only the last component of `path` if `path`
+/// and `folder` have too few folders in common ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
 pub fn relative_to_folder(path: &Path, folder: &Path) -> PathBuf {
     let found = (|| {
         let (path, folder) = (real_path(path)?, real_path(folder)?);

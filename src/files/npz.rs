@@ -30,7 +30,7 @@ const MAX_LIST: u64 = 4 << 20;
 /// Maximum number of bytes of decoded arrays, in the scratch file, per byte of the archive; [`BASE_SCRATCH_BYTES`] are
 /// allowed in addition. Trained models need 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Number of bytes of decoded arrays that an archive of any size may have.
+/// Number of bytes of decoded arrays that are allowed in the scratch file for an archive of any size.
 const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Largest possible ratio of decompressed to compressed bytes with DEFLATE.
 const MAX_DEFLATE_FACTOR: u64 = 1032;
@@ -58,7 +58,7 @@ pub(crate) struct NpzArray {
     pub(crate) is_fortran: bool,
     /// Whether the array is compressed in the archive.
     pub(crate) is_compressed: bool,
-    /// Size of the array in the archive, in bytes.
+    /// Size of the array in the archive, in bytes; the compressed size if the array is compressed.
     stored: u64,
     /// Index of the array among the files of the archive.
     index: usize,
@@ -76,7 +76,7 @@ pub(crate) struct Float {
 }
 
 impl Float {
-    /// The type that can be read without decoding: little-endian float32.
+    /// Type of values that can be read without decoding: little-endian float32.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
     /// Returns the type of the values if the header describes floating-point numbers in C order, else `None`.
@@ -277,7 +277,8 @@ impl Npz {
     }
 }
 
-/// Opens the zip archive at `path`. The inner error describes what is wrong with the content of the archive.
+/// Opens the zip archive at `path`. Returns an outer error if the file cannot be opened, and an inner error, which
+/// describes what was found, if its content is no valid archive.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
     let directory = match declared_directory(&mut file) {
@@ -299,8 +300,8 @@ impl NpzArray {
         !self.is_compressed && float == Float::F32
     }
 
-    /// Reads the header of the array in `file`, which is file `index` of the archive. The error text describes what was
-    /// found instead.
+    /// Reads the header of the array `name` in `file`, the file of the archive with index `index`. The error text
+    /// describes what was found instead of a header.
     fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<NpzArray, String> {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();

@@ -50,7 +50,7 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
     Ok(bytes)
 }
 
-/// Checks that a file of the type `found` is a regular one.
+/// Checks that `found`, the type of the file at `path`, is that of a regular file. The error names the type found.
 fn check_regular(path: &Path, found: FileType) -> Result<()> {
     let kind = match FileKind::from_type(found) {
         FileKind::File => return Ok(()),

@@ -25,7 +25,7 @@ pub struct PlyFrames {
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
-    /// Converted rows of each frame that is a text file; `None` for binary files.
+    /// For each frame whose file is a text file, its rows in binary form; `None` for binary files.
     texts: Vec<Option<TextRows>>,
     memory: ReadLimit,
 }
@@ -158,9 +158,9 @@ const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the who
 
 /// Entries of a folder that are named like frames, in natural order.
 pub(crate) struct FrameFiles {
-    /// Entries that are files: the frames.
+    /// Entries that are files; each is a frame.
     frames: Vec<PathBuf>,
-    /// Entries that are not files.
+    /// Entries that are named like frames but are not files, such as folders.
     others: Vec<PathBuf>,
 }
 
@@ -182,7 +182,7 @@ impl FrameFiles {
         Ok(FrameFiles { frames, others })
     }
 
-    /// Returns the frames. Messages name `folder`.
+    /// Returns the paths of the frames in natural order. `folder` is the folder that was listed, for messages.
     ///
     /// # Errors
     /// Fails if the numbers of the frames have a gap or if an entry is not a file, unless `allow_gaps` is true.
@@ -242,7 +242,8 @@ fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }
 
-/// Checks that a frame has the same properties as the first frame, which is the file `first`.
+/// Checks that the frame `ply` has the same properties as the first frame. `properties` are those of the first frame,
+/// and `first` is its file. The error names the first difference.
 fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<()> {
     if ply.properties() == properties {
         return Ok(());

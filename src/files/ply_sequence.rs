@@ -63,7 +63,7 @@ impl PlySequence {
         Ok(PlySequence { frames, info, note: None, bytes, states })
     }
 
-    /// Sets the note for the user about the files of this sequence.
+    /// Returns this sequence with `note`, a note for the user about its files.
     pub fn with_note(self, note: String) -> PlySequence {
         PlySequence { note: Some(note), ..self }
     }
@@ -142,7 +142,7 @@ enum OwnedIds {
 }
 
 impl OwnedIds {
-    /// Copies the indices `ids`.
+    /// Copies the indices `ids` into a value that owns them.
     fn from_ids(ids: Ids<'_>) -> OwnedIds {
         match ids {
             Ids::Range(range) => OwnedIds::Range(range),

@@ -138,13 +138,14 @@ impl<'a> Parser<'a> {
         self.take(token)
     }
 
-    /// Skips white space and `token`. Fails if something else than `token` comes next; `expected` describes it in the
-    /// error.
+    /// Skips white space and then `token`. Fails if anything other than `token` comes next; `expected` describes
+    /// `token` in the error.
     fn expect(&mut self, token: &str, expected: &'static str) -> Parsed<()> {
         if self.take_token(token) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// Reads the longest run of characters that can occur in names, keywords and numbers.
+    /// Skips white space, then reads and returns the longest run of characters that can occur in names, keywords and
+    /// numbers.
     fn word(&mut self) -> &'a str {
         self.skip_space();
         let rest = self.rest();
@@ -153,8 +154,8 @@ impl<'a> Parser<'a> {
         &rest[..end]
     }
 
-    /// Parses a value that ends at a separator. If it is no literal, the text up to the next separator becomes
-    /// [`Literal::Opaque`].
+    /// Parses a value up to the next separator, `depth` levels of brackets deep. If the text up to the separator is no
+    /// literal, it becomes [`Literal::Opaque`]. Fails if `depth` is more than 32 or a bracket or quote is missing.
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
         self.skip_space();
         let start = self.at;
@@ -182,7 +183,7 @@ impl<'a> Parser<'a> {
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 
-    /// Parses a literal. Returns `None` if the next token does not begin a literal.
+    /// Parses a literal, `depth` levels of brackets deep. Returns `None` if the next token does not begin a literal.
     fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         Ok(match self.rest().chars().next() {
             Some('\'' | '"') => Some(Literal::Str(self.string()?)),
@@ -198,7 +199,8 @@ impl<'a> Parser<'a> {
         })
     }
 
-    /// Parses the elements of a list or tuple up to the bracket `close`.
+    /// Parses a list or tuple from its opening bracket to its closing bracket `close`, and returns its elements.
+    /// `depth` is the nesting depth of the list.
     fn sequence(&mut self, close: &str, depth: usize) -> Parsed<Vec<Literal>> {
         self.at += 1;
         let mut items = Vec::new();
@@ -211,7 +213,8 @@ impl<'a> Parser<'a> {
         Ok(items)
     }
 
-    /// Parses a dictionary; returns `None` for a set, which is not supported.
+    /// Parses a dictionary from its opening to its closing brace; returns `None` for a set, which is not supported.
+    /// `depth` is the nesting depth of the dictionary.
     fn dict(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         self.at += 1;
         let mut entries = Vec::new();
@@ -317,7 +320,8 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// Parses an integer or a float as Python prints it. An integer that does not fit into i64 becomes a float.
+/// Parses an integer or a float as Python prints it; returns `None` for other words. An integer that does not fit into
+/// i64 becomes a float.
 fn number(word: &str) -> Option<Literal> {
     let digits = word.trim_start_matches(['+', '-']);
     if matches!(digits, "inf" | "nan") {

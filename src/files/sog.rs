@@ -26,7 +26,7 @@ pub const VERSION: u64 = 2;
 /// Name of the file in the archive that describes the images.
 pub const META_FILE: &str = "meta.json";
 
-/// Content of `meta.json`.
+/// Content of the file `meta.json` of an archive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Meta {
     pub(crate) version: u64,
@@ -41,13 +41,13 @@ pub(crate) struct Meta {
     sh_n: Option<PaletteEntry>,
 }
 
-/// Program that wrote a file.
+/// Member `asset` of `meta.json`: the program that wrote the archive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Asset {
     generator: String,
 }
 
-/// Images of positions, and the range of their logarithmic coordinates.
+/// Member `means` of `meta.json`: names of the two images of positions, and the range of their logarithmic coordinates.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct MeansEntry {
     mins: [f64; 3],
@@ -55,20 +55,22 @@ pub(crate) struct MeansEntry {
     files: [String; 2],
 }
 
-/// Image of three-component values, and the codebook of its bytes.
+/// Members `scales` and `sh0` of `meta.json`: name of an image of three-component values, and the codebook in which the
+/// bytes of the image are indices.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct CodebookEntry {
     codebook: Vec<Option<f32>>,
     files: [String; 1],
 }
 
-/// Image without further parameters.
+/// Member `quats` of `meta.json`: name of the image of rotations, whose bytes need no range and no codebook.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct ImageEntry {
     files: [String; 1],
 }
 
-/// Images of the palette of SH coefficients and of the labels, and the codebook of the values.
+/// Member `shN` of `meta.json`: names of the images of the palette of SH coefficients and of the labels, and the
+/// codebook of the values in the palette.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct PaletteEntry {
     count: Option<u64>,

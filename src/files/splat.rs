@@ -17,7 +17,8 @@ use crate::model::{Gaussians, sh_from_color};
 
 /// Number of bytes per Gaussian.
 pub const ROW_BYTES: usize = 32;
-/// Smallest standard deviation, so that its logarithm is finite.
+/// Minimum standard deviation, in scene units, of a Gaussian after reading. Smaller values of the file are raised to
+/// the minimum, so that their logarithms are finite.
 const MIN_SCALE: f32 = 1e-7;
 
 /// Reads the Gaussians of the `.splat` file at `path`, with SH degree 0.

@@ -2,9 +2,9 @@
 //! time, as read by the players splaTV and WebGS.
 //!
 //! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the JSON text, and the texture that this text
-//! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth`,
-//! `texheight` and `cameras`. The texture holds one row of [`ROW_BYTES`] bytes per Gaussian ([`SplatvGaussian`]), then
-//! zeros. Source: antmatter15/splaTV.
+//! describes. The text is a list; the entry of type `splat` in it has `size` (bytes of the texture), `texwidth` and
+//! `texheight` (columns and rows of the texture, in texels) and `cameras`. The texture holds one row of [`ROW_BYTES`]
+//! bytes per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
 
 pub mod rows;
 pub mod write;
@@ -40,14 +40,14 @@ pub struct SplatvGaussian {
     pub position: [f32; 3],
     /// Coefficients of dt, dt² and dt³ in the position, x, y, z for each, in scene units.
     pub motion: [f32; 9],
-    /// Quaternion wxyz at dt = 0; its length may be any.
+    /// Quaternion wxyz at dt = 0, of any length.
     pub rotation: [f32; 4],
     /// Change of the quaternion `rotation` per unit of time.
     pub omega: [f32; 4],
     /// Standard deviations along the three axes, in scene units.
     pub scale: [f32; 3],
-    /// View-independent color in [0, 1]. It is f64, because the writer truncates it to a byte instead of rounding, so
-    /// that the last digit matters.
+    /// View-independent color (red, green, blue) in [0, 1]. The type is f64 because the writer truncates the color to a
+    /// byte instead of rounding it, so the smallest difference can change the byte.
     pub rgb: [f64; 3],
     /// Opacity at dt = 0, its maximum over time, in [0, 1].
     pub opacity: f64,
@@ -58,7 +58,7 @@ pub struct SplatvGaussian {
 }
 
 impl SplatvGaussian {
-    /// Decodes a Gaussian from the words that store it.
+    /// Decodes a Gaussian from the 32-bit words that store it.
     pub fn from_words(words: &[u32; WORDS_PER_GAUSSIAN]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
@@ -99,7 +99,8 @@ pub struct Splatv {
     /// Offset in bytes of the texture in the file.
     start: usize,
     count: usize,
-    /// If the file ends before the texture does, the number of rows (Gaussians) that the texture should have.
+    /// Number of rows (Gaussians) that the texture should have, if the file ends before its texture does; otherwise
+    /// `None`.
     declared: Option<usize>,
     cameras: Value,
 }

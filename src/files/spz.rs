@@ -1,4 +1,5 @@
-//! `.spz` files: one frame of Gaussians (nianticlabs/spz, `load-spz.cc`). Written are versions 3 and 4, read also 2.
+//! `.spz` files: one frame of Gaussians (nianticlabs/spz, `load-spz.cc`). Versions 3 and 4 are written; versions 2, 3
+//! and 4 are read.
 //!
 //! | array | bytes per Gaussian | value |
 //! |---|---|---|
@@ -10,8 +11,8 @@
 //! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
 //! Versions 2 and 3 are a header of 16 bytes and the arrays one after the other, all compressed by gzip. Version 4 is a
-//! header of 32 bytes, a table of the compressed and the original size of each array (u64 each), and each array as a zstd
-//! frame. Arrays of 0 bytes are left out.
+//! header of 32 bytes, a table of the compressed and the original size of each array (u64 each), and each array as a
+//! zstd frame. Arrays of 0 bytes are left out.
 //!
 //! The maintained crate for this format is not used, because it depends on an asynchronous runtime.
 
@@ -27,7 +28,8 @@ use super::accuracy::{CodingErrors, RenderedAttributes, check_positions};
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Gaussians, color_from_sh, opacity};
 
-/// First word of a file, "NGSP", of a gzip file after decompression.
+/// First 32-bit word of a file, "NGSP". In versions 2 and 3, which are gzip files, it is the first word after
+/// decompression.
 pub const MAGIC: u32 = 0x5053_474e;
 /// Number of bytes of the header of version 4.
 const HEADER_BYTES_4: usize = 32;
@@ -76,7 +78,8 @@ pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<
     Ok(position_error)
 }
 
-/// Writes the header `head` and the arrays, compressed together by gzip (version 3).
+/// Writes an `.spz` file of version 3: the header `head` and the arrays of the Gaussians `state`, compressed together
+/// by gzip. Positions are stored in units of `unit`.
 fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> std::io::Result<()> {
     // Write no time stamp and no name into the gzip header, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(file, Compression::best());
@@ -86,8 +89,9 @@ fn write_gzip(head: &[u8], state: &Gaussians, unit: f64, file: impl Write) -> st
     out.get_mut().flush()
 }
 
-/// Writes the header, the table and each array as a zstd frame (version 4). `head` returns the first 16 bytes of the
-/// header for a version and a number of arrays.
+/// Writes an `.spz` file of version 4: the header, the table of sizes, and each array of the Gaussians `state` as a
+/// zstd frame. `head` returns the first 16 bytes of the header for a version and a number of arrays. Positions are
+/// stored in units of `unit`.
 fn write_streams(
     head: &dyn Fn(u32, usize) -> Vec<u8>,
     state: &Gaussians,
@@ -113,7 +117,8 @@ fn write_streams(
     file.flush()
 }
 
-/// Function that writes one array of the Gaussians; positions are stored in units of the second argument.
+/// Function that writes one array of the given Gaussians. The second argument is the unit in which positions are
+/// stored.
 type WriteArray = fn(&Gaussians, f64, &mut dyn Write) -> std::io::Result<()>;
 
 /// Writers of the arrays in the order of the file.
@@ -205,8 +210,8 @@ fn sh_byte(k: usize, value: f32) -> u8 {
     byte(nearest.floor() * step)
 }
 
-/// Encodes a unit quaternion xyzw in 32 bits: the index of its largest component, and the other three components. q and
-/// −q are the same rotation; the sign is chosen so that the omitted largest component is positive.
+/// Encodes a unit quaternion xyzw in 32 bits: the index of its largest component, and the values of the other three. q
+/// and −q are the same rotation; the sign is chosen so that the omitted largest component is positive.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);

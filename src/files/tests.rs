@@ -12,8 +12,9 @@ pub(super) fn gaussians_with_sh(count: usize, degree: usize) -> Gaussians {
     state
 }
 
-/// Asserts that multiplying the SH coefficients above degree 0 by `signs` reverses the axes with −1 in `axes`: each basis
-/// function then has the same value in a direction as the original one in the reversed direction.
+/// Asserts that `signs` are the factors of the SH coefficients above degree 0 that reverse the axes with −1 in `axes`:
+/// each SH basis function times its sign has the same value in a direction as the unchanged function in the reversed
+/// direction.
 pub(super) fn assert_signs_reverse_axes(signs: [f32; 15], axes: [f64; 3]) {
     let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
         [

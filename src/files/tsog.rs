@@ -1,7 +1,8 @@
 //! `.tsog` files, version 4 of the format (temporal SOG): moving Gaussians as lossless WebP images in a ZIP archive.
 //!
-//! The images and the members of `meta.json` of a [`.sog`](super::sog) file, and those of the table. Time t runs from 0 to
-//! 1. Sources: the encoder of xiaomi-research/tsog, and the playback profile of OpsiClear-4DGS/ftgs-player.
+//! An archive holds the images and the members of `meta.json` of a [`.sog`](super::sog) file, and also the members in
+//! the table. Time t runs from 0 to 1. Sources: the encoder of xiaomi-research/tsog, and the playback profile of
+//! OpsiClear-4DGS/ftgs-player.
 //!
 //! | member | content | value of the bytes R G B of its images |
 //! |---|---|---|
@@ -10,8 +11,8 @@
 //! | `temporal.means` | range of the velocity v, one or two images | v with 8 or 16 bits: position + v·(t − c) |
 //! | `profile`, `fps`, `playback` | version of the profile, frame rate and duration | |
 //!
-//! Without `timeline` the file is a still. The member `splatsieve`, which players ignore, maps the time of the player to
-//! the time of the sequence that was converted.
+//! Without `timeline` the file is a still. The member `splatsieve`, which players ignore, maps the time of the player
+//! to the time of the sequence that was converted.
 
 pub mod read;
 pub mod write;
@@ -34,16 +35,16 @@ const DEFAULT_FRAMES: usize = 300;
 pub enum Timeline {
     /// A still: every Gaussian is visible at every time and does not move.
     Still,
-    /// Each Gaussian is seen in one of the given number of frames only. [`StoredParams::format_specific`] holds the index of this
-    /// frame.
+    /// Each Gaussian is seen in a single frame of a sequence with the given number of frames.
+    /// [`StoredParams::format_specific`] holds the index of this frame.
     Frames(usize),
-    /// Linear motion in Gaussian windows of time. [`StoredParams::format_specific`] holds the parameters of
-    /// [`crate::files::ftgs`].
+    /// Each Gaussian moves linearly and is visible in a Gaussian window of time. [`StoredParams::format_specific`]
+    /// holds the parameters that [`crate::files::ftgs`] describes.
     Windows,
 }
 
 impl Timeline {
-    /// Returns the number of further parameters of a Gaussian, in [`StoredParams::format_specific`].
+    /// Returns the number of parameters per Gaussian in [`StoredParams::format_specific`].
     pub fn param_count(self) -> usize {
         match self {
             Timeline::Still => 0,
@@ -56,15 +57,15 @@ impl Timeline {
 /// Gaussians with their visibility over time, as players show them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TimedGaussians {
-    /// Stored parameters; what the further ones mean depends on `timeline`.
+    /// Stored parameters of the Gaussians. `timeline` determines the meaning of [`StoredParams::format_specific`].
     pub params: StoredParams,
-    /// Visibility over time.
+    /// Visibility of the Gaussians over time.
     pub timeline: Timeline,
-    /// Frames, and the mapping of their times to the range from 0 to 1.
+    /// Number and rate of the frames, and the mapping of their times to the range from 0 to 1.
     pub clip: ClipTimes,
 }
 
-/// Content of `meta.json`.
+/// Content of the file `meta.json` of an archive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct TsogMeta {
     #[serde(flatten)]
@@ -83,14 +84,15 @@ struct TsogMeta {
     splatsieve: Option<OriginalTimes>,
 }
 
-/// Playback profile that a file follows.
+/// Member `profile` of `meta.json`: the playback profile that the archive follows.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Profile {
     id: String,
     version: u64,
 }
 
-/// Images of the time windows (type 1) or of the frames (type 0) of the Gaussians.
+/// Member `timeline` of `meta.json`: names and value ranges of the two images of the time windows (type 1) or of the
+/// frames (type 0) of the Gaussians.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct TimelineEntry {
     #[serde(rename = "type")]
@@ -106,14 +108,15 @@ struct TimelineEntry {
     files: [String; 2],
 }
 
-/// Motion of the Gaussians.
+/// Member `temporal` of `meta.json`: the motion of the Gaussians.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Temporal {
     means: Velocity,
 }
 
-/// Images of the velocities: one with 8 bits per axis, or those of the low and high bytes of 16 bits.
+/// Member `temporal.means` of `meta.json`: range of the velocities, and the names of their images: one image with 8
+/// bits per axis, or two images with the low and the high bytes of 16 bits per axis.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Velocity {
@@ -122,7 +125,7 @@ struct Velocity {
     files: Vec<String>,
 }
 
-/// Settings of the player.
+/// Member `playback` of `meta.json`: settings of the player.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Playback {
     /// Duration in seconds.
@@ -132,13 +135,14 @@ struct Playback {
     fps: Option<f64>,
 }
 
-/// Times of the first and the last frame of the sequence that was converted.
+/// Member `splatsieve` of `meta.json`: times of the first and the last frame of the sequence that was converted.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct OriginalTimes {
     times: [f64; 2],
 }
 
-/// Returns the number of 16-bit codes that stand for one of `frames` frames.
+/// Returns the number of 16-bit codes that stand for the same frame if a sequence has `frames` frames: 65,536 /
+/// `frames`, rounded down.
 fn codes_per_frame(frames: usize) -> usize {
     (1 << 16) / frames.max(1)
 }

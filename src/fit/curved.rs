@@ -3,10 +3,11 @@
 //!
 //! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
 //! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … overlapping
-//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the visible time, and each width is three quarters of the spacing. The
-//! sum of such windows is 1 with an error of at most 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the
-//! opacity, add up where Gaussians overlap. So the depth of the Gaussian is distributed among the curves, by
-//! multiplicative updates that keep all depths positive (Richardson 1972, Lucy 1974).
+//! curves (linear motion: 2, 3, 4, 5, 7, 9 …, as it needs more of them). Their centers are evenly spaced over the
+//! visible time, and each width is three quarters of the spacing. The sum of such windows is 1 with an error of at most
+//! 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α), where α is the opacity, add up where Gaussians overlap. So the
+//! depth of the Gaussian is distributed among the curves, by multiplicative updates that keep all depths positive
+//! (Richardson 1972, Lucy 1974).
 
 use super::least_squares::polynomial;
 use super::{FitError, FittedTrack, MIN_VISIBLE_OPACITY, Tolerance};
@@ -50,7 +51,7 @@ pub struct CurveForm {
     is_linear: bool,
     /// Minimum width of the time window, in units of time.
     min_width: f64,
-    /// Maximum number of intervals between overlapping curves.
+    /// Maximum number of intervals between the centers of overlapping curves: the number of curves minus 1.
     max_intervals: usize,
 }
 
@@ -64,13 +65,14 @@ impl CurveForm {
         CurveForm { is_linear: true, min_width, max_intervals: 32 }
     }
 
-    /// Returns this form with at most `max_intervals` intervals between overlapping curves, one less than the number of
-    /// curves.
+    /// Returns this form with at most `max_intervals` intervals between the centers of overlapping curves, and so with
+    /// at most `max_intervals` + 1 curves.
     pub fn with_intervals(self, max_intervals: usize) -> CurveForm {
         CurveForm { max_intervals, ..self }
     }
 
-    /// Returns the numbers of intervals between overlapping curves that are tried, in this order.
+    /// Returns the numbers of intervals that are tried, in this order. An interval lies between the centers of
+    /// neighboring overlapping curves, so n intervals take n + 1 curves.
     fn intervals(self) -> &'static [usize] {
         if self.is_linear { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
     }
@@ -145,8 +147,9 @@ fn constant_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
 }
 
 /// Returns one curve whose logarithm of opacity is the parabola that fits the visible frames best, weighted by squared
-/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does not
-/// open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is long.
+/// opacity. It is exact for a time window of which only a part lies within the sequence. `None` if the parabola does
+/// not open downward, exceeds [`MAX_OPACITY`], or has its vertex further outside the sequence than the sequence is
+/// long.
 fn fading_curve(track: &FittedTrack, form: CurveForm) -> Option<CubicTrack> {
     let (first, last) = (track.times[0], track.times[track.len() - 1]);
     let (middle, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
@@ -191,7 +194,8 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves for the visible time from `start` to `end`.
+/// Returns `count` + 1 overlapping curves. Their centers are evenly spaced over the time from `start` to `end`, in
+/// which the Gaussian is visible.
 fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
@@ -235,8 +239,9 @@ fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// Returns a curve that follows the position and rotation of `track` by least squares; `weight` is multiplied by the
-/// opacity of a frame. The returned opacity is 0.
+/// Returns a curve that follows the position and rotation of `track` by least squares. The weight of a frame is its
+/// opacity times `weight(frame)`. Scales and SH coefficients are weighted means. The opacity of the curve is left at 0,
+/// for the caller to set.
 fn fit_motion(
     track: &FittedTrack,
     form: CurveForm,
@@ -277,8 +282,9 @@ fn fit_motion(
     }
 }
 
-/// Returns the largest error of `curves` in units of `tolerance`, and the errors over all visible frames. Where several
-/// curves are visible, each must be close to the Gaussian, in proportion to its share of the optical depth.
+/// Returns the largest error of `curves` relative to `tolerance` (1 means just within it; infinite if an error is NaN),
+/// and the errors over all visible frames. Where several curves are visible, each must be close to the Gaussian, in
+/// proportion to its share of the optical depth.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
     let (mut worst, mut misfit) = (0.0f64, FitError::default());
     for frame in 0..track.len() {

@@ -17,18 +17,21 @@ pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 /// Maximum error of a fit at every frame in which the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Maximum distance between positions, in units of the Gaussian's middle scale (of three).
+    /// Maximum distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale
+    /// (of three).
     pub position: f64,
-    /// Maximum angle between rotations, radians. Ignored for a nearly round Gaussian, whose log scales all differ by
-    /// less than 0.1.
+    /// Maximum angle between the rotations of the fit and of the Gaussian, radians. Ignored for a nearly round
+    /// Gaussian, whose log scales all differ by less than 0.1.
     pub rotation: f64,
-    /// Maximum difference of log scales (natural logarithms).
+    /// Maximum difference between the log scales (natural logarithms) of the fit and of the Gaussian.
     pub log_scale: f64,
-    /// Maximum difference of opacities, which are in [0, 1].
+    /// Maximum difference between the opacities, in [0, 1], of the fit and of the Gaussian.
     pub opacity: f64,
-    /// Maximum difference of SH coefficients.
+    /// Maximum difference between the SH coefficients of the fit and of the Gaussian.
     pub sh: f64,
-    /// Opacity below which a Gaussian may be further off, in inverse proportion to its opacity; 0 for no such Gaussians.
+    /// Opacity from which on all tolerances hold as given; 0 if they hold for every Gaussian. For a Gaussian of a lower
+    /// opacity α, all of them but the tolerance of opacity are larger by the factor `full_opacity`/α. Used by
+    /// [`curved`] only.
     pub full_opacity: f64,
 }
 
@@ -37,7 +40,8 @@ impl Tolerance {
     pub const COMPACT: Tolerance =
         Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
 
-    /// Returns the weight, at most 1, of errors of a Gaussian of opacity `opacity`.
+    /// Returns the factor, at most 1, by which errors of a Gaussian of opacity `opacity` (except errors of the opacity)
+    /// are multiplied before they are compared with the tolerances.
     fn weight(&self, opacity: f64) -> f64 {
         if opacity < self.full_opacity { opacity / self.full_opacity } else { 1.0 }
     }
@@ -50,32 +54,35 @@ impl Default for Tolerance {
     }
 }
 
-/// Errors beyond which a fitted Gaussian is far off: of its position, in units of its middle scale, and of its opacity.
+/// Errors beyond which a fitted Gaussian counts as far off: the error of its position, in units of its middle scale,
+/// and the error of its opacity.
 const FAR: [f64; 2] = [1.0, 0.1];
 
-/// Error of fits, over all Gaussians and the frames in which they are visible.
+/// Error of fitted curves or pieces against the Gaussians, over all Gaussians and the frames in which they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct FitError {
     /// Number of compared states (Gaussians × visible frames).
     pub states: u64,
-    /// Sum of squared distances between positions, in units of the Gaussian's middle scale squared.
+    /// Sum, over all compared states, of the squared distance between the positions of the fit and of the Gaussian, in
+    /// units of the Gaussian's middle scale squared.
     squares: f64,
     /// Sum, over all compared states, of the squared difference between the opacity of the fit and that of the
     /// Gaussian.
     opacity_squares: f64,
-    /// Sum of the opacities of the Gaussians.
+    /// Sum of the Gaussian's opacity over all compared states.
     visible: f64,
-    /// Sum of the opacities of the Gaussians that are off by more than [`FAR`].
+    /// Sum of the Gaussian's opacity over the compared states in which the fit is off by more than [`FAR`].
     far: f64,
-    /// Largest distance between positions, in units of the Gaussian's middle scale.
+    /// Largest distance between the positions of the fit and of the Gaussian, in units of the Gaussian's middle scale.
     pub position: f64,
-    /// Largest difference between the opacities of fit and Gaussian.
+    /// Largest difference between the opacities of the fit and of the Gaussian.
     pub opacity: f64,
 }
 
 impl FitError {
-    /// Adds the errors of one Gaussian of opacity `visible` at one frame: of its position, in units of its middle scale,
-    /// and of its opacity.
+    /// Adds the errors of one Gaussian at one frame. `position` is the error of its position, in units of its middle
+    /// scale; `opacity` is the error of its opacity; `visible` is its opacity, the weight in
+    /// [`FitError::far_off_fraction`].
     pub(crate) fn add(&mut self, position: f64, opacity: f64, visible: f64) {
         self.visible += visible;
         self.far += if position > FAR[0] || opacity.abs() > FAR[1] { visible } else { 0.0 };
@@ -100,18 +107,21 @@ impl FitError {
         }
     }
 
-    /// Returns the root mean square distance between positions, in units of the Gaussian's middle scale.
+    /// Returns the root mean square distance between the positions of the fit and of the Gaussian, over all compared
+    /// states, in units of the Gaussian's middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
     }
 
-    /// Returns the fraction of the visible states, weighted by their opacity, that are off by more than the middle scale
-    /// or by more than 0.1 of opacity. Unlike the other errors, this one hardly counts Gaussians that are hardly seen.
+    /// Returns the fraction of the compared states, weighted by their opacity, in which the fit is far off: by more
+    /// than the middle scale in position, or by more than 0.1 in opacity. Unlike the other errors, this one hardly
+    /// counts Gaussians that are hardly seen.
     pub fn far_off_fraction(&self) -> f64 {
         self.far / self.visible.max(f64::MIN_POSITIVE)
     }
 
-    /// Returns the root mean square difference between the opacities of fit and Gaussian.
+    /// Returns the root mean square difference between the opacities of the fit and of the Gaussian, over all compared
+    /// states.
     pub fn opacity_rms(&self) -> f64 {
         (self.opacity_squares / self.states.max(1) as f64).sqrt()
     }

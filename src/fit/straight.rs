@@ -10,7 +10,7 @@ use super::{FitError, FittedTrack, Tolerance};
 pub struct LinearPiece {
     /// Frames in which the piece represents the Gaussian.
     pub frames: Range<usize>,
-    /// Middle of the piece, the time at which the Gaussian is at `position`.
+    /// Time in the middle of the piece, at which the Gaussian is at `position`.
     pub at: f64,
     /// Position at the time `at`, in scene units.
     pub position: [f64; 3],

@@ -23,7 +23,7 @@ pub struct FittedTrack {
 }
 
 impl FittedTrack {
-    /// Returns the track of Gaussian `row`. `states`: all Gaussians at each of the `times`.
+    /// Returns the track of the Gaussian in row `row` of `states`. `states` holds all Gaussians at each of the `times`.
     pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];

@@ -1,4 +1,4 @@
-//! Storage of summaries in cache entries (files with the result of a stage).
+//! Storage of summaries of stages in cache entries (files with the result of a stage).
 
 use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;
@@ -36,7 +36,8 @@ mod tests {
         postcard::from_bytes::<AsToml<T>>(&postcard::to_stdvec(&AsToml(value)).unwrap()).unwrap().0
     }
 
-    /// Checks that `value` is unchanged after storage. Compares texts, because NaN is not equal to itself.
+    /// Checks that `value` is unchanged after it was stored and read. Compares texts, because NaN is not equal to
+    /// itself.
     fn same<T: Serialize + DeserializeOwned + Clone + std::fmt::Debug>(value: &T) {
         assert_eq!(format!("{:?}", kept(value.clone())), format!("{value:?}"));
     }

@@ -1,5 +1,5 @@
-//! Journal of a run: its stages with their time, memory and reads, omitted stages with reasons, and notes. Code adds an
-//! entry at the place where the work happens.
+//! Journal of a run: its stages with their time, memory and reads, omitted stages with reasons, and notes. An entry is
+//! added where the work is done.
 
 pub(crate) mod as_toml;
 pub mod records;
@@ -54,8 +54,8 @@ fn processor_seconds() -> Option<f64> {
 /// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Amounts read when every frame of the input is read once (one full read). Reads of stages are reported in this
-    /// unit.
+    /// Amounts that one full read takes: every frame of the input is read once. Reads of stages are reported as
+    /// multiples of it.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -64,19 +64,20 @@ pub struct Journal {
     pub left_out: Vec<LeftOut>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Measured effect on renders of writing the deformation field in half precision.
+    /// Measured effect on renders of writing the deformation field in half precision, if it was measured.
     pub field: Option<FieldSummary>,
-    /// Measured effect on renders of dropping SH degrees.
+    /// Measured effect on renders of dropping SH degrees, if it was measured.
     pub bands: Option<ShDegreeSummary>,
-    /// PSNR before and after refinement.
+    /// PSNR before and after refinement, if the run refined.
     pub refined: Option<RefinedSummary>,
-    /// Forecast of time and memory that was made before the run, if there was one.
+    /// Forecast of time and memory, if one was made before the run.
     pub forecast: Option<Forecast>,
 }
 
 impl Journal {
-    /// Runs `work` as a stage and records its time, memory and reads of `source`. `work` returns its result and the
-    /// number of Gaussians after the stage; the result is returned.
+    /// Runs `work` as the stage `name` and records its time, memory, and reads of `source`. `gaussians_in` is the
+    /// number of Gaussians before the stage. `work` returns its result and the number of Gaussians after the stage.
+    /// Returns the result.
     ///
     /// # Errors
     /// Fails if `work` fails; the stage is not recorded then.
@@ -94,12 +95,13 @@ impl Journal {
         Ok(value)
     }
 
-    /// Runs a stage that cannot be divided among processes, like [`Journal::run_stage`], or returns its result from the
-    /// cache. The result is stored under `key` in the work folder of the scene.
+    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage like
+    /// [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be divided among
+    /// processes.
     ///
     /// # Errors
-    /// Fails if `compute` fails, or if the cache cannot be read or written. A run that computes only one shard (part
-    /// of a divided stage) ends here with an error.
+    /// Fails if `compute` fails, or if the cache cannot be read or written. A run that computes only one shard (part of
+    /// a divided stage) ends here with an error.
     pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,
@@ -114,16 +116,17 @@ impl Journal {
         })
     }
 
-    /// Returns the mean PSNR of the result against the original on validation views (used to choose, not to fit), dB,
-    /// from the last stage that measured it; `None` if no stage did.
+    /// Returns the mean PSNR of the result against the original on validation views (used to choose, not to fit), dB.
+    /// The value is from the last stage that measured it; `None` if no stage did.
     pub fn result_psnr(&self) -> Option<f64> {
         let bands = self.bands.as_ref().map(|bands| bands.result);
         let field = self.field.as_ref().and_then(|field| field.result);
         bands.or(field).or(self.refined.map(|refined| refined.result))
     }
 
-    /// Returns the result of `stage` for `key` from the cache, or computes it. Also adds the entries that `compute`
-    /// makes in a journal to this journal; they are cached with the result.
+    /// Returns the result of `stage` for `key` from the cache `work`, or computes and stores it. `compute` records its
+    /// stages and notes in a journal of its own. They are stored with the result and added to this journal, also when
+    /// the result comes from the cache.
     ///
     /// # Errors
     /// Fails if `compute` fails or the cache cannot be used.
@@ -154,7 +157,7 @@ impl Journal {
         Ok(found)
     }
 
-    /// Records the opening of the input as stage `name`, which began at `start`, found `gaussians` Gaussians and read
+    /// Records the opening of the input as the stage `name`. It began at `start`, found `gaussians` Gaussians and read
     /// the amounts `reads`.
     pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
@@ -165,7 +168,7 @@ impl Journal {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
     }
 
-    /// Adds an entry for the omitted work `what` with the reason `why` and the cost `saved` by omitting it.
+    /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost `saved`.
     pub fn record_saving(&mut self, what: impl Into<String>, why: impl Into<String>, saved: SavedCost) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }

@@ -18,12 +18,12 @@ pub struct StageRecord {
     pub gaussians_out: usize,
     /// Amounts read from the input, counted by the code that reads.
     pub reads: Reads,
-    /// Amount read from the input, divided by the amount of reading every frame once; in bytes if the input is stored
-    /// in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
+    /// Amount read from the input, as a multiple of one full read (every frame once). It is measured in bytes if the
+    /// input is stored in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
     pub full_reads: f64,
     /// Number of bytes read back from scratch files, which are not part of the input.
     pub scratch_bytes: u64,
-    /// Whether the result came from the cache. Times and reads are then those of the run that computed it.
+    /// Whether the result came from the cache. If so, times and reads are from the run that computed it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     #[serde(rename = "kept")]
     pub from_cache: bool,
@@ -48,20 +48,20 @@ pub struct LeftOut {
     pub saved: Option<SavedCost>,
 }
 
-/// Cost that was saved by omitting work.
+/// Cost that was saved because work was omitted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SavedCost {
     /// Estimated cost of a whole stage.
     Stage {
-        /// Wall-clock time when all threads are busy, seconds.
+        /// Estimated wall-clock time of the stage when all threads are busy, seconds.
         seconds: f64,
-        /// Maximum amount read, in full reads (every frame of the input once).
+        /// Maximum amount that the stage would have read, in full reads (every frame of the input once).
         reads: f64,
     },
     /// Values of attributes that are the same in every frame and were therefore not read again.
     Values {
-        /// Number of bytes that were not read.
+        /// Number of bytes of the values that were not read again.
         bytes: u64,
     },
 }
@@ -86,7 +86,8 @@ impl LeftOut {
     }
 }
 
-/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. The number null becomes NaN.
+/// Deserializes pairs of an integer and a number, such as number of Gaussians and PSNR. null becomes NaN in the place
+/// of the number.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
@@ -109,13 +110,13 @@ pub struct FieldSummary {
     pub rounding: f64,
     /// Mean PSNR of renders with the exact field compared with the original, dB; `None` if the choice did not need it.
     pub result: Option<f64>,
-    /// Value that `rounding` must reach for half precision to be used, dB.
+    /// Minimum value of `rounding` for which half precision is used, dB.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
 
 impl FieldSummary {
-    /// Returns, as text, the measured values that explain why the field is or is not written in half precision.
+    /// Returns a text with the measured values that explain why the field is or is not written in half precision.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
         let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
@@ -129,15 +130,15 @@ impl FieldSummary {
     }
 }
 
-/// PSNR before and after refinement, on validation views.
+/// PSNR before and after refinement, measured on validation views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RefinedSummary {
     /// Number of validation views, which are used to choose the best state but not to fit.
     pub pictures: usize,
-    /// Mean PSNR against renders of the original before refinement, dB.
+    /// Mean PSNR before refinement, against renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub before: f64,
-    /// Mean PSNR against renders of the original after refinement, dB.
+    /// Mean PSNR after refinement, against renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
 }
@@ -156,7 +157,8 @@ pub enum ViewKind {
     Virtual,
 }
 
-/// Median time of rendering one view on one thread, milliseconds, without the evaluation of the deformation field.
+/// Time of rendering one view on one thread, milliseconds: median over views, without the evaluation of the deformation
+/// field.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RenderTime {
     /// Render time of the original, milliseconds.
@@ -168,14 +170,15 @@ pub struct RenderTime {
 /// Quality of renders of the result compared with renders of the original.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct QualitySummary {
-    /// Kind of the views.
+    /// Kind of the views on which the quality was measured.
     pub kind: ViewKind,
-    /// Number of views.
+    /// Number of views on which the quality was measured.
     pub views: usize,
-    /// Mean PSNR, dB.
+    /// Mean PSNR of renders of the result against renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub psnr: f64,
-    /// Mean SSIM; `None` where only the PSNR on validation views is known.
+    /// Mean SSIM of renders of the result against renders of the original; `None` if only the PSNR on validation views
+    /// is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
     /// Render times of the original and the result, if measured.
@@ -197,13 +200,13 @@ pub struct ShDegreeSummary {
     /// Mean PSNR of renders with all SH degrees compared with renders of the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
-    /// Value that the PSNR of a lower degree in `tried` had to reach for this degree to be used, dB.
+    /// PSNR, dB, below which an SH degree in `tried` was rejected.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
 
 impl ShDegreeSummary {
-    /// Returns, as text, the measured values that explain the SH degree of the output.
+    /// Returns a text with the measured values that explain the SH degree of the output.
     pub(crate) fn why(&self) -> String {
         let ShDegreeSummary { pictures, tried, result, least, .. } = self;
         let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
@@ -217,7 +220,7 @@ impl ShDegreeSummary {
     }
 }
 
-/// Estimated value with its lower and upper bound.
+/// Estimate of a quantity: its expected value, with a lower and an upper bound.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EstimateRange {
     /// Lower bound; smaller values are unlikely.
@@ -257,15 +260,17 @@ pub struct Forecast {
 /// Percentiles, over all Gaussians, of one term of the score by which Gaussians are ranked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::ScoredQuantity::name).
+    /// Name of the term of the score, as returned by
+    /// [`Quantity::name`](crate::statistics::score::ScoredQuantity::name).
     pub name: String,
-    /// Value that 1% of the Gaussians do not exceed.
+    /// First percentile: value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p1: f64,
-    /// Value that 99% of the Gaussians do not exceed.
+    /// 99th percentile: value that 99% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
-    /// Whether the two percentiles differ. If they are equal, the term only tells Gaussians above them from the others.
+    /// Whether the two percentiles differ. If they are equal, the term only separates Gaussians with values above the
+    /// percentiles from all others.
     pub active: bool,
 }
 

@@ -1,5 +1,7 @@
 //! Properties of an input from which memory and time are estimated, and the measured time of common operations.
 
+use std::num::NonZeroU32;
+
 use crate::files::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::{Attributes, Camera, Rig, SequenceInfo, ViewSchedule};
@@ -137,8 +139,8 @@ impl Workload {
     }
 
     /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. If the
-    /// smaller of `max_kept_frames` and the frame block of the input is at most 1, it keeps none; otherwise it keeps two
-    /// more than this number.
+    /// smaller of `max_kept_frames` and the frame block of the input is at most 1, it keeps none; otherwise it keeps
+    /// two more than this number.
     pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -212,9 +214,9 @@ impl Workload {
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
-    /// Returns the maximum amount that is read for `frames` evenly spread frames, as a multiple (or fraction) of the whole
-    /// input. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only some of its
-    /// frames.
+    /// Returns the maximum amount that is read for `frames` evenly spread frames, as a multiple (or fraction) of the
+    /// whole input. Tiles are read as a whole. A tile is read several times if the memory limit lets readers keep only
+    /// some of its frames.
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -226,8 +228,8 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns [`Workload::full_reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians of
-    /// two blocks is read for each of the two.
+    /// Returns [`Workload::full_reads`] for Gaussians with arbitrary ids that are read in blocks. A tile with Gaussians
+    /// of two blocks is read for each of the two.
     pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
@@ -242,6 +244,11 @@ impl Workload {
         RenderCost { gaussian, pixel, pace }: RenderCost,
     ) -> f64 {
         pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+    }
+
+    /// Returns this workload if only every `stride`-th pixel of a view in each direction is rendered.
+    pub fn on_grid(&self, stride: NonZeroU32) -> Workload {
+        Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
     }
 
     /// Returns the time in seconds on one processor core for reading `gaussians` Gaussians at `frames` frames.
@@ -279,7 +286,8 @@ impl Workload {
 pub struct Throughput {
     /// Time for reading Gaussians at a frame and processing them, as a multiple of the assumed time.
     pub states: f64,
-    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that [`CONTRIBUTION_COST`] assumes.
+    /// Time for finding the contributions of the Gaussians to a view, as a multiple of the time that
+    /// [`CONTRIBUTION_COST`] assumes.
     pub contribution_time: f64,
     /// Time for finding removal errors in a view, as a multiple of the time that [`REMOVAL_COST`] assumes.
     pub removal_time: f64,
@@ -306,9 +314,9 @@ pub struct RenderCost {
     pace: fn(&Throughput) -> f64,
 }
 
-/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view. [`CONTRIBUTION_COST`],
-/// [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models; `scripts/estimate.py` compares estimated with
-/// measured times.
+/// Time of one view for finding the contribution (Σ alpha · transmittance) of every Gaussian to a view.
+/// [`CONTRIBUTION_COST`], [`REMOVAL_COST`] and [`RENDER_COST`] are fitted to runs on three trained models;
+/// `scripts/estimate.py` compares estimated with measured times.
 pub const CONTRIBUTION_COST: RenderCost =
     RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.contribution_time };
 /// Time for finding the removal error of every Gaussian in a view: the squared error that removing it alone would

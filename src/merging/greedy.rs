@@ -26,7 +26,7 @@ pub struct Clustering {
     pub leader_of: Vec<u32>,
     /// Number of nodes that joined another node, which is their leader.
     pub joins: usize,
-    /// Number of parallel rounds that were run.
+    /// Number of parallel rounds in which nodes were assigned to leaders.
     pub rounds: usize,
     /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
     pub sequential: bool,

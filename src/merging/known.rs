@@ -15,8 +15,8 @@ pub type PairSimilarity = (u32, u32, f64);
 pub struct SimilarityCache(Vec<PairSimilarity>);
 
 impl SimilarityCache {
-    /// Returns those of `pairs` whose similarity is not known yet, without duplicates. Each has its smaller row first;
-    /// the pairs are sorted.
+    /// Returns the pairs in `pairs` whose similarity is not known yet, sorted and without duplicates. Each returned
+    /// pair has its smaller row first.
     pub fn missing(&self, pairs: impl ExactSizeIterator<Item = (u32, u32)>) -> Vec<(u32, u32)> {
         let mut missing = Vec::with_capacity(pairs.len());
         missing.extend(pairs.map(|(a, b)| (a.min(b), a.max(b))).filter(|&pair| self.position(pair).is_err()));

@@ -68,8 +68,8 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all their
-    /// proxies together, on all threads.
+    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all
+    /// proxies among them together, on all threads.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
@@ -108,10 +108,10 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every selected Gaussian, the row in `ids` of its own id.
+    /// For every selected Gaussian, the index in `ids` of its own id (that of its leader if it is a proxy).
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
-    /// For every member of every proxy, its row in `ids` and its weight; one proxy after the other.
+    /// For every member of every proxy, the index of its id in `ids`, and its weight; one proxy after the other.
     members: Vec<(u32, f64)>,
 }
 

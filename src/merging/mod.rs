@@ -43,8 +43,8 @@ use proxy::Importance;
 use tree::TreePoint;
 
 /// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. Groups take 12
-/// before the pass and 12 after it, the row of the state 4, the rank 4. The last term is the largest of three that are
-/// not needed at once: neighbor index (46), coincident nodes (24), and clustering (24).
+/// bytes before the pass and 12 after it, the row of the state 4, the rank 4. The last term is the largest of three
+/// that are not needed at once: neighbor index (46), coincident nodes (24), and clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
@@ -90,7 +90,8 @@ pub struct RequestedPairs<'a> {
 }
 
 impl<'a> RequestedPairs<'a> {
-    /// Returns each pair as two rows of [`Survivors::states`], those of the leaders if the nodes are groups.
+    /// Returns each pair as two rows of [`Survivors::states`]. For a node that is a merged group, the row is that of
+    /// its leader.
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
     }
@@ -267,10 +268,10 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Finds sets of coincident nodes: nodes that are equal in every attribute that `gates` compare, and that pass these
-/// tests. Calls `take` with the pairs (leader, member) of each set. The leader is the first node of the set in rank;
-/// all others are its members, however many. Pairs are ordered by leader, and each call gets at most `max_batch` (at
-/// least 1).
+/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 (`gates`) compare, and
+/// that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the set
+/// that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call of
+/// `take` gets at most `max_batch` pairs (at least 1).
 ///
 /// This step is needed because the neighbor search returns a fixed number of nearest Gaussians. If more Gaussians than
 /// that coincide, all neighbors of each are in the same set, so the set would neither merge into one nor reach the

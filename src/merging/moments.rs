@@ -122,9 +122,9 @@ fn unit_from_axes(frame: &DMat3) -> DQuat {
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
-/// Returns the same ellipsoid with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of
-/// the 24 rotations that map axes to axes, the one with the largest |⟨q, reference⟩| is taken, the first one on a tie.
-/// The quaternion q gets the sign nearest to `reference`.
+/// Returns `ellipsoid` with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of the 24
+/// rotations that map axes to axes, the one with the largest |⟨q, reference⟩| is taken, the first one on a tie. The
+/// quaternion q gets the sign nearest to `reference`.
 ///
 /// A deformation field adds its deltas axis by axis, so the axes of a proxy must be in the same order as those of its
 /// leader.

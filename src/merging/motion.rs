@@ -22,15 +22,15 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 /// frames, whatever the time between them, because the noise level they are compared with is also one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean cosine a·b/(‖a‖‖b‖ + 1e-8) of the velocities a and b; a step in which one of them is zero counts as 0. The
-    /// mean is over all frames in which both are alive (`MotionParams::Literal`), or only over the steps that also
-    /// begin in such a frame (`MotionParams::Runs`).
+    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; 0
+    /// counts for a step in which one of them is zero. The mean is over all frames in which both are alive
+    /// (`MotionParams::Literal`), or only over the steps that also begin in such a frame (`MotionParams::Runs`).
     pub cosine: f64,
-    /// Σ a·b of the velocities a and b over the steps, in squared scene units.
+    /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub dot: f64,
-    /// Σ ‖a‖² + ‖b‖² of the velocities a and b over the steps, in squared scene units.
+    /// Σ ‖a‖² + ‖b‖² over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub squares: f64,
-    /// Number n of steps in the sums.
+    /// Number n of steps (from one frame to the next) in the sums `dot` and `squares`.
     pub steps: u32,
     /// Number of frames in which both Gaussians are alive.
     pub common: u32,
@@ -44,17 +44,17 @@ pub struct PairMeasure {
 impl PairMeasure {
     /// Returns the alignment of the velocities a and b, A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]. It is 1
     /// for two static Gaussians, the cosine for equally fast ones, and small if one is ten times as fast as the other.
-    /// Without any of the n steps, or without motion at σ = 0, A is 1.
+    /// A is 1 if there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
     ///
-    /// `noise`: noise level σ of a step, in scene units.
+    /// `noise` is σ, the noise level of a step in scene units.
     pub fn alignment(&self, noise: f64) -> f64 {
         let floor = 2.0 * f64::from(self.steps) * noise * noise;
         let denominator = self.squares + floor;
         if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
     }
 
-    /// Returns in which fraction of the frames with at least one Gaussian alive only one is alive; 1 if neither is ever
-    /// alive.
+    /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
+    /// least one is. Returns 1 if neither is ever alive.
     pub fn one_alive_fraction(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
@@ -98,7 +98,7 @@ impl MotionThresholds {
 }
 
 /// Position of a node (Gaussian or merged group) at the present, the previous and the reference frame, and whether it
-/// is alive at the first two.
+/// is alive in the present and in the previous frame.
 #[derive(Debug, Clone, Copy)]
 struct NodeTrack {
     reference: [f32; 3],
@@ -120,7 +120,7 @@ struct NodePair {
     drift_squared: f64,
 }
 
-/// Measures the motion of pairs of nodes (Gaussians or merged groups) over frames that arrive in order.
+/// Measurement of the motion of pairs of nodes (Gaussians or merged groups), to which the frames are added in order.
 #[derive(Debug)]
 pub struct PairMotion {
     motion: MotionParams,
@@ -130,9 +130,9 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts to measure `pairs` of the N nodes. `reference`: position of each node at the reference frame. `motion`:
-    /// with `Literal` all steps count that end in a frame in which both nodes are alive, with `Runs` only those that
-    /// also begin in such a frame.
+    /// Starts the measurement of `pairs`, each given as the indices of two nodes. `reference` yields the position of
+    /// every node at the reference frame. With the `motion` `Literal`, all steps count that end in a frame in which
+    /// both nodes are alive; with `Runs`, only those that also begin in such a frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -158,7 +158,7 @@ impl PairMotion {
         }
     }
 
-    /// Adds the next frame. `state` returns for the index of a node its position and whether it is alive.
+    /// Adds the next frame. `state` gets the index of a node, and returns its position and whether it is alive.
     pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);

@@ -34,14 +34,15 @@ pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
 
-/// Measures the motion similarity of pairs of Gaussians of a source.
+/// Measurement of the motion similarity of pairs of Gaussians of a source: settings, and the trajectories gathered so
+/// far.
 pub struct PairMeter<'a> {
     /// Source from which the trajectories are read.
     pub source: &'a dyn FrameSource,
     /// Scan parameters. Used are `alpha_min`, the opacity from which a Gaussian is alive, and `motion`, which defines
     /// the steps between frames that count as motion.
     pub scan: &'a recipe::ScanParams,
-    /// Thresholds of test 3 (motion).
+    /// Thresholds of test 3 (motion) of merging.
     pub gate: MotionThresholds,
     /// Number of consecutive frames that a reader keeps in memory; trajectories are gathered this many frames at a
     /// time.
@@ -57,9 +58,9 @@ pub struct PairMeter<'a> {
 /// Trajectories of Gaussians in a scratch file, in voxel order: Gaussians close in space are close in the file.
 pub struct GatheredTrajectories {
     trajectories: Trajectories,
-    /// For every place in the file, the row of its Gaussian.
+    /// For every place (index of a trajectory in the file), the row of its Gaussian in the list of ids.
     order: Vec<u32>,
-    /// For every row, the place of its Gaussian in the file.
+    /// For every row of the list of ids, the place of its Gaussian (index of its trajectory in the file).
     place: Vec<u32>,
 }
 
@@ -72,7 +73,8 @@ impl PairMeter<'_> {
     /// Measures the motion similarity of each of `pairs` and returns it with its pair, in any order. The pairs are rows
     /// of `ids`, which increase. `reference` `[3, M]` holds the positions of `ids` at the reference frame, where the
     /// two Gaussians of a pair are at most about `reach` apart. `ids` and `reference` must be the same in every call.
-    /// `is_part`: whether pairs are also requested in other calls, so that gathering the trajectories pays.
+    /// `is_part` is true if pairs are also requested in other calls, so that gathering the trajectories in a file saves
+    /// time.
     ///
     /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
     /// With gathered trajectories also 8 bytes for each of `ids`; while gathering, 12 more and the values of the frames
@@ -168,7 +170,8 @@ fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     members
 }
 
-/// Returns each pair as two indices into the sorted list `members`.
+/// Converts each pair of `pairs`, given as two values that occur in the sorted list `members`, to the indices of these
+/// values in the list.
 fn local_indices<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
     let place = |member: u32| members.binary_search(&member).unwrap_or_default() as u32;
     pairs.iter().map(move |&(a, b)| (place(a), place(b)))

@@ -106,7 +106,7 @@ impl PointIndex {
 
 /// Returns the hash of the voxel with Morton code `number`. The eight voxels of a 2×2×2 cube follow one another in the
 /// table, so that the 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the
-/// highest bits first, so these differ within a cube too.
+/// highest bits of hashes first, so these bits are made different within a cube too.
 fn hash(number: u64) -> u64 {
     let corner = number & 7;
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
@@ -117,8 +117,8 @@ fn hash(number: u64) -> u64 {
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
     last_voxel: Option<[u32; 3]>,
-    /// Voxels with points among the last queried voxel and the 26 around it, each with its step along the three axes,
-    /// encoded as in [`STEPS`].
+    /// Voxels that contain points, out of the last queried voxel and the 26 around it. Each has the step along the
+    /// three axes that leads to it, encoded as in [`STEPS`].
     around: Vec<([u8; 3], Occupied)>,
     nearest: NearestPoints,
 }
@@ -176,9 +176,9 @@ impl NeighborSearch<'_> {
     }
 }
 
-/// Steps from a voxel to itself and to the 26 around it, one per axis: 0 stays, 1 goes down, 2 goes up. The voxel
-/// itself comes first, then those that share a side, an edge and a corner. Near voxels come first so that more of the
-/// far ones can be skipped.
+/// Steps from a voxel to itself and to the 26 voxels around it. A step has one number per axis: 0 stays, 1 goes down, 2
+/// goes up. The voxel itself comes first, then those that share a side, an edge and a corner. Near voxels come first so
+/// that more of the far ones can be skipped.
 const STEPS: [[u8; 3]; 27] = {
     let mut steps = [[0; 3]; 27];
     let (mut filled, mut moved) = (0, 0);

@@ -32,7 +32,8 @@ pub(crate) type TrajectorySample = [f32; 4];
 /// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum distance in the file between two requested Gaussians that are read in one go, with those between them.
+/// Maximum distance between two requested Gaussians that are read in one go together with the Gaussians between them,
+/// as a number of Gaussians in the file.
 const GAP: u32 = 32;
 /// Maximum number of Gaussians that are read in one go.
 const RUN: u32 = 2048;
@@ -141,8 +142,9 @@ fn value_range(columns: Attributes) -> Range<usize> {
     start..if columns.contains(Attributes::OPACITY) { 4 } else { 3 }
 }
 
-/// Reads the attributes `columns` of Gaussians at `frames` into `values`, with layout `[N, frames, W]` in the order of
-/// place. `places`: pairs (id, place), sorted by id.
+/// Reads the attributes `columns`, W values in all, of N Gaussians at `frames` into `values`, laid out as `[N, frames,
+/// W]` with the Gaussians in the order of their places. `places` holds the pairs (id, place) of the Gaussians, sorted
+/// by id.
 fn read_frames(
     source: &dyn FrameSource,
     places: &[(u32, u32)],

@@ -49,7 +49,7 @@ impl NearestPoints {
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 
-    /// Adds those of `points` that are nearer than the worst candidate found so far.
+    /// Adds every point in `points` that is nearer than the worst candidate found so far.
     pub fn add_points(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
@@ -106,8 +106,8 @@ impl Tree {
         Tree { nodes, depth }
     }
 
-    /// Adds to `nearest` those of `points` that belong there, skipping subtrees that are too far away. `points` must be
-    /// in the order that [`Tree::new`] gave them.
+    /// Adds to `nearest` the points in `points` that are among the nearest, and skips subtrees that are too far away.
+    /// `points` must be in the order that [`Tree::new`] gave them.
     pub fn search(&self, points: &[TreePoint], nearest: &mut NearestPoints) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }

@@ -9,7 +9,8 @@ use crate::files::container::Container;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, TimeOrigin};
 use crate::source::FrameSource;
 
-/// Container that stores the state of every Gaussian at every frame (`.gseq`).
+/// Model format of containers of frames (`.gseq`), which store the state of every Gaussian at every frame: recognizes
+/// and opens a file.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {

@@ -9,11 +9,12 @@ use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
 use crate::models::input_model::ModelFormat;
 
-/// Advice in every message, since it works for models of any renderer.
+/// Advice at the end of every error message of this module. It works for models of any renderer.
 const ADVICE: &str = "export its frames with its own renderer, either as PLY files (one per frame, with the same \
                       Gaussians in the same order) or as a frame stream, and give those";
 
-/// Checkpoint of an unsupported trainer, or a folder that contains one.
+/// Entry for checkpoints of unsupported trainers and for folders that contain one: recognizes them, and refuses to open
+/// them with an error that says how to convert the model.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => describe_folder(found.path).is_some(),
@@ -62,8 +63,8 @@ fn describe_checkpoint(path: &Path, memory: ReadLimit) -> crate::error::Result<&
     })
 }
 
-/// Iterates over the names of tensors in the root of the checkpoint, if it is a dictionary, and in dictionaries
-/// directly below it.
+/// Returns an iterator over the names of tensors in the root of the checkpoint, if the root is a dictionary, and in
+/// dictionaries directly below it.
 fn tensor_names(pickle: &Pickle) -> impl Iterator<Item = &str> {
     let root = pickle.root();
     let inner = pickle.items(root).into_iter().flatten().map(|(_, id)| id);

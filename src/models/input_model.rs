@@ -76,7 +76,7 @@ pub trait InputModel: Send + Sync {
     /// Returns the memory that the open input takes and the time and memory that reading it takes.
     fn memory_profile(&self) -> MemoryProfile;
 
-    /// Allows the input to keep decoded values in memory if [`MemoryProfile::decoded`] is not 0.
+    /// Tells the input that it may keep decoded values in memory, up to the bytes of [`MemoryProfile::decoded`].
     fn hold_decoded(&self) {}
 
     /// Returns where the time stamps of frames come from.
@@ -120,7 +120,8 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the merge class of Gaussian `id`. Gaussians of different classes are never merged.
+    /// Returns the merge class of Gaussian `id`, such as foreground or background. Gaussians of different classes are
+    /// never merged.
     fn class(&self, id: u32) -> u8 {
         let _ = id;
         0
@@ -156,8 +157,8 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Computes the stored parameters of one proxy (Gaussian that replaces merged ones) per cluster. `reference` is the
-    /// frame at which proxies are compared with their members (the merged Gaussians). By default no parameters are
-    /// computed, and each proxy is computed from its members frame by frame.
+    /// frame at which proxies are compared with their members (the merged Gaussians); `rule` holds the merge
+    /// parameters. By default no parameters are computed, and each proxy is computed from its members frame by frame.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
@@ -188,8 +189,8 @@ pub trait InputModel: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Returns the frames of the model decoded from `content`, at the times of this input. `content` is what an archive
-    /// of this input, or of a compressed model of it, stores.
+    /// Returns the frames of the model that `content` describes, at the times of this input. `content` is the decoded
+    /// content of an archive of this input, or of a compressed model of it.
     ///
     /// # Errors
     /// Fails if `content` belongs to another kind of input.
@@ -316,7 +317,7 @@ pub struct ColumnInfo {
     pub max_error: f64,
     /// Number of tiles (blocks of Gaussians × frames) of the column.
     pub tiles: usize,
-    /// Number of tiles of the column that store one frame, as their values are the same in all frames.
+    /// Number of tiles of the column that store only one frame, because their values are the same in all frames.
     pub constant_tiles: usize,
     /// Number of tiles of the column that are stored without compression.
     pub raw_tiles: usize,
@@ -334,15 +335,16 @@ pub struct ColumnInfo {
 pub(super) struct ModelFormat {
     /// Returns whether the input has this format, judged by the content of its files.
     pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame times
-    /// are set.
+    /// Opens the input. If the model is continuous in time ([`TimeOrigin::Continuous`]), it has no frames until frame
+    /// times are set.
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
-/// Number of bytes at the start of a file by which its format is recognized; enough for the header of a `.compressed.ply`.
+/// Number of bytes at the start of a file by which its format is recognized; enough for the header of a
+/// `.compressed.ply`.
 const HEAD_BYTES: u64 = 512;
 
-/// Path to open, and what was found there.
+/// Path that the user asked to open, with the facts by which its format is recognized.
 pub(super) struct FoundInput<'a> {
     pub(super) path: &'a Path,
     pub(super) is_folder: bool,
@@ -404,9 +406,11 @@ pub struct TrainingConventions {
     /// Length of `time_duration` of 4D Gaussian Splatting, the period after which colors repeat, in the model's time
     /// unit. `None` uses the guess of the model format and adds a note.
     pub time_duration: Option<f64>,
-    /// Whether 4D rotations use the convention from before 15 September 2024, without the reversal of axes.
+    /// Whether the rotations of 4D Gaussian Splatting use the convention from before 15 September 2024: the order of
+    /// the axes of the 4D rotation matrix is not reversed.
     pub rot4d_unflipped: bool,
-    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means [`ZeroRotation::Drop`].
+    /// How Gaussians of a `.splatv` or `.ftgs.ply` with a zero quaternion are treated; `None` means
+    /// [`ZeroRotation::Drop`].
     pub zero_rotation: Option<ZeroRotation>,
 }
 

@@ -29,7 +29,7 @@ use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, compare_order};
 
-/// Folder with one PLY file per frame.
+/// Model format of frames in PLY files: recognizes and opens a folder with one PLY file per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
@@ -38,14 +38,15 @@ pub(super) const FOLDER: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns whether `folder` holds an entry whose name ends in `.ply`, or cannot be listed.
+/// Returns whether `folder` holds an entry whose name ends in `.ply`. Also returns true if the folder cannot be listed;
+/// opening it then reports the error.
 fn has_ply(folder: &Path) -> bool {
     let is_ply = |path: &Path| path.extension().is_some_and(|found| found.eq_ignore_ascii_case("ply"));
     fs::read_dir(folder)
         .map_or(true, |mut entries| entries.any(|entry| entry.map_or(true, |entry| is_ply(&entry.path()))))
 }
 
-/// Single PLY file, read as one frame.
+/// Model format of a single PLY file: recognizes and opens the file, which becomes the only frame.
 pub(super) const FILE: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::open_single(path, &options.ply())?, path, options),

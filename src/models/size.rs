@@ -39,19 +39,20 @@ impl ModelSize {
         self.cloud + self.field + self.frames + self.rest
     }
 
-    /// Returns the name and the size in bytes of each part.
+    /// Returns the name and the size in bytes of each of the four parts: canonical Gaussians (`cloud`), deformation
+    /// field, frames and rest.
     pub fn named_parts(&self) -> [(&'static str, u64); 4] {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
-    /// Formats the parts that are not 0 for messages, in bytes: `cloud 248, field 1000`.
+    /// Formats for messages the names and bytes of all parts of the model whose size is not 0: `cloud 248, field 1000`.
     pub fn parts_text(&self) -> String {
         let parts = self.named_parts().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// Formats the size of each part next to the same part of `before` for messages: `cloud 248 of 2480 (10.0%)`. A
-    /// part that only one of the two models has is compared with `none`.
+    /// Formats for messages the size in bytes of each part of this model next to that of the same part of `before`:
+    /// `cloud 248 of 2480 (10.0%)`. A part that only one of the two models has is compared with `none`.
     pub fn format_relative_to(&self, before: &ModelSize) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
@@ -62,8 +63,8 @@ impl ModelSize {
         self.named_parts().into_iter().zip(before.named_parts()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
 
-    /// Returns a message that explains why this size of an output is larger than the size `before` of the input; `None`
-    /// if it is not larger.
+    /// Returns a message that explains why an output of this size is larger than the input, whose size is `before`;
+    /// `None` if the output is not larger.
     pub fn why_larger_than(&self, before: &ModelSize) -> Option<String> {
         let (after, whole) = (self.total(), before.total());
         let why = match (self.frames > 0, before.frames > 0) {

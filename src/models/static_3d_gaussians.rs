@@ -25,7 +25,8 @@ const POINT_CLOUD_FOLDER: &str = "point_cloud";
 /// Name of the point cloud file in a folder `iteration_K`.
 const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
-/// Model folder with a point cloud file and no deformation field.
+/// Model format of 3D Gaussian Splatting: recognizes and opens a model folder with a point cloud file and no
+/// deformation field.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let is_static =
@@ -65,7 +66,7 @@ impl StaticModel {
         })
     }
 
-    /// Returns the paths of those of [`COPIED_FILES`] that exist in the model folder.
+    /// Returns the paths of the files in [`COPIED_FILES`] that exist in the model folder.
     fn copied_files(&self) -> impl Iterator<Item = PathBuf> {
         COPIED_FILES.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }

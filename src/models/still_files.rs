@@ -1,5 +1,5 @@
-//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file, or a
-//! folder with one file per frame.
+//! Files of web viewers that hold one frame each (`.sog`, `.spz`, `.splat`, `.glb`, `.compressed.ply`): a single file,
+//! or a folder with one file per frame.
 //!
 //! The files are decoded into PLY files in a temporary folder and opened there like PLY frames, so every command that
 //! reads PLY frames reads them too.
@@ -38,7 +38,8 @@ struct StillFormat {
     ending: &'static str,
     /// Name of the format, shown to users.
     kind: &'static str,
-    /// Returns whether a path that is no sequence has this format.
+    /// Returns whether the path is one frame of this format: a file, or for `.sog` also a folder with the content of
+    /// one.
     recognizes: fn(&FoundInput) -> bool,
     /// Reads the Gaussians of a file.
     read: fn(&Path, ReadLimit) -> Result<Gaussians>,
@@ -81,7 +82,8 @@ const FORMATS: [StillFormat; 5] = [
     },
 ];
 
-/// Returns whether the file is a PLY whose header has an element `chunk` first or a packed property near its start.
+/// Returns whether the file is a compressed PLY: its header has an element `chunk` first, or a packed property near its
+/// start.
 fn has_packed_positions(found: &FoundInput) -> bool {
     let has = |text: &str| found.head.windows(text.len()).any(|part| part == text.as_bytes());
     !found.is_folder
@@ -89,7 +91,7 @@ fn has_packed_positions(found: &FoundInput) -> bool {
         && (has("\nelement chunk ") || has(compressed_ply::MARKER_PROPERTY))
 }
 
-/// File of a web viewer, or a folder of such files.
+/// Model format of the files of web viewers: recognizes and opens one file, or a folder with one file per frame.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| format_of(found).is_some(),
     open: |path, options| {
@@ -99,7 +101,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns the format of a file or of the files of a folder; `None` for other inputs.
+/// Returns the format of the file, or of the files in the folder, that was found at a path; `None` if it is none of
+/// [`FORMATS`].
 fn format_of(found: &FoundInput) -> Option<&'static StillFormat> {
     let holds_frames = |format: &StillFormat| {
         let entries = fs::read_dir(found.path).ok().filter(|_| found.is_folder);
@@ -248,7 +251,7 @@ impl InputModel for StillFiles {
     }
 }
 
-/// Returns `paths` with every folder replaced by the files in it, sorted by name.
+/// Returns the files in `paths`: each folder is replaced by the files in it, sorted by name.
 fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for path in paths {

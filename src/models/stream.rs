@@ -43,8 +43,8 @@ pub struct ReceivedStream {
 }
 
 impl ReceivedStream {
-    /// Receives a stream and packs it into a temporary file in `folder`. Calls `take` with the frames of each block of
-    /// consecutive frames, in order.
+    /// Receives a stream, packs it into a temporary container in `folder`, and returns the received stream, whose
+    /// frames are read from this container. Calls `take` with the frames of each block of consecutive frames, in order.
     ///
     /// # Errors
     /// Fails if the stream is damaged or a write fails.

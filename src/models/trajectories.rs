@@ -37,7 +37,7 @@ pub const DEFAULT_OUTPUT: OutputKind = OutputKind::PlySequence;
 pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
                                      archive\n  write a .gseq instead, or pack the input into a .gseq first";
 
-/// Returns the bytes that the attributes `columns` of one Gaussian at one frame take as f32.
+/// Returns the bytes that the attributes `columns` of one Gaussian at one frame take if every value is stored as f32.
 pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
@@ -90,9 +90,9 @@ pub(super) fn write_trajectories(
     write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.max_kept_frames, events)
 }
 
-/// Writes a container of a compressed model with proxies. The members of a proxy can be anywhere in the source, so
-/// frame blocks are processed one by one, and within each the output Gaussians in groups that need about
-/// `max_gaussians` source Gaussians.
+/// Writes a container of a compressed model with proxies (Gaussians that replace merged ones). The members of a proxy
+/// can be anywhere in the source. So one block of frames is processed after another, and within a block of frames one
+/// range of output Gaussians after another. A range needs about `max_gaussians` source Gaussians in memory.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
@@ -134,8 +134,9 @@ fn write_merged(
     writer.finish()
 }
 
-/// Divides the Gaussians of `merged` into ranges of whole blocks. The Gaussians of a range are made of at most
-/// `max_gaussians` source Gaussians, or the range is a single block.
+/// Divides the output Gaussians into consecutive ranges and returns them. A range consists of whole blocks of
+/// [`GAUSSIAN_BLOCK`] Gaussians, which are computed from at most `max_gaussians` source Gaussians. A block that needs
+/// more is a range of its own.
 fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<usize>> {
     let count = merged.info().count;
     let (mut parts, mut start, mut source_gaussians) = (Vec::new(), 0, 0);
@@ -153,7 +154,7 @@ fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<
 }
 
 /// Writes the frames of `source` to `path` as `kind`, a kind of output for explicit frames, and returns notes for the
-/// user. A reader of whole frames keeps at most `held` of the frames that are decoded together in memory.
+/// user. Several consecutive frames of `source` may be decoded together; at most `held` of them are kept in memory.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
@@ -205,7 +206,8 @@ pub fn write_sequence(
 }
 
 /// Writes every frame of `source` to a file `frame_0000.sog`, `frame_0001.sog`, … in the folder `path`, without the
-/// Gaussians that are not drawn in this frame. Returns a note with the largest errors of all frames.
+/// Gaussians that are not drawn in this frame. Returns a note with the largest errors of all frames. At most `held`
+/// decoded frames are kept in memory.
 fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<Vec<String>> {
     let frames = source.info().times.len();
     let progress = events.task("emit", "frames", frames as u64);

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result, quoted};
 use crate::model::Attributes;
 
-/// Maximum error of each attribute in its own unit, in the order of [`Attributes::all`]. 0 stores the attribute without
-/// loss.
+/// Maximum error of each attribute in the attribute's own unit, in the order of [`Attributes::all`]. 0 means that the
+/// attribute is stored without loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ErrorBounds([f64; 5]);
 

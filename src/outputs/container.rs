@@ -1,9 +1,9 @@
-//! Writes any sequence to a container, one frame block (consecutive frames) after the other. A tile has the values of
-//! one attribute of one block of Gaussians in one frame block.
+//! Writes any sequence to a `.gseq` container, one frame block (consecutive frames) after the other. A tile has the
+//! values of one attribute of one block of Gaussians in one frame block. Attributes are the columns of the container.
 //!
-//! Memory per thread: one tile of every column ([`GAUSSIAN_BLOCK`] × frames of a block values of each of its
-//! components), and as much again while it is encoded (four times the tile for a column with an error bound). Also 80
-//! bytes per column and block of Gaussians, and 16 per frame.
+//! Memory per thread: one tile of every column, with [`GAUSSIAN_BLOCK`] × frames × components values, and as much again
+//! while it is encoded (four times the tile for a column with an error bound). Also 80 bytes per column and block of
+//! Gaussians, and 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,13 +18,13 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{FrameSource, Ids};
 
-/// Number of Gaussians per tile, which one task of a scan reads. It is constant, so that the bytes of a container
-/// depend only on its values.
+/// Number of Gaussians per tile. One task of a scan reads such a block of Gaussians. The number is constant, so that
+/// the bytes of a container depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Number of frames per tile without error bounds, except for streams with large frames.
+/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer.
 pub const FRAME_BLOCK: usize = 32;
-/// Number of frames per tile with error bounds. More frames pay then, because the first frame of a tile takes as much
-/// space as all others together.
+/// Number of frames per tile in a container with error bounds. More frames pay with bounds, because the first frame of
+/// a tile takes as much space as all others together.
 pub const BOUNDED_FRAME_BLOCK: usize = 64;
 
 /// Encoding of the values in a container: compression and maximum errors.
@@ -47,12 +47,12 @@ impl Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
-    /// Returns the number of frames per tile: more if there are error bounds.
+    /// Returns the number of frames per tile, which is larger if there are error bounds.
     pub fn frame_block(&self) -> usize {
         if self.bounds == ErrorBounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }
 
-    /// Returns the number of frame blocks (ranges of consecutive frames, as many as a tile has) that `source` needs.
+    /// Returns the number of frame blocks (ranges of consecutive frames) into which the frames of `source` are divided.
     pub fn frame_blocks(&self, source: &dyn FrameSource) -> usize {
         source.info().times.len().div_ceil(self.frame_block())
     }
@@ -63,7 +63,7 @@ impl Packing {
         start..source.info().times.len().min(start + self.frame_block())
     }
 
-    /// Returns the cache key of this encoding. The values to be encoded are not part of it.
+    /// Returns the cache key of this encoding. The key does not depend on the values that are encoded.
     pub fn cache_key(&self) -> CacheKey {
         let column_key = |column| match self.column(column) {
             Compression::Raw => (0, 0.0, 0),
@@ -83,8 +83,9 @@ impl Packing {
     }
 }
 
-/// Writes all frames of `source` to the container `path`. The file appears only when it is complete. Calls `advance`
-/// with the number of Gaussian states (Gaussians × frames) encoded since the last call.
+/// Writes all frames of `source` to the container `path`, encoded as `packing`, with the metadata `attributes` (names
+/// and texts). The file appears only when it is complete. Calls `advance` with the number of Gaussian states (Gaussians
+/// × frames) encoded since the last call.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -100,9 +101,10 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes the frame blocks `blocks` of `source` and writes them to the scratch file `to`, from which
-/// [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the tile equals the
-/// one in the frame block before.
+/// Encodes the frame blocks with the numbers `blocks` and writes them to the scratch file `to`, from which
+/// [`join_container`] reads them. Writes one record per tile, in order. An empty record means that the tile equals that
+/// of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
+/// last call.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or written.
@@ -123,10 +125,11 @@ pub fn spill_blocks(
 }
 
 /// Writes the container `path` from frame blocks that [`spill_blocks`] encoded. The file is the same as that of
-/// [`write_container`]. `spills` must have all frame blocks, in order. Memory: a tile, and the index of the container.
+/// [`write_container`]. `spills` lists the scratch files, each with the numbers of its frame blocks; together they must
+/// have all frame blocks, in order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
-/// Fails if a spill cannot be read back or the container cannot be written.
+/// Fails if a scratch file cannot be read back or the container cannot be written.
 pub fn join_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -162,7 +165,8 @@ pub struct ContainerWriter {
 }
 
 impl ContainerWriter {
-    /// Creates the container `path` for `count` Gaussians, with `frame_block` frames in a frame block.
+    /// Creates the container `path` for `count` Gaussians, with `frame_block` frames in a frame block, encoded as
+    /// `packing`, and with the metadata `attributes` (names and texts).
     pub fn create(
         path: &Path,
         count: usize,
@@ -187,7 +191,8 @@ impl ContainerWriter {
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
     }
 
-    /// Creates the container `path` for the Gaussians of `source`.
+    /// Creates the container `path` with the number of Gaussians, the SH degree and the frames per block that `source`
+    /// and `packing` need.
     fn from_source(
         source: &dyn FrameSource,
         path: &Path,
@@ -198,8 +203,10 @@ impl ContainerWriter {
         ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
     }
 
-    /// Adds the next frame block: `frames` of `source`. There must be as many frames as in a block; a block with fewer
-    /// must be the last one. Attributes that do not vary with time must have the same values as in the blocks before.
+    /// Adds the frames `frames` of `source` as the next frame block. There must be as many frames as in a block; a
+    /// block with fewer must be the last one. Attributes that do not vary with time must have the same values as in the
+    /// blocks before. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last
+    /// call.
     pub fn append_block(
         &mut self,
         source: &dyn FrameSource,
@@ -210,16 +217,17 @@ impl ContainerWriter {
         self.add_gaussians(source, 0, frames, advance)
     }
 
-    /// Begins a frame block with frames at `times`. Afterwards [`ContainerWriter::add_gaussians`] must add all Gaussians, in one
-    /// or several parts.
+    /// Begins a frame block with frames at the times `times`. After this call, all Gaussians must be added by one or
+    /// several calls of [`ContainerWriter::add_gaussians`].
     pub fn begin_block(&mut self, times: &[f64]) -> Result<()> {
         self.writer.append_times(times)?;
         self.frame_blocks += 1;
         Ok(())
     }
 
-    /// Adds some Gaussians to the present frame block: all those of `source`, at its `frames`. In the container they
-    /// are Gaussian `first` and those that follow. `first` is a multiple of [`GAUSSIAN_BLOCK`].
+    /// Adds all Gaussians of `source` to the present frame block, at the frames `frames` of `source`. In the container
+    /// they get consecutive indices from `first` on, which is a multiple of [`GAUSSIAN_BLOCK`]. Calls `advance` with
+    /// the number of Gaussian states (Gaussians × frames) encoded since the last call.
     pub fn add_gaussians(
         &mut self,
         source: &dyn FrameSource,
@@ -234,9 +242,10 @@ impl ContainerWriter {
         })
     }
 
-    /// Adds a frame block like [`ContainerWriter::append_block`]: `frames` of `source`, with the time stamps `times`.
-    /// `presence` tells how each block of Gaussians changes within the frame block. A block that does not change is
-    /// read and encoded once for all frames, or not at all if it equals that of the frame block before.
+    /// Adds the frames `frames` of `source` as the next frame block, with the time stamps `times`, like
+    /// [`ContainerWriter::append_block`]. `presence` has one entry per block of Gaussians. It saves reading and
+    /// encoding: a block that does not change is read and encoded once for all frames, or not at all if it repeats the
+    /// frame block before.
     pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
@@ -256,7 +265,7 @@ impl ContainerWriter {
         )
     }
 
-    /// Writes one tile of the present frame block. `None` means that the tile equals the one in the frame block before.
+    /// Writes one tile of the present frame block. `None` means that the tile equals that of the frame block before.
     fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
@@ -273,37 +282,39 @@ impl ContainerWriter {
     }
 }
 
-/// Change of a block of Gaussians within a frame block (consecutive frames).
+/// Change of a block of Gaussians within a frame block (consecutive frames). It decides which tiles are encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockChange {
-    /// Attributes that vary with time may change from frame to frame; all others equal those of the frame block before.
+    /// Block that changes from frame to frame. Attributes that vary with time in the source are encoded for every
+    /// frame; the others equal those of the frame block before and are not encoded again.
     Varying,
-    /// Every attribute is encoded anew, because it may differ from the frame block before. Attributes that vary with
-    /// time may change from frame to frame in the frame block; all others are constant in it.
+    /// Block that may differ from the frame block before in every attribute. Attributes that vary with time in the
+    /// source are encoded for every frame, the others for the first frame.
     New,
-    /// All frames of the frame block are equal.
+    /// Block whose frames are all equal, so that only the first is encoded.
     Still,
-    /// All frames equal those of the frame block before, in which all frames were equal.
+    /// Block whose frames are all equal, and equal to those of the frame block before. No tile is encoded.
     Repeating,
 }
 
-/// Returns the change of every block of Gaussians of `source`, which is the same for all. `is_first`: for the first
-/// frame block.
+/// Returns the changes of all blocks of Gaussians for a frame block of a whole `source`. All blocks have the same
+/// change: [`BlockChange::New`] in the first frame block (`is_first`), [`BlockChange::Varying`] afterwards.
 fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
     // An attribute that never varies is encoded for the first frame block only.
     let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
     vec![presence; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
-/// Returns which of `count` Gaussians are in block number `block`.
+/// Returns the indices of the Gaussians in block number `block`, of `count` Gaussians in total.
 pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     let start = block * GAUSSIAN_BLOCK;
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes `frames` of `source` as one frame block. `presence` tells how each block of Gaussians changes. Calls `each`
-/// for every tile in the order of the container, with the number of its block of Gaussians, the number of its column,
-/// and the tile; `None` means that the tile equals the one in the frame block before.
+/// Encodes the frames `frames` of `source` as one frame block. `presence` has the change of each block of Gaussians.
+/// Calls `each` for every tile in the order of the container, with the number of its block of Gaussians, the number of
+/// its column, and the tile; `None` means that the tile equals that of the frame block before. Calls `advance` with the
+/// number of Gaussian states (Gaussians × frames) encoded since the last call.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
@@ -341,8 +352,8 @@ fn encode_frames(
     Ok(())
 }
 
-/// Encodes the blocks `blocks` of Gaussians of `source` over `frames`, one frame block, and returns the number of bytes
-/// of each column.
+/// Encodes some blocks of Gaussians of `source` over the frames `frames` as one frame block. Returns the number of
+/// bytes that each column (attribute) takes. `blocks` has the numbers of the blocks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -362,8 +373,8 @@ pub fn column_bytes(
     Ok(bytes)
 }
 
-/// Encodes the tiles of one block of Gaussians over `frames`. Returns one entry per column; it is `None` for columns
-/// that are not in `columns`.
+/// Encodes the tiles of the block of Gaussians `gaussians` over the frames `frames`. Returns one tile per attribute;
+/// `None` for attributes that are not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,

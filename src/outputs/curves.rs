@@ -15,8 +15,8 @@ use crate::passes::{gather_all, map_tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Writes all frames of `source` to the `.splatv` file `path`. Returns a message with the errors of positions and
-/// opacities.
+/// Writes all frames of `source` to the `.splatv` file `path`. Returns a message with the errors of the fitted
+/// positions and opacities.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -83,7 +83,7 @@ mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::DemoScene;
     use crate::files::splatv::Splatv;
-    use crate::model::opacity;
+    use crate::outputs::tests::{blended, opacities_near};
 
     #[test]
     fn only_times_outside_0_to_1_are_scaled() {
@@ -119,22 +119,10 @@ mod tests {
                 })
                 .collect();
             for id in 0..300 {
-                let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
-                if visible < 0.1 {
-                    continue;
-                }
-                let at = state.position.row::<3>(id).map(f64::from);
-                let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
-                let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
-                let nearby: Vec<f64> = shown
-                    .iter()
-                    .filter(|(place, _)| distance(*place) < 0.5)
-                    .map(|(_, alpha)| (1.0 - alpha).ln())
-                    .collect();
+                let Some((visible, near)) = opacities_near(&state, id, &shown) else { continue };
                 seen += 1;
-                missing += f64::from(nearby.is_empty());
-                // Other Gaussians may lie there too, so the test can detect only a missing contribution.
-                too_faint += f64::from(1.0 - nearby.iter().sum::<f64>().exp() < visible - 0.1);
+                missing += f64::from(near.is_empty());
+                too_faint += f64::from(blended(&near) < visible - 0.1);
             }
         }
         let seen = f64::from(seen);

@@ -43,7 +43,7 @@ pub enum Codec {
 }
 
 impl FilmFormat {
-    /// Returns the film format that belongs to the ending of `path`.
+    /// Returns the film format for the file name ending of `path`.
     ///
     /// # Errors
     /// Fails if the ending is not that of a film format, or if the format needs an encoder that is not installed.

@@ -1,5 +1,5 @@
-//! Writes a sequence as a `.4dgs` file: pieces of straight motion, each shown in a window of time. The crate `fourdgs`
-//! encodes and checks them.
+//! Writes a sequence as a `.4dgs` file: pieces of straight motion, fitted to the trajectory of every Gaussian, each
+//! shown in a window of time. The crate `fourdgs` encodes and checks the pieces.
 //!
 //! Frames are 1/30 s apart, whatever the times of the source. A piece is shown until the start of the frame that
 //! follows its last frame. As the format requires, base colors are clamped to [0, 1], and SH coefficients above degree
@@ -22,7 +22,8 @@ use crate::source::FrameSource;
 /// Frame rate stored in the file, in frames per second. Sequences have no frame rate of their own.
 const FRAME_RATE: f64 = 30.0;
 
-/// Writes all frames of `source` to the `.4dgs` file `path`. Returns a message with the errors of the pieces.
+/// Writes all frames of `source` to the `.4dgs` file `path`. Returns a message with the errors of the fitted pieces of
+/// straight motion.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if the format cannot hold a value, or if the file cannot be written.
@@ -65,9 +66,10 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Rounds positions, velocities, colors and opacities to the quantization grid of the file. The encoder compares decoded
-/// values with its bounds without allowing for their rounding to f32. For coordinates of a few units, this rounding would
-/// move values half a step away from the grid beyond the bound. Colors of 8 bits are half a step away if they are odd.
+/// Rounds positions, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
+/// encoder accepts them. The encoder compares decoded values with its error bounds and does not allow for their
+/// rounding to f32. For coordinates of a few units, the rounding to f32 would push values that lie half a step away
+/// from the grid beyond the bound. Colors of 8 bits are half a step away if they are odd.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
@@ -97,8 +99,8 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     }
 }
 
-/// Checks that the rounded positions in `set` are close to `wanted`, the positions before rounding. `ids`: index of the
-/// Gaussian that each piece belongs to.
+/// Checks that the rounded positions in `set` are close to `wanted`, the positions before rounding. `ids` has for each
+/// piece (of straight motion) the index of its Gaussian, for the error message.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
     let mut accuracy = CodingErrors::new(&AttributeValues::from_planes(3, planes));
@@ -116,7 +118,8 @@ fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = 
     accuracy.check("a .4dgs")
 }
 
-/// Adds `piece` to `set`. `starts`: start time of each frame, then the end of the last frame, in seconds.
+/// Adds the piece of straight motion `piece` to `set`. `starts` has the start time of each frame, then the end of the
+/// last frame, in seconds.
 fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     let to_f32 = |value: f64| value as f32;
     set.positions.extend(piece.position.map(to_f32));

@@ -18,8 +18,8 @@ pub struct StreamWriter<W> {
 }
 
 impl<W: Write> StreamWriter<W> {
-    /// Creates a writer to `to`. Writes `header` and those attributes of `constant` that are the same in all frames.
-    /// `name`: name of the stream in messages.
+    /// Creates a writer of a stream to `to` and begins the stream: writes `header`, and the attributes of `constant`
+    /// that are the same in all frames. `name` is the name of the stream in messages.
     ///
     /// # Errors
     /// Fails if an attribute has another length than `header` says, or if the stream cannot be written.
@@ -30,10 +30,10 @@ impl<W: Write> StreamWriter<W> {
         Ok(stream)
     }
 
-    /// Writes the next frame, at `time`: those attributes of `state` that vary with time.
+    /// Writes the next frame, at the time `time`: the attributes of `state` that vary with time.
     ///
     /// # Errors
-    /// Fails if `time` is not finite or not later than that of the frame before, if an attribute has another length
+    /// Fails if `time` is not finite or not later than the time of the frame before, if an attribute has another length
     /// than the header says, if there are more than 2³² − 1 frames, or if the stream cannot be written.
     pub fn write_frame(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         let mark = FrameMark::Frame { index: self.frames, time, bytes: self.header.frame_bytes() }.to_bytes();

@@ -1,8 +1,8 @@
-//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal: every frame whole, as textures
-//! that are compressed by LZ4.
+//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal: every frame whole, as
+//! textures that are compressed by LZ4.
 //!
-//! Layout, little-endian: "GSD1", u32 length of a JSON text, the JSON text, then for each frame u32 length and that many
-//! bytes of one LZ4 block. A block holds the textures of the table one after the other, each W × W pixels of four
+//! Layout, little-endian: "GSD1", u32 length of a JSON text, the JSON text, then for each frame u32 length and that
+//! many bytes of one LZ4 block. A block holds the textures of the table one after the other, each W × W pixels of four
 //! numbers, row by row. Bytes of a texture are shuffled: byte 0 of all pixels, then byte 1, and so on.
 //!
 //! | texture | numbers of a pixel | type | other pixels |
@@ -37,8 +37,8 @@ const CENTIMETERS: f64 = 100.0;
 /// Number of bits per axis of the Morton code.
 const MORTON_BITS: u32 = 10;
 
-/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message with the loss of the format. A reader of
-/// whole frames keeps at most `held` of the frames that are decoded together in memory.
+/// Writes all frames of `source` to the `.gsd` file `path`. Returns a message with the loss of the format. Some sources
+/// decode several frames together; at most `held` decoded frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -85,7 +85,8 @@ pub fn write_gsd(source: &dyn FrameSource, path: &Path, held: usize, events: &Ev
     Ok(format!("at most {most} visible Gaussians per frame, at {FRAME_RATE} frames a second{degrees}{dropped}"))
 }
 
-/// Returns the JSON text of a sequence `name` with at most `most` Gaussians per frame.
+/// Returns the JSON text of the file for a sequence called `name`. `most` is the largest number of Gaussians in a
+/// frame, `frames` has the entry of each frame.
 fn describe_sequence(name: &str, most: usize, frames: &[Value]) -> Value {
     json!({
         "version": 1, "compression": "shuffle_lz4", "sequenceName": name, "frameCount": frames.len(),
@@ -95,13 +96,13 @@ fn describe_sequence(name: &str, most: usize, frames: &[Value]) -> Value {
     })
 }
 
-/// Returns the width and height in pixels of the textures of `count` Gaussians.
+/// Returns the side length in pixels of the square textures of `count` Gaussians.
 fn side(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
 }
 
-/// One frame of a `.gsd` before LZ4 compression. The bytes of its textures (images of the attributes of all Gaussians)
+/// Frame of a `.gsd` file before LZ4 compression. The bytes of its textures (images of the attributes of all Gaussians)
 /// are shuffled.
 struct PackedFrame {
     textures: Vec<u8>,
@@ -114,7 +115,7 @@ struct PackedFrame {
 }
 
 impl PackedFrame {
-    /// Packs the visible Gaussians of `state`.
+    /// Packs the visible Gaussians of `state` into textures.
     fn new(state: &Gaussians) -> PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();
@@ -155,7 +156,7 @@ impl PackedFrame {
         PackedFrame { textures, count: rows.len(), not_finite: seen.len() - rows.len(), bounds }
     }
 
-    /// Returns the entry of the frame in the JSON text. `bytes`: length of its LZ4 block.
+    /// Returns the entry of the frame in the JSON text. `bytes` is the length of its LZ4 block.
     fn describe(&self, bytes: usize) -> Value {
         let side = side(self.count);
         let [low, high] = self.bounds.map(|[x, y, z]| json!({ "x": x, "y": y, "z": z }));
@@ -166,25 +167,26 @@ impl PackedFrame {
     }
 }
 
-/// Returns whether all stored values of a Gaussian are finite.
+/// Returns whether all stored values of the Gaussian `row` are finite.
 fn is_finite(state: &Gaussians, row: usize) -> bool {
     let base = state.sh.row::<3>(row).iter().all(|x| x.is_finite());
     let [position, scale] = [state.position.row::<3>(row), state.log_scale.row::<3>(row)];
     base && position.iter().chain(&scale).chain(&state.rotation.row::<4>(row)).all(|x| x.is_finite())
 }
 
-/// Returns a position of the scene in Unreal's axes.
+/// Converts a position from the scene's axes to Unreal's axes.
 fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
     [z, x, -y]
 }
 
-/// Returns the bytes of a half-precision number. Values out of range become the largest finite one.
+/// Returns the bytes of `value` as a half-precision number. A value out of range becomes the largest finite one.
 fn half_bytes(value: f64) -> [u8; 2] {
     let most = f16::MAX.to_f64();
     f16::from_f64(value.clamp(-most, most)).to_le_bytes()
 }
 
-/// Returns the Morton code of a position in scene units within `bounds`, which are in centimeters.
+/// Returns the Morton code of the position `place`, which is in scene units, within the box from `low` to `high`, which
+/// are in centimeters.
 fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     let most = f64::from((1u32 << MORTON_BITS) - 1);
     (0..3).fold(0, |code, axis| {
@@ -219,7 +221,7 @@ mod tests {
     use crate::model::Attributes;
     use crate::passes::gather_all;
 
-    /// Values of the four textures of a frame by pixel, as the format describes them.
+    /// Pixels of the four textures of a frame, each pixel with the four numbers that the format describes.
     type Pixels = [Vec<[f64; 4]>; 4];
 
     /// Reads a file as the format specifies, without code shared with the writer.

@@ -1,8 +1,8 @@
 //! Index map: a file with the index in the output of each Gaussian of the input.
 //!
 //! Input: for every Gaussian of the input its index in the output, or `None` if it was pruned. Output: a `.npy` file of
-//! int64 `[N]`, −1 for pruned Gaussians. With it, other tensors with one entry per Gaussian can be reordered likewise.
-//! Memory: none of its own.
+//! int64 `[N]`, −1 for pruned Gaussians. Users can reorder other tensors that have one entry per Gaussian with this
+//! file. Memory: none besides a write buffer.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};

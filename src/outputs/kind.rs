@@ -18,11 +18,11 @@ pub enum OutputKind {
     PlySequence,
     /// One PLY file: the canonical Gaussians of a model, or a sequence of one frame.
     Ply,
-    /// A `.gsz` archive for storage and transfer; for a sequence of frames, a container with error bounds.
+    /// A `.gsz` archive for storage and transfer. For a sequence of frames it is a container with error bounds.
     Archive,
-    /// A `.splatv` file for web viewers: Gaussians with cubic motion in windows of time.
+    /// A `.splatv` file for web viewers: Gaussians with cubic motion, each visible in a window of time.
     Splatv,
-    /// A `.4dgs` file: pieces of straight motion in windows of time.
+    /// A `.4dgs` file: pieces of straight motion, each visible in a window of time.
     #[serde(rename = "4dgs")]
     FourDgs,
     /// A `.spz` file of version 3: one frame, strongly compressed.
@@ -36,17 +36,18 @@ pub enum OutputKind {
     Glb,
     /// A folder with one `.sog` file per frame.
     SogSequence,
-    /// A `.gsd` file: every frame whole, for Unreal.
+    /// A `.gsd` file for a plugin of Unreal: all attributes of every frame.
     Gsd,
-    /// A `.ftgs.ply` file: linear motion in Gaussian windows of time.
+    /// A `.ftgs.ply` file: Gaussians with linear motion, whose opacity follows a Gaussian function of time.
     Ftgs,
-    /// A `.tsog` file: linear motion in Gaussian windows of time, or single frames, as images for web players.
+    /// A `.tsog` file for web players, with attributes as images: Gaussians with linear motion, whose opacity follows a
+    /// Gaussian function of time, or single frames.
     Tsog,
 }
 
 impl OutputKind {
-    /// Returns the kind of output: `asked` if the user named one, else the kind that the file name `path` stands for,
-    /// else `input_kind`, the kind of the input.
+    /// Returns the kind of output: `asked` if the user named a kind, else the kind for the file name `path`, else
+    /// `input_kind`, the kind of the input.
     pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
         asked.or(Self::from_name(path)).unwrap_or(input_kind)
     }
@@ -104,13 +105,14 @@ impl OutputKind {
         matches!(self, OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence)
     }
 
-    /// Returns whether this kind of output stores every frame, unlike a model from which frames are computed.
+    /// Returns whether this kind of output stores the values of every frame. The others store a model, from which
+    /// frames are computed.
     pub fn stores_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }
 
-    /// Returns the bytes of memory per Gaussian that encoding one frame takes besides the frame itself. `state_bytes`: bytes
-    /// of the attributes of one Gaussian.
+    /// Returns the number of bytes of memory per Gaussian that encoding one frame takes, besides the frame itself.
+    /// `state_bytes` is the number of bytes of the attributes of one Gaussian.
     pub fn encoding_bytes(self, state_bytes: u64) -> u64 {
         match self {
             // Six images of 4 bytes, compressed and not, the Morton order with its keys, and for the SH coefficients a
@@ -121,7 +123,7 @@ impl OutputKind {
         }
     }
 
-    /// Checks that this kind of output can hold `frames` frames. Messages name `path`.
+    /// Checks that this kind of output can hold `frames` frames. Messages name `path`, the output.
     ///
     /// # Errors
     /// Fails for a `.spz`, a `.sog` or a `.glb` file if the number of frames is not 1.
@@ -140,7 +142,7 @@ impl OutputKind {
     }
 }
 
-/// Checks that `path` can be the name of an output folder. `what`: the command that writes the folder, for messages.
+/// Checks that `path` can be the name of an output folder. `what` is the command that writes the folder, for messages.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] if the name has an ending like a file.
@@ -154,7 +156,7 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Checks that `path` can be the name of a container. `what`: the command that writes the container, for messages.
+/// Checks that `path` can be the name of a container. `what` is the command that writes the container, for messages.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] if the name has the ending of another kind of file.

@@ -15,3 +15,26 @@ pub mod index_map;
 pub mod kind;
 pub mod rows;
 pub mod time_windows;
+
+#[cfg(test)]
+mod tests {
+    use crate::model::{Gaussians, opacity};
+
+    /// Compares Gaussian `id` of the frame state `state` with positions and opacities that a player shows at this frame
+    /// (`shown`). Returns the Gaussian's opacity, and the opacities shown within half its largest scale; `None` if its
+    /// opacity is below 0.1.
+    pub(super) fn opacities_near(state: &Gaussians, id: usize, shown: &[([f64; 3], f64)]) -> Option<(f64, Vec<f64>)> {
+        let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
+        let at = state.position.row::<3>(id).map(f64::from);
+        let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
+        let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
+        let near = shown.iter().filter(|(place, _)| distance(*place) < 0.5).map(|&(_, alpha)| alpha);
+        (visible >= 0.1).then(|| (visible, near.collect()))
+    }
+
+    /// Returns the opacity of Gaussians with the opacities `near` at one place. Other Gaussians than those that are
+    /// compared may lie there too, so it can only show that a contribution is missing.
+    pub(super) fn blended(near: &[f64]) -> f64 {
+        1.0 - near.iter().map(|alpha| (1.0 - alpha).ln()).sum::<f64>().exp()
+    }
+}

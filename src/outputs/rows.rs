@@ -17,11 +17,12 @@ use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 use crate::model::{self, Rows, Statistic};
 
-/// Statistics, scores and decisions of N Gaussians after the selection. Every slice has one value per Gaussian.
+/// Statistics and scores of N Gaussians, and whether the selection keeps each of them. Every slice has one value per
+/// Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics, one column each ([`Statistic::column_name`]). The peak contribution W, if measured, is the last column of
-    /// the table.
+    /// Statistics, each a column of the table ([`Statistic::column_name`]). The peak contribution W, if measured, is
+    /// the last column of the table.
     pub rows: &'a Rows,
     /// Static score S_static of each Gaussian, from its contribution and shape.
     pub static_score: &'a [f64],

@@ -1,9 +1,10 @@
-//! Writes any sequence in formats of linear motion in Gaussian windows of time: lines in time windows, fitted to the
-//! trajectory of every Gaussian. Models that have such motion are written without a fit.
+//! Writes any sequence as Gaussians with linear motion, whose opacity follows a Gaussian function of time (a time
+//! window). Such lines in time windows are fitted to the trajectory of every Gaussian. Models that have this kind of
+//! motion are written without a fit.
 //!
 //! The time of these formats runs from 0, at the first frame, to 1, at the last. A `.tsog` can also hold single frames,
-//! and does where lines are too far off or too many ([`are_frames_better`]). Memory: all lines, or the visible Gaussians
-//! of all single frames.
+//! and does if the fit is too inaccurate or has too many lines ([`are_frames_better`]). Memory: all lines, or the
+//! visible Gaussians of all single frames.
 
 use std::path::Path;
 
@@ -18,21 +19,22 @@ use crate::passes::{FrameStates, map_tracks};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// Standard deviation of the time window of a Gaussian with constant opacity, in units of the sequence. The window is 1
-/// with an error below 1e-7 at every time from 0 to 1.
+/// Standard deviation of the time window of a Gaussian with constant opacity, as a multiple of the sequence's duration.
+/// The window is 1 with an error below 1e-7 at every time from 0 to 1.
 const CONSTANT_DEVIATION: f64 = 2000.0;
-/// Minimum difference of an opacity from 0 and from 1, so that its logit is finite.
+/// Minimum distance of an opacity from 0 and from 1, so that its logit is finite.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// Maximum number of Gaussians of all single frames together in a `.tsog`. Its player shows no more by default.
+/// Maximum number of Gaussians in a `.tsog` of single frames, all frames together. Its player shows no more by default.
 pub const MAX_SINGLE_FRAME_GAUSSIANS: usize = 1_000_000;
-/// Fraction of the visible states that are far off in a fit ([`FitError::far_off_fraction`]) above which single frames are
-/// written.
+/// Maximum fraction of the visible states (Gaussians × frames) that may be far off in a fit of lines
+/// ([`FitError::far_off_fraction`]); above it single frames are written.
 const MAX_FAR_SHARE: f64 = 0.1;
-/// Maximum number of intervals between the lines of a Gaussian in a `.tsog`. More lines take many bytes for the few
-/// Gaussians that need them.
+/// Maximum number of intervals into which the trajectory of a Gaussian is divided for the lines of a `.tsog`. More
+/// lines take many bytes for the few Gaussians that need them.
 const COMPACT_INTERVALS: usize = 8;
-/// Approximate bytes in a `.tsog` of a line in a time window, divided by those of a Gaussian in a single frame.
+/// Approximate number of bytes of a line with its time window in a `.tsog`, as a multiple of the bytes of a Gaussian in
+/// a single frame.
 const BYTES_RATIO: f64 = 1.5;
 
 /// Gaussians with linear motion in time windows, fitted to a sequence.
@@ -40,16 +42,17 @@ const BYTES_RATIO: f64 = 1.5;
 struct FittedWindows {
     lines: TimedGaussians,
     misfit: FitError,
-    /// Number of lines that were left out because a value of their Gaussian is not finite.
+    /// Number of lines that were left out because one of their values is not finite.
     left_out: usize,
 }
 
-/// Returns whether `kind` is a format of linear motion in time windows.
+/// Returns whether `kind` is a format of Gaussians with linear motion in time windows.
 pub fn is_windowed(kind: OutputKind) -> bool {
     matches!(kind, OutputKind::Ftgs | OutputKind::Tsog)
 }
 
-/// Returns whether the format `kind` can store Gaussians with the visibility `timeline`.
+/// Returns whether the format `kind` can store Gaussians that are visible as `timeline` says (always, in single frames,
+/// or in time windows).
 pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
     kind == OutputKind::Tsog || (kind == OutputKind::Ftgs && timeline == Timeline::Windows)
 }
@@ -57,7 +60,7 @@ pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
 /// Writes the Gaussians `timed` to the file `path`, in the format `kind`. Returns notes for the user.
 ///
 /// # Errors
-/// Fails if the file cannot be written, or if `kind` cannot store the motion ([`can_store`]).
+/// Fails if the file cannot be written, or if the format cannot store when the Gaussians are visible ([`can_store`]).
 pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
     match kind {
         OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
@@ -68,8 +71,8 @@ pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Res
     }
 }
 
-/// Writes all frames of `source` to the file `path` in the format `kind`, as lines in time windows. Returns notes for
-/// the user: the errors of the fit.
+/// Writes all frames of `source` to the file `path` in the format `kind`, as lines in time windows (linear motion with
+/// an opacity that is a Gaussian function of time). Returns notes for the user: the errors of the fit.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -115,9 +118,9 @@ pub fn write_fitted_windows(
     Ok(notes)
 }
 
-/// Returns whether single frames are written instead of `lines`: if more than [`MAX_FAR_SHARE`] of them are far off, or if
-/// single frames, which have no such error, take about as few bytes. There may be at most [`MAX_SINGLE_FRAME_GAUSSIANS`] of
-/// them.
+/// Returns whether single frames are written instead of `lines`. This is so if more than the fraction [`MAX_FAR_SHARE`]
+/// of the visible states are far off, or if single frames, which have no error of a fit, take about as few bytes.
+/// Single frames with more than [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians are not written.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
     let are_many = BYTES_RATIO * lines.params.len() as f64 >= misfit.states as f64;
@@ -125,8 +128,8 @@ fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     (is_far_off || are_many) && misfit.states <= MAX_SINGLE_FRAME_GAUSSIANS as u64 && frames <= MAX_FRAMES
 }
 
-/// Returns the visible Gaussians of all frames, each seen in its own frame only. Gaussians with values that are not
-/// finite are left out.
+/// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. Gaussians with values
+/// that are not finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
     let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(1))?;
@@ -155,7 +158,8 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
     Ok(TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip: *clip })
 }
 
-/// Fits lines in time windows to all Gaussians of `source`, for the format `kind`.
+/// Fits lines in time windows (linear motion with an opacity that is a Gaussian function of time) to all Gaussians of
+/// `source`, for the format `kind`.
 fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
@@ -181,7 +185,7 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     Ok(FittedWindows { lines: TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit, left_out })
 }
 
-/// Returns whether all values of a line fit into f32. The width of its window may be infinite.
+/// Returns whether all values of `line` are finite as f32. The width of its time window may be infinite.
 fn is_finite(line: &CubicTrack) -> bool {
     let values = line.position.iter().flatten().chain(&line.rotation[0]).chain(&line.log_scale).copied();
     let values = values.chain([line.opacity, line.center]);
@@ -189,7 +193,7 @@ fn is_finite(line: &CubicTrack) -> bool {
     values.chain(sh).all(|value| (value as f32).is_finite())
 }
 
-/// Sets the parameters of Gaussian `row` to those of `line`.
+/// Sets the parameters of the Gaussian `row` to those of the fitted line `line`.
 fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     let narrow = |value: f64| value as f32;
     let gaussians = &mut params.gaussians;
@@ -217,9 +221,10 @@ mod tests {
     use crate::files::splatv::rows::ZeroRotation;
     use crate::files::tsog::read::read_tsog;
     use crate::limits::ReadLimit;
+    use crate::outputs::tests::{blended, opacities_near};
     use crate::passes::gather_all;
 
-    /// Evaluates the formulas of the player: positions and opacities of all Gaussians at the time `time`.
+    /// Evaluates the formulas of the player: returns position and opacity of every Gaussian at the time `time`.
     fn shown(file: &Ftgs, time: f64) -> Vec<([f64; 3], f64)> {
         let params = &file.params;
         let own = |plane: usize, row: usize| f64::from(params.format_specific.plane(plane)[row]);
@@ -248,19 +253,10 @@ mod tests {
             let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             let lines = shown(&file, frame as f64 / 29.0);
             for id in 0..300 {
-                let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
-                if visible < 0.1 {
-                    continue;
-                }
-                let at = state.position.row::<3>(id).map(f64::from);
-                let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
-                let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
-                let near = lines.iter().filter(|(place, _)| distance(*place) < 0.5);
-                let depth: f64 = near.clone().map(|(_, alpha)| (1.0 - alpha).ln()).sum();
+                let Some((visible, near)) = opacities_near(&state, id, &lines) else { continue };
                 seen += 1;
-                missing += i32::from(near.filter(|(_, alpha)| *alpha > MIN_VISIBLE_OPACITY).count() == 0);
-                // Other Gaussians may lie there too, so the test can detect only a missing contribution.
-                too_faint += i32::from(1.0 - depth.exp() < visible - 0.1);
+                missing += i32::from(near.iter().all(|&alpha| alpha <= MIN_VISIBLE_OPACITY));
+                too_faint += i32::from(blended(&near) < visible - 0.1);
             }
         }
         assert!(seen > 3000 && 100 * missing < seen && 20 * too_faint < seen, "{missing} {too_faint} of {seen}");
@@ -291,7 +287,7 @@ mod tests {
         );
     }
 
-    /// Returns lines and the error of their fit, which visited `states` states.
+    /// Returns `lines` Gaussians, and the error of a fit with `states` compared states that are all off by `position`.
     fn fitted(lines: usize, states: usize, position: f64) -> (TimedGaussians, FitError) {
         let mut misfit = FitError::default();
         (0..states).for_each(|_| misfit.add(position, 0.0, 0.5));

@@ -21,13 +21,8 @@ impl<'a> SomeFrames<'a> {
 
     /// Returns the views of `schedule`, a schedule for all frames of the other source, at the chosen frames.
     pub fn views(&self, schedule: &ViewSchedule) -> ViewSchedule {
-        let mut chosen = ViewSchedule::default();
-        chosen.cameras.clone_from(&schedule.cameras);
-        for (frame, views) in schedule.iter().enumerate() {
-            if self.frames.binary_search(&frame).is_ok() {
-                chosen.push_frames(1, views);
-            }
-        }
+        let mut chosen = ViewSchedule::new(schedule.cameras.clone());
+        self.frames.iter().for_each(|&frame| chosen.push_frames(1, schedule.views(frame)));
         chosen
     }
 }

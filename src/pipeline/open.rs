@@ -57,9 +57,10 @@ pub fn open_to_measure(
         let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalized, None)?;
         let stream = open_stream(options)?;
         if !is_linked(stream.header(), options) {
-            let found = receive_measured(stream, rig, options, plan, journal)?;
-            journal.record_opening("receive", start, found.0.source().info().count, Reads::default());
-            return Ok(found);
+            let (mut scene, stages, measured) = receive_measured(stream, rig, options, plan, journal)?;
+            scene.add_outside_views(stages.measure.scan.recipe.outside);
+            journal.record_opening("receive", start, scene.source().info().count, Reads::default());
+            return Ok((scene, stages, measured));
         }
         from_input(link_stream(stream, options, rig)?, options)?
     } else {
@@ -191,7 +192,6 @@ fn receive_measured(
         Some(measuring) => finish_measuring(measuring, &stages.measure, &mut scene)?,
         None => None,
     };
-    scene.add_outside_views(stages.measure.scan.recipe.outside);
     let measured = arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))

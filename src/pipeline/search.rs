@@ -49,8 +49,8 @@ const MAX_SIZES: usize = 8;
 /// Ratio of the smallest size (number of Gaussians) that passed to the largest that failed, at or below which the
 /// search ends.
 const SAME_SIZE_RATIO: f64 = 1.04;
-/// Approximate cost of halving the number of Gaussians: the PSNR that is lost, dB, and the factor by which a loss of
-/// PSNR grows. The search guesses its next size from them.
+/// Approximate cost of halving the number of Gaussians, from which the search guesses its next size: the PSNR falls by
+/// the first number, dB, and a loss of PSNR against photographs grows by the second, a factor.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 /// Surplus of quality that is small enough to end the search. Unit: number of times that the surplus would allow the
 /// number of Gaussians to be halved.

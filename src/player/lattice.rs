@@ -1,8 +1,8 @@
-//! Quantization of frame states for the page that plays a scene: every value becomes the nearest point of a grid, so
+//! Quantization of frame states for the page that plays a scene. Every value becomes the nearest point of a grid, so
 //! that differences between frames are small integers that repeat.
 //!
-//! Input: the Gaussians of one frame. Output: planes of i32 (one scalar component of all Gaussians each), one after
-//! another. Memory: one plane per component.
+//! Input: the Gaussians of one frame. Output: multiples of quantization steps as i32. They form planes (one scalar
+//! component of all Gaussians), one after another. Memory: one plane per component.
 
 use std::ops::Range;
 
@@ -28,14 +28,14 @@ pub struct PlayerSteps {
     pub sh: f64,
 }
 
-/// Size of a position step: the scene's extent, rounded down to a power of two, times 2^−14. In a render of the whole
-/// scene on 800 pixels, positions are off by at most a fortieth of a pixel.
+/// Binary digits of a position: the position step is 2^−14 times the scene's extent, which is first rounded down to a
+/// power of two. In a render of the whole scene on 800 pixels, positions are off by at most a fortieth of a pixel.
 const POSITION_BITS: i32 = 14;
 /// Largest absolute value of a log scale on the player page, as in the rasterizer; other values are clamped.
 const LOGARITHM_LIMIT: f32 = 80.0;
 /// Largest absolute SH coefficient, in quantization steps: the player page stores coefficients in 16 bits.
 const SH_LIMIT: f64 = 32767.0;
-/// Largest absolute position, in quantization steps.
+/// Largest absolute value of a position coordinate, in quantization steps.
 const POSITION_LIMIT: f64 = (1 << 30) as f64;
 
 impl PlayerSteps {
@@ -56,8 +56,8 @@ impl PlayerSteps {
     }
 }
 
-/// Returns the indices of the scalar components of the attribute `column` among all components of a Gaussian, in the
-/// order position, rotation, log scale, opacity, SH.
+/// Returns the range of indices of the attribute `column` among all scalar components of a Gaussian. The attributes are
+/// in the order position, rotation, log scale, opacity, SH.
 pub fn component_range(column: Attributes, sh_degree: usize) -> Range<usize> {
     let width = |column: Attributes| column.width(sh_degree);
     let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
@@ -69,14 +69,15 @@ pub fn component_count(sh_degree: usize) -> usize {
     11 + 3 * sh_coefficients(sh_degree)
 }
 
-/// Writes the attributes `which` of `state` as multiples of their quantization steps into `points`, `[width, N]`;
-/// leaves the other attributes in `points` as they are. Returns the number of Gaussians that become invisible.
+/// Quantizes the attributes `which` of `state`: writes them as multiples of their quantization steps into `points`,
+/// `[components, N]`. Leaves the other attributes in `points` as they are. Returns the number of Gaussians that become
+/// invisible.
 ///
 /// Quaternions are normalized and get the sign that is closer to the earlier content of `points`. A Gaussian with a
 /// value that is not finite, or too far away for the integers, gets opacity 0 and is invisible.
 ///
 /// # Panics
-/// Panics if `points` has fewer than `width` × N values.
+/// Panics if `points` has fewer than components × N values.
 pub fn quantize_into(state: &Gaussians, which: Attributes, steps: &PlayerSteps, points: &mut [i32]) -> usize {
     let (count, degree) = (state.len(), state.sh_degree());
     let of = |column: Attributes| {
@@ -139,8 +140,9 @@ fn nearest(value: f64, step: f64) -> i32 {
     (value / step).round_ties_even() as i32
 }
 
-/// Writes unit quaternions as multiples of `step` into `points`. Of both signs of a rotation the one closer to the
-/// earlier content of `points` is taken, so that a steady rotation gives equal differences.
+/// Normalizes the quaternions `rotation` and writes them as multiples of `step` into `points`. A quaternion and its
+/// negative are the same rotation; the one closer to the earlier content of `points` is written, so that a steady
+/// rotation gives equal differences.
 fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {

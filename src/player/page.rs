@@ -20,15 +20,16 @@ use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{policy_digest, policy_meta_element};
-use crate::model::{Rig, Split};
+use crate::model::{Camera, Rig, Split};
+use crate::scene::outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
-/// Maximum number of cameras on the player page; of more cameras an even selection is taken.
+/// Maximum number of cameras on the player page. If there are more cameras, an even selection is taken.
 const CAMERAS: usize = 400;
 
 const PAGE: &str = include_str!("page/page.html");
-/// Placeholders in the HTML of the player page, each with the file content that replaces it.
+/// Placeholders in the HTML of the player page, each with the text that replaces it.
 const PARTS: [(&str, &str); 3] = [
     ("/*page.css*/", include_str!("page/page.css")),
     ("/*sorter.js*/", include_str!("page/sorter.js")),
@@ -56,7 +57,7 @@ pub struct PageModel {
     pub frames: usize,
     /// SH degree of the model.
     pub degree: usize,
-    /// Description of the encoded frames.
+    /// Description of the encoded frames of the model.
     pub track: PageSequence,
 }
 
@@ -74,10 +75,12 @@ pub struct PageScene {
     /// Center of the scene, in scene units.
     #[serde(rename = "middle")]
     pub center: [f64; 3],
-    /// Longest side of the scene without its floaters, in scene units.
+    /// Longest side of the scene in scene units, measured without stray Gaussians far away (floaters).
     pub extent: f64,
     /// Mean upward direction of the cameras.
     pub up: [f64; 3],
+    /// Directions in which the training cameras see the scene; `None` if nothing is outside them.
+    pub rig: Option<PageRig>,
     /// Names of the files of the chunks (encoded groups of frames) to load, in order; empty if the page itself contains
     /// the chunks.
     pub files: Vec<String>,
@@ -87,12 +90,36 @@ pub struct PageScene {
     pub poster: Option<String>,
 }
 
+/// Directions in which the training cameras see the scene, by which the page tells where nothing was fitted.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PageRig {
+    /// Point where the optical axes of the cameras meet, in scene units.
+    focus: [f64; 3],
+    /// Inward unit normals of the faces of the cone of directions from this point to the cameras.
+    faces: Vec<[f64; 3]>,
+    /// Sine of the angle from which a direction counts as outside.
+    tolerance: f64,
+}
+
+/// Maximum number of training cameras whose cone is computed; of more cameras an even selection is taken.
+const RIG_CAMERAS: usize = 64;
+
+/// Returns the directions in which the training cameras of `rig` see the scene. Returns `None` if there are no such
+/// cameras, or if they are all around the scene.
+pub fn training_rig(rig: &Rig) -> Option<PageRig> {
+    let all = training_cameras(rig);
+    let step = all.len().div_ceil(RIG_CAMERAS).max(1);
+    let cone = RigCone::new(&all.into_iter().step_by(step).collect::<Vec<Camera>>());
+    let faces: Vec<[f64; 3]> = cone.faces().iter().map(|face| face.to_array()).collect();
+    (!faces.is_empty()).then(|| PageRig { focus: cone.focus().to_array(), faces, tolerance: MIN_ANGLE.sin() })
+}
+
 /// Camera on the player page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageCamera {
     view: u32,
     split: Split,
-    /// Time of the camera's only view; `None` if it has several views or its view has no time.
+    /// Time of the camera's only view. `None` if the camera has several views or if its view has no time.
     time: Option<f64>,
     size: [u32; 2],
     focal: [f64; 2],
@@ -139,13 +166,13 @@ pub fn mean_up(rig: &Rig) -> DVec3 {
     if is_known { sum.normalize() } else { DVec3::Z }
 }
 
-/// Chunks (encoded groups of frames) as scripts in scratch files, until the page is written.
+/// Collection of encoded chunks (groups of frames), stored as scripts in scratch files until the page is written.
 pub struct ChunkFiles {
     folder: ScratchFolder,
-    /// For each chunk: its start as a fraction of the frames shown, index of its model, its index in the model, bytes
-    /// of its script.
+    /// Entry of each chunk: position of its first frame as a fraction of the frames shown, index of its model, index of
+    /// the chunk in the model, number of bytes of its script.
     made: Vec<(f64, usize, usize, u64)>,
-    /// Digests of the chunks' scripts, for the content security policy of the page.
+    /// Digests of the scripts of the chunks, which the content security policy of the page lists.
     digests: Vec<String>,
 }
 
@@ -158,8 +185,8 @@ impl ChunkFiles {
         Ok(ChunkFiles { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
-    /// Adds the encoded chunk `bytes` as chunk `chunk` of model `model`. `since` is the index of its first frame as a
-    /// fraction of the frames shown.
+    /// Adds the chunk `bytes`, which is chunk number `chunk` of model number `model`. `since` is the index of its first
+    /// frame as a fraction of the frames shown.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -172,7 +199,7 @@ impl ChunkFiles {
         Ok(())
     }
 
-    /// Returns the size of all chunks in bytes, as scripts.
+    /// Returns the size in bytes of the scripts of all chunks.
     pub fn bytes(&self) -> u64 {
         self.made.iter().map(|made| made.3).sum()
     }
@@ -181,15 +208,16 @@ impl ChunkFiles {
         self.folder.path().join(name(model, chunk))
     }
 
-    /// Returns (model, chunk) of all chunks in the order of their first frames, so that the first frames of both models
-    /// load first.
+    /// Returns the numbers (model, chunk) of all chunks in the order in which the page loads them. The order follows
+    /// their first frames, so that the first frames of both models load first.
     fn ordered(&self) -> Vec<(usize, usize)> {
         let mut made = self.made.clone();
         made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
         made.into_iter().map(|(_, model, chunk, _)| (model, chunk)).collect()
     }
 
-    /// Writes one HTML file with all chunks inside to `path`. Returns its size in bytes.
+    /// Writes one HTML file to `path` that contains all chunks. `stage` describes the scene. Returns the size of the
+    /// file in bytes.
     ///
     /// # Errors
     /// Fails if a file cannot be read or written.
@@ -207,7 +235,8 @@ impl ChunkFiles {
         Ok(fs::metadata(path).map_err(failed())?.len())
     }
 
-    /// Writes the page and its chunks into `folder`. Returns the names of all files, and their size in bytes together.
+    /// Writes the page and, as separate files, its chunks into `folder`. Sets the file names in `stage`, the
+    /// description of the scene. Returns the names of all written files, and their total size in bytes.
     ///
     /// # Errors
     /// Fails if a file cannot be read or written.
@@ -230,8 +259,8 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the HTML of the page up to its chunks. Its content security policy allows the scripts of the page and those
-/// with the digests `chunks`.
+/// Returns the HTML of the page before its chunks (scripts with encoded frames). `chunks` has the digests of the
+/// chunks, which the content security policy allows besides the scripts of the page itself.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
@@ -253,13 +282,13 @@ fn head(stage: &PageScene, chunks: &[String]) -> String {
     page.replace("<!--policy-->", &policy) + "<script>" + &begin + "</script>\n"
 }
 
-/// Returns the part of `page` between the first `start` and the next `end`.
+/// Returns the text in `page` between the first occurrence of `start` and the next occurrence of `end`.
 fn between<'a>(page: &'a str, start: &str, end: &str) -> &'a str {
     let rest = page.split_once(start).map_or("", |(_, rest)| rest);
     rest.split_once(end).map_or(rest, |(content, _)| content)
 }
 
-/// Returns `json` as text that may stand in a script element: `<` is escaped.
+/// Returns `json` as text that can stand in an HTML script element: `<` is escaped.
 fn inline(json: &serde_json::Value) -> String {
     json.to_string().replace('<', "\\u003c")
 }
@@ -287,6 +316,7 @@ mod tests {
             center: [0.0; 3],
             extent: 1.0,
             up: [0.0, 0.0, 1.0],
+            rig: None,
             files: Vec::new(),
             poster: None,
         }

@@ -1,4 +1,4 @@
-//! Poster: the first render of a scene, shown by the page until the scene itself is drawn.
+//! Poster: an image of the scene, which the page shows until the scene itself is drawn.
 
 use std::io;
 
@@ -16,7 +16,7 @@ use crate::source::FrameSource;
 
 /// Maximum number of pixels of a poster.
 const MAX_PIXELS: f64 = 160_000.0;
-/// JPEG quality of a poster, of 100.
+/// JPEG quality of a poster, from 1 to 100.
 const QUALITY: u8 = 80;
 
 /// Renders `source` by the first camera of `rig`, at the camera's time if it has one, else at the first frame. Returns
@@ -54,13 +54,14 @@ pub fn render_poster(
     Ok(uri)
 }
 
-/// Returns the memory for rendering a poster: bytes per Gaussian, and bytes of the render itself.
+/// Returns the memory for rendering a poster, in bytes, as two parts: an amount per Gaussian, and an amount for the
+/// render itself.
 pub fn poster_memory() -> [MemoryPart; 2] {
     // Three channels of f32, their bytes, and the JPEG.
     [("poster", SHARED_VIEW_BYTES_PER_GAUSSIAN), ("poster", render::STRIP_BYTES as u64 + 16 * MAX_PIXELS as u64)]
 }
 
-/// Returns `camera` scaled to renders of at most [`MAX_PIXELS`] pixels.
+/// Returns `camera` with its resolution reduced so that renders have at most about [`MAX_PIXELS`] pixels.
 fn smaller(camera: &Camera) -> Camera {
     let pixels = f64::from(camera.width) * f64::from(camera.height);
     let scale = (MAX_PIXELS / pixels).sqrt().min(1.0);

@@ -26,15 +26,16 @@ use crate::passes::FrameStates;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// Maximum number of quantized values of a group of frames in memory, unless one frame alone has more.
+/// Maximum number of quantized values of a group of frames, which are in memory at once. A group of one frame may have
+/// more.
 pub const GROUP_VALUES: usize = 1 << 23;
-/// Maximum number of frames of a group. The page decodes a whole group to jump in time.
+/// Maximum number of frames of a group. The page must decode a whole group to jump to another time.
 const GROUP_FRAMES: usize = 20;
 /// Compression level of deflate. Differences are mostly noise, so higher levels gain little for their time.
 const LEVEL: u32 = 6;
-/// Flag in the first byte of a component: its differences are of second order.
+/// Flag in the first byte of an encoded component: its differences are of second order.
 const SECOND_ORDER: u8 = 8;
-/// Flag in the first byte of a component: it has values of more than 16 bits.
+/// Flag in the first byte of an encoded component: it has values of more than 16 bits.
 const WIDE: u8 = 16;
 
 /// Description of a sequence of frames, which the player page reads before the chunks.
@@ -48,20 +49,20 @@ pub struct PageSequence {
     pub times: Vec<f64>,
     /// Quantization steps of the values.
     pub steps: PlayerSteps,
-    /// Ranges of scalar components that vary with time, in order: index of the first component, and number of
-    /// components.
+    /// Scalar components of a Gaussian that vary with time, as ranges in increasing order: index of the first
+    /// component, and number of components.
     pub varying: Vec<[usize; 2]>,
-    /// Index of the first frame of each group, followed by the number of frames.
+    /// Index of the first frame of each group, followed by the total number of frames.
     pub groups: Vec<usize>,
-    /// Largest number of Gaussians, over all frames, that are not finite or too far away for the quantization grid and
-    /// therefore invisible at a frame.
+    /// Largest number of Gaussians in a frame that the page does not show, because a value is not finite or a position
+    /// is too far away for the quantization grid.
     #[serde(skip)]
     pub unseen: usize,
 }
 
 impl PageSequence {
-    /// Plans the encoding of the frames `frames` of `source`: divides them into groups, with SH coefficients up to
-    /// `sh_degree` and the quantization steps `steps`.
+    /// Plans the encoding of the frames `frames` of `source`, with SH coefficients up to `sh_degree` and the
+    /// quantization steps `steps`. Divides the frames into groups and returns the description of the sequence.
     pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: PlayerSteps) -> PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
@@ -91,14 +92,15 @@ impl PageSequence {
     }
 }
 
-/// Returns the attributes that are encoded for every frame if the attributes `varying` vary with time. Opacity is among
-/// them, because a Gaussian that is not finite at some frames is invisible there.
+/// Returns the attributes that are encoded for every frame, given the attributes `varying` that vary with time. If any
+/// attribute varies, opacity is added, because a Gaussian that is not finite at some frames is invisible there.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
-/// Encodes the chunks of `track`, planned for `frames` of `source`, and passes each with its index to `sink`, in order.
-/// A reader keeps at most `held` of the frames that are decoded together in memory.
+/// Encodes the frames `frames` of `source`, for which `track` was planned. Passes each chunk with its index to `sink`,
+/// in order. Counts invisible Gaussians in `track`. Some sources decode several frames together; at most `held` decoded
+/// frames are then kept in memory.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, if a position cannot be stored accurately, or if `sink` fails.
@@ -157,8 +159,9 @@ pub fn encode(
     Ok(())
 }
 
-/// Compresses the scalar components of the attributes (such as x of the position). Each component has its quantized values of
-/// all Gaussians at the first frame, and the changes of these values for every frame.
+/// Encodes scalar components (such as x of the position) as a compressed chunk. Each component has the values of all
+/// Gaussians at the first frame of the sequence, and their values at every frame of the chunk; all values are
+/// quantized.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
@@ -170,8 +173,9 @@ fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     to.finish().map_err(failed)
 }
 
-/// Returns the encoded bytes of one scalar component: a byte of flags, then the planes of the differences between
-/// frames.
+/// Returns the encoded bytes of one scalar component: a byte of flags, then the planes of bytes of the differences
+/// between frames. `start` has the values at the first frame of the sequence, `frames` the values at the frames of the
+/// chunk.
 fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
     let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();
@@ -186,8 +190,9 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     bytes
 }
 
-/// Returns the differences between successive frames, Gaussian by Gaussian, with the sign in the lowest bit. The first
-/// difference is relative to `start`. With `is_second`, later ones are second-order differences.
+/// Returns the differences between successive frames, Gaussian by Gaussian, each with its sign in the lowest bit. The
+/// first difference of a Gaussian is relative to `start`. If `is_second`, differences after the second are of second
+/// order: relative to the value that the last step extrapolates.
 fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
     let mut values = Vec::with_capacity(start.len() * frames.len());
     for (i, &first) in start.iter().enumerate() {

@@ -11,7 +11,7 @@ use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
 use crate::player::lattice::{PlayerSteps, component_count};
-use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up};
+use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up, training_rig};
 use crate::player::poster::{self, render_poster};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::progress::Events;
@@ -22,7 +22,7 @@ use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
 /// Name of the stage, for progress and the memory plan.
 const NAME: &str = "view";
 
-/// Options of the command `view`.
+/// Options of the command `view`, which writes a page that plays one or two models.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
     /// Model to play, or the original of a compressed model. The split that these options request is ignored.
@@ -31,17 +31,18 @@ pub struct ViewOptions {
     pub compressed: Option<PathBuf>,
     /// Maximum number of frames, evenly spaced from the first to the last.
     pub max_frames: usize,
-    /// Maximum number of frames of an original beside a compressed model; `None`: `max_frames`.
+    /// Maximum number of frames of the original if a compressed model is shown beside it; `None` means `max_frames`.
     pub original_frames: Option<usize>,
-    /// Maximum SH degree of an original beside a compressed model; `None`: its own.
+    /// Maximum SH degree of the original if a compressed model is shown beside it; `None` means the degree of the
+    /// original.
     pub original_degree: Option<usize>,
-    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`render_background`].
+    /// Background color: red, green, blue in [0, 1]. If it is `None`, [`render_background`] chooses the color.
     pub background: Option<[f32; 3]>,
-    /// Maximum number of bytes of encoded frames in one HTML file; with more bytes a folder is written.
+    /// Maximum number of bytes of encoded frames in a single HTML file. If there are more bytes, a folder is written.
     pub page_limit: u64,
     /// Path of the output: an HTML file NAME.html, or a folder.
     pub output: PathBuf,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
@@ -60,7 +61,7 @@ pub struct ViewReport {
     pub notes: Vec<String>,
 }
 
-/// Checks, before any work, that the page may be written.
+/// Checks, before any work, that the output may be written.
 ///
 /// # Errors
 /// Fails as [`check_target`] does, for example if the output exists and may not be replaced.
@@ -133,6 +134,7 @@ pub fn view(options: &ViewOptions) -> Result<ViewReport> {
         center: middle.to_array(),
         extent: if extent > 0.0 { extent } else { 1.0 },
         up: mean_up(&scene.rig).to_array(),
+        rig: if scene.has_cameras { training_rig(&scene.rig) } else { None },
         files: Vec::new(),
         poster: render_poster(scene.source(), &scene.rig, background, &limits)?,
     };
@@ -167,7 +169,8 @@ struct ModelView<'a> {
     degree: usize,
 }
 
-/// Encodes `model` as model number `place` of the page, adds its chunks to `chunks`, and returns its description.
+/// Encodes the frames of `model` as model number `place` of the page and adds its chunks to `chunks`. Returns the
+/// description of the model.
 fn show(
     model: &dyn InputModel,
     place: usize,
@@ -204,7 +207,7 @@ fn evenly(frames: usize, count: usize) -> Vec<usize> {
     (0..count.min(frames)).map(|i| (i as f64 * step).round_ties_even() as usize).collect()
 }
 
-/// Returns the resource estimate (memory, time, reads) of encoding the frames for the page.
+/// Returns the resource estimate (memory, time, reads) of encoding the frames of one model for the page.
 fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
     let [per_gaussian, render] = poster::poster_memory();
     let points = 4 * component_count(work.sh_degree) as u64;

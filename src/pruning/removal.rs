@@ -13,7 +13,8 @@ use crate::source::{FrameSource, Ids};
 
 /// Number of rendered pixels of a view per Gaussian that is enough for a ranking by removal errors. Other views change
 /// the ranking more than other pixels do.
-const PIXELS_PER_GAUSSIAN: f64 = 1.5;
+const PIXELS_PER_GAUSSIAN: f64 = 1.0;
+
 /// Returns the stride of the pixels of the views by which `count` Gaussians are ranked. `pixels`: number of pixels of a
 /// view.
 pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {

@@ -1,5 +1,6 @@
 //! Stage `visible`: measures how much every Gaussian contributes to the scored views, occlusion included.
 
+use std::num::NonZeroU32;
 use std::ops::Range;
 
 use crate::error::Result;
@@ -9,6 +10,7 @@ use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
 use crate::model::{Attributes, Rows, Statistic};
 use crate::passes::{frames_to_cover, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
+use crate::pruning::removal::ranking_stride;
 use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
@@ -22,6 +24,8 @@ pub(crate) const NAME: &str = "visible";
 pub struct VisibilityStage {
     /// Parameters of the scan. Used are the strides of pixels, views and frames, and the maximum number of views.
     pub recipe: recipe::ScanParams,
+    /// Whether pruning rounds rank the Gaussians again. Then every n-th pixel is enough, see [`ranking_stride`].
+    pub is_preliminary: bool,
 }
 
 impl VisibilityStage {
@@ -33,11 +37,12 @@ impl VisibilityStage {
             Coverage::Visible => true,
             Coverage::Projected => false,
         };
-        looks.then(|| VisibilityStage { recipe: recipe.clone() })
+        looks.then(|| VisibilityStage { recipe: recipe.clone(), is_preliminary: false })
     }
 
-    /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan,
-    /// contribution C and peak W of every Gaussian, and the views being rendered.
+    /// Estimates the memory and time that this stage needs for the input `work`. Memory holds the statistics of the
+    /// scan, the contribution C and the peak W (largest weight in one pixel) of every Gaussian, and the views being
+    /// rendered.
     pub fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (mut per_gaussian, mut fixed) =
             work.view_pass_memory(limits, Attributes::all().difference(Attributes::SH), 12);
@@ -56,9 +61,16 @@ impl VisibilityStage {
             // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
+        let stride = self.pixel_stride(work.pixels, work.gaussians as usize);
         let seconds = work.reading_seconds(work.gaussian_count(), frames as f64)
-            + work.render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
+            + work.on_grid(stride).render_seconds(strided.min(max_views), work.gaussian_count(), CONTRIBUTION_COST);
         ResourceEstimate { stage: NAME, reads: work.full_reads(frames, limits), seconds, per_gaussian, fixed }
+    }
+
+    /// Returns the stride of the pixels of views of `pixels` pixels by which `count` Gaussians are measured.
+    fn pixel_stride(&self, pixels: u64, count: usize) -> NonZeroU32 {
+        let of_ranking = if self.is_preliminary { ranking_stride(pixels, count) } else { NonZeroU32::MIN };
+        self.recipe.pixel_stride.max(of_ranking)
     }
 
     /// Returns whether the views of a frame can be chosen as soon as the frame has been read. If the number of views is
@@ -77,7 +89,7 @@ impl VisibilityStage {
         let count = source.info().count;
         let frames = frames_to_cover(life, source.info().times.len());
         let pictures = scoring_views(&scene.schedule, &self.recipe, frames);
-        let stride = self.recipe.pixel_stride;
+        let stride = self.pixel_stride(scene.workload().pixels, count);
         let cameras = &scene.schedule.cameras[..];
         let look = |range: Range<usize>| {
             visible_contribution(source, (cameras, &pictures[range]), stride, scene.limits, &scene.events)

@@ -8,7 +8,7 @@ use super::{MOST_STEPS, Recipe};
 pub enum Effort {
     /// A third of the recipe's optimization steps, fewer scored views, and more Gaussians removed per pruning round.
     Fast,
-    /// The recipe's own values.
+    /// Optimization steps, scored views and pruning rounds as the recipe sets them.
     Default,
     /// Three times the recipe's optimization steps, more scored views, and fewer Gaussians removed per pruning round.
     Best,

@@ -53,7 +53,7 @@ pub struct Recipe {
     pub merge: MergeParams,
     /// Parameters of refinement, which fits the stored values of the survivors (Gaussians not removed) to renders.
     pub refine: RefineParams,
-    /// Parameters of how precisely the deformation field is written.
+    /// Parameters of the precision with which the deformation field is written.
     pub field: FieldParams,
     /// Parameters by which the SH degree of the result is chosen.
     pub bands: ShDegreeParams,

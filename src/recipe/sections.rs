@@ -31,7 +31,8 @@ pub struct ScanParams {
 pub enum ScanFrames {
     /// Every frame.
     All,
-    /// Few evenly spaced frames if the statistics of motion and opacity decide nothing, otherwise every frame.
+    /// A few evenly spaced frames if no decision of the run depends on the statistics of motion and opacity, otherwise
+    /// every frame.
     Needed,
 }
 
@@ -40,7 +41,8 @@ pub enum ScanFrames {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionParams {
-    /// The paper's divisors. Steps across gaps of the life span (frames with opacity of at least `alpha_min`) count.
+    /// The paper's definition. Steps across gaps of the life span (frames with opacity of at least `alpha_min`) count;
+    /// the sum is divided by a number that follows from the length of the life span.
     Literal,
     /// Only steps between consecutive frames of the life span count; the sum is divided by their number.
     Runs,
@@ -131,9 +133,9 @@ pub struct SelectParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LowScorePolicy {
-    /// Gaussians that are not candidates are removed.
+    /// Gaussians that stage 1 does not choose as candidates are removed.
     Drop,
-    /// Stage 2 decides on Gaussians that are not candidates in the same way as on candidates.
+    /// Stage 2 decides on Gaussians that stage 1 does not choose in the same way as on the candidates that it chooses.
     Rescue,
 }
 
@@ -169,7 +171,7 @@ pub struct RefineParams {
     pub refine_knots: usize,
 }
 
-/// Parameters of how precisely the deformation field is written.
+/// Parameters of the precision with which the deformation field is written.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]

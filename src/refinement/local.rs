@@ -69,8 +69,8 @@ pub(super) struct LinearizedFrames {
     frames: Vec<StoredFrame>,
 }
 
-/// Byte offset of a frame in the scratch file. For a sparse frame also its number of Gaussians, whose indices precede
-/// their values in the file.
+/// Place of a frame in the scratch file: byte offset `at`, and the number of Gaussians `present` if the frame is stored
+/// without its invisible Gaussians. The indices of those that are present then precede their values.
 #[derive(Debug, Clone, Copy)]
 struct StoredFrame {
     at: u64,

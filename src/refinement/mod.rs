@@ -54,8 +54,8 @@ const MIN_START_FRACTION: f64 = 0.4;
 pub(crate) const MIN_PRUNE_FRACTION: f64 = 0.8;
 /// Number of views by which the Gaussians are ranked for one prune step. Every prune step uses other views.
 const RANKING_VIEWS: usize = 48;
-/// Bytes of memory per Gaussian for its removal error, its position, a k-d tree and marks while a prune step chooses the
-/// Gaussians that stay.
+/// Bytes of memory per Gaussian for its removal error, its position, a k-d tree and marks while a prune step chooses
+/// the Gaussians that stay.
 const NEIGHBOR_BYTES: u64 = 64;
 /// Maximum number of validation views by whose error the learning rates before a prune step are set.
 const RATE_VIEWS: usize = 16;
@@ -138,11 +138,11 @@ impl RefineStage {
         StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Returns the stride at which the pixels of training views of `pixels` pixels are stored if refinement begins with
-    /// `first` Gaussians. It may be larger than [`RefineStage::stride`] allows for so many, because most of them will be
-    /// removed by prune steps.
+    /// Returns the stride at which the pixels of training views are stored. `pixels`: number of pixels of a view.
+    /// `first`: number of Gaussians with which refinement begins. Prune steps remove most of them, so the stride is
+    /// that of a third as many, which may be larger than [`RefineStage::stride`] of `first`.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
-        let fewer = if self.cuts { first / 2 } else { first };
+        let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)
     }
 
@@ -194,9 +194,14 @@ impl RefineStage {
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
+        // With a deformation field, no reader is open while steps are made, and either two more states are held while
+        // states are evaluated again, or one per thread while views are rendered.
+        let is_deformed = work.input.jacobian > 0;
+        let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
+        let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
         let left = [
-            ("states", (6 + work.threads) * whole),
-            ("jacobians", (3 + work.threads) * work.input.jacobian),
+            ("states", states * whole),
+            ("jacobians", (2 + work.threads.max(2)) * work.input.jacobian),
             ("mean", 2 * work.state_bytes(self.columns)),
             ("neighbors", NEIGHBOR_BYTES),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
@@ -206,7 +211,7 @@ impl RefineStage {
         // Peak memory is the maximum of three phases: rendering the original, optimizing constant deltas of the
         // survivors (Gaussians left by pruning), and optimizing deltas that vary with time.
         let phase = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
-            let parts = read.into_iter().chain(left).chain(more);
+            let parts = left_readers.into_iter().chain(left).chain(more);
             parts.map(|(name, bytes)| (name, bytes_of_survivors(part, bytes))).collect()
         };
         let (wanted, keyframe_count) = (self.target.unwrap_or(1.0).min(1.0), self.keyframes_for(work));
@@ -226,7 +231,6 @@ impl RefineStage {
             prune_counts(self.initial_count((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted) + if keyframe_count > 0 { along_time(self.last_steps(wanted)) } else { 0 };
         let validation_renders = pictures / targets::validation_every(own + between) as f64 * 4.0;
-        let on_grid = |stride: NonZeroU32| Workload { pixels: work.pixels / u64::from(stride.get()).pow(2), ..*work };
         let seconds = |(k, &size): (usize, &usize)| {
             let (count, left) = (size as f64 / 1e6 * work.gaussian_count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == prune_counts.len() {
@@ -236,14 +240,18 @@ impl RefineStage {
             // Evaluating states and their Jacobians under a deformation field takes three times as long as evaluating
             // states.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
-            let strided = on_grid(self.stride(work.pixels, count as usize));
+            let strided = work.on_grid(self.stride(work.pixels, count as usize));
             work.reading_seconds(count, frames as f64 * found)
                 + work.render_seconds(renders, count, RENDER_COST)
                 + strided.render_seconds(STEP_RENDERS * steps as f64, count, RENDER_COST)
                 + strided.render_seconds(ranked, count, REMOVAL_COST)
         };
         let first = prune_counts.first().map_or(0.0, |&first| first as f64 / 1e6 * work.gaussian_count());
-        let stored = on_grid(self.stored_stride(work.pixels, first as usize));
+        let stored = work.on_grid(self.stored_stride(work.pixels, first as usize));
+        // Whole views are rendered for validation, one per thread, with 6 bytes per pixel of the target view. Steps
+        // render pixels of a grid, and hold the image, its gradient and the target view.
+        let whole_views = work.threads * 24 * work.pixels;
+        let views_of_steps = (work.threads + 4) * 12 * stored.pixels;
         ResourceEstimate {
             stage: NAME,
             reads: 2.0 * work.scattered_full_reads(frames, limits),
@@ -254,16 +262,16 @@ impl RefineStage {
             fixed: vec![
                 work.filling_blocks(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
-                ("views", (work.threads + 4) * 12 * work.pixels),
+                ("views", whole_views.max(views_of_steps)),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
             ],
         }
     }
 }
 
-/// Returns how many of the `all` Gaussians of a model refinement begins with if it is to end with `wanted`. It begins
-/// with at least the fraction `starts_at` and removes the surplus in prune steps. If `starts_at` is `None`, it begins
-/// with `wanted`.
+/// Returns the number of Gaussians with which refinement begins if it ends with `wanted` of the `all` Gaussians of the
+/// model. Refinement begins with at least the fraction `starts_at` of all and removes the surplus in prune steps. If
+/// `starts_at` is `None`, it begins with `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }

@@ -65,7 +65,7 @@ pub(super) struct OptimizerState<'a> {
     /// Delta of earlier optimization steps, which `stored` and `linearized` already include.
     before: ParamDelta,
     fixed: Vec<bool>,
-    /// Loss and optimized attributes, restricted to the attributes and SH degree that the model has.
+    /// Settings of the loss, and the attributes and SH degree that are optimized, as far as the model has them.
     step_params: StepParams,
     descent: Adam,
     /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.

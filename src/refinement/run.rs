@@ -36,8 +36,8 @@ const RATE_REDUCTION: f32 = 0.3;
 /// Learning rates of the last step as a fraction of those of the first step: before a prune step, and in the final
 /// steps.
 const LAST_RATES: [f32; 2] = [1.0, 0.5];
-/// Fraction of the final steps at the end, over which the parameters are averaged. The mean is closer to the optimum than
-/// the parameters after a single step, which scatter around it.
+/// Fraction of the final steps at the end, over which the parameters are averaged. The mean is closer to the optimum
+/// than the parameters after a single step, which scatter around it.
 const AVERAGED_FRACTION: f64 = 0.4;
 /// Number of optimization steps between two parameter deltas that are averaged.
 const AVERAGE_EVERY: usize = 4;
@@ -364,7 +364,8 @@ impl<'a> RefineRun<'a> {
         Ok(Some((kept.steps, kept.schedule, kept.best_state)))
     }
 
-    /// Writes a checkpoint after `steps` steps of the phase, if enough time has passed since the last one.
+    /// Writes a checkpoint of the present phase (one prune step, or the final steps), of which `steps` optimization
+    /// steps are done. Does nothing if too little time has passed since the last checkpoint.
     fn save_checkpoint(
         &self,
         optimizer: &OptimizerState<'_>,

@@ -9,12 +9,12 @@ use super::shown::ShownImage;
 pub(super) struct Analysis {
     /// Scores, failure modes and notes of the compressed model.
     pub(super) data: ResultData,
-    /// Files that `compress` left beside the compressed model.
+    /// Files that `compress` wrote beside the compressed model.
     pub(super) run: RunFiles,
-    /// Images of the renders that the page shows.
+    /// Renders that the page shows, as images.
     pub(super) shown: Vec<ShownImage>,
     /// Animations that the page shows.
     pub(super) films: Vec<FilmPanel>,
-    /// For each failure mode that can be judged, the images of the place where it is worst.
+    /// Images of the places with the worst damage: one pair of images for each failure mode that can be judged.
     pub(super) close: Vec<WorstPlaceImages>,
 }

@@ -1,5 +1,5 @@
-//! Head of the report page: the verdict, and the changes in four cards, or in one table if there are several compressed
-//! models.
+//! Head of the report page: the verdict, and what compression changed. The changes stand on four cards, or in one table
+//! if there are several compressed models.
 
 use super::analysis::Analysis;
 use super::findings::ResultData;
@@ -7,8 +7,8 @@ use super::html::{bytes, count, db, escape, figure, percent};
 use crate::evaluation::found::ByModel;
 use crate::models::ModelSize;
 
-/// Returns the HTML of the head of the page: names of the models, verdict, and cards (of one result) or a table (of
-/// several).
+/// Returns the HTML of the head of the page: names of the models, verdict, and changes. The changes of a single result
+/// stand on cards, those of several results in a table.
 pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
     let found = &results[0].data.evaluation;
     let original = escape(&found.path.original);
@@ -50,7 +50,8 @@ fn plural(number: usize) -> &'static str {
     if number == 1 { "" } else { "s" }
 }
 
-/// Returns the HTML of a card: label, value before, value after, and a line with further figures.
+/// Returns the HTML of a card: its label, the value of the original (`before`), the value of the compressed model
+/// (`after`), and a line with further figures (`more`).
 fn card(label: &str, before: &str, after: &str, more: &str) -> String {
     format!(
         "<div class=\"card\"><span class=\"label\">{label}</span><span class=\"change\"><span>{before}</span> \
@@ -58,8 +59,8 @@ fn card(label: &str, before: &str, after: &str, more: &str) -> String {
     )
 }
 
-/// Returns the HTML of the four cards of a result: Gaussians, size, quality, and the comparison with photographs (else
-/// the render time, else SSIM).
+/// Returns the HTML of the four cards of a result: Gaussians, size, quality, and the comparison with photographs.
+/// Without photographs the last card has the render time; without render times, SSIM.
 fn cards(result: &ResultData) -> String {
     let found = &result.evaluation;
     let (counts, sizes, mean) = (found.count, found.bytes, found.loss.overall);
@@ -115,8 +116,9 @@ fn milliseconds(value: f64) -> String {
     format!("{value:.1} ms")
 }
 
-/// Returns the parts of the size that both models have (at least 1% of the compressed model's bytes), as (name, bytes
-/// before, bytes after); empty for fewer than two parts.
+/// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more
+/// than 1% of the compressed model's bytes, as (name, bytes of the original, bytes of the compressed model). Returns an
+/// empty list if there are fewer than two such parts.
 pub(super) fn size_parts(size: &ByModel<ModelSize>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();

@@ -28,18 +28,18 @@ const LETTER: f64 = 8.2;
 /// Number of different styles (color, shape, dash) of series that [`STYLE`] defines.
 const LOOKS: usize = 9;
 
-/// Axis of a chart.
+/// Axis of a chart, as the caller describes it.
 #[derive(Debug, Clone, Default)]
 pub struct ChartAxis {
     /// Measured quantity and its unit, written beside the axis.
     pub label: String,
-    /// Whether the axis is logarithmic; values that are not positive are then left out.
+    /// Whether the axis is logarithmic. Values that are not positive are then left out.
     pub log: bool,
     /// Whether the axis must reach 0.
     pub from_zero: bool,
 }
 
-/// Series of points in a plot.
+/// Series of points in a plot, drawn in one style.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
     /// Name in the legend; a series without a name is not listed.
@@ -48,7 +48,8 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// Whether a line joins the points.
     pub joined: bool,
-    /// Whether the series is paired with the one before it: same color, dashed and hollow.
+    /// Whether the series is paired with the series before it. It then has the same color, dashed lines and hollow
+    /// marks.
     pub paired: bool,
     /// Texts beside the points, shown where there is room: one per point, or none at all.
     pub labels: Vec<String>,
@@ -74,14 +75,14 @@ pub struct BarChart {
     pub title: String,
     /// Measured quantity and its unit, written below the axis.
     pub label: String,
-    /// Names and values, from top to bottom.
+    /// Name and value of each bar, from top to bottom.
     pub bars: Vec<(String, f64)>,
-    /// Whether the axis covers only the range of the values instead of starting at 0. Marks are then drawn instead of
-    /// bars.
+    /// Whether the axis covers only the range of the values instead of starting at 0. Marks are drawn instead of bars
+    /// if so.
     pub is_fitted: bool,
 }
 
-/// Chart of stacked counts: for each bin of values, the counts of several groups on top of one another.
+/// Chart of stacked counts: for each bin of values, the counts of several groups of items on top of one another.
 #[derive(Debug, Clone, Default)]
 pub struct StackedHistogram {
     /// Description of the chart for readers who do not see it.
@@ -94,7 +95,7 @@ pub struct StackedHistogram {
     pub groups: Vec<(String, Vec<usize>)>,
 }
 
-/// Axis with its range of values and its range of pixels in the chart.
+/// Scale of an axis: its range of values, and the range of SVG units (about pixels) onto which it is mapped.
 struct AxisScale {
     log: bool,
     low: f64,
@@ -104,7 +105,8 @@ struct AxisScale {
 }
 
 impl AxisScale {
-    /// Returns a scale that covers `values` with a margin, from pixel `from` to pixel `to`; `None` without values.
+    /// Returns a scale that covers `values` with a margin and runs from pixel `from` to pixel `to` of the chart; `None`
+    /// if there are no values to draw.
     fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
@@ -133,7 +135,7 @@ impl AxisScale {
         })
     }
 
-    /// Leaves `room` pixels free behind the last value on the axis.
+    /// Extends the range of values so that `room` pixels stay free behind the last value on the axis.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
@@ -146,7 +148,7 @@ impl AxisScale {
         at.is_finite().then_some(at)
     }
 
-    /// Returns round values within the range of the axis, for its ticks.
+    /// Returns the values of the ticks: round values within the range of the axis.
     fn ticks(&self) -> Vec<f64> {
         if self.log {
             let decades = (self.low.floor() as i32)..=(self.high.ceil() as i32);
@@ -170,7 +172,7 @@ impl AxisScale {
     }
 }
 
-/// Returns round values from `low` to `high`, evenly spaced.
+/// Returns about five round values from `low` to `high`, evenly spaced.
 fn even_ticks(low: f64, high: f64) -> Vec<f64> {
     let rough = (high - low) / 5.0;
     let power = 10f64.powf(rough.log10().floor());
@@ -217,7 +219,7 @@ impl Plot {
         out.finish()
     }
 
-    /// Returns the style of every series.
+    /// Returns the style (color, shape, dash) of every series.
     fn looks(&self) -> Vec<SeriesStyle> {
         let mut colors = 0;
         let look = |series: &Series| {
@@ -314,7 +316,7 @@ impl StackedHistogram {
 /// Style of a series, which selects CSS classes of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Index of the style, below [`LOOKS`].
+    /// Index of the style (color, shape, dash) in [`STYLE`], below [`LOOKS`].
     number: usize,
     hollow: bool,
 }
@@ -332,14 +334,14 @@ impl fmt::Display for SeriesStyle {
     }
 }
 
-/// Entry of a legend.
+/// Entry of a legend: a name and the style of its mark.
 struct LegendEntry<'a> {
     name: &'a str,
     look: SeriesStyle,
     joined: bool,
 }
 
-/// SVG element that is being written.
+/// Chart that is being written, as an SVG element.
 struct Drawing {
     text: String,
     height: f64,
@@ -401,8 +403,8 @@ impl Drawing {
         let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
     }
 
-    /// Writes the label `words` beside the point (`x`, `y`), inside the plot, where it overlaps no other label. Writes
-    /// nothing if there is no such place.
+    /// Writes the label `words` beside the point (`x`, `y`). The label lies inside the plot and overlaps no other
+    /// label; it is left out if there is no such place.
     fn label(&mut self, x: f64, y: f64, words: &str) {
         let wide = words.chars().count() as f64 * LETTER;
         // Left end and foot. Places above come first, because curves of error against time fall.
@@ -445,7 +447,8 @@ impl Drawing {
         self.x_axis(x, x_label, [self.top, bottom]);
     }
 
-    /// Draws ticks, grid and label of a horizontal axis for rows from `top` to `bottom`.
+    /// Draws ticks, grid lines and label of a horizontal axis. The grid lines run from `top` to `bottom`, in SVG units
+    /// (about pixels).
     fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };

@@ -5,8 +5,8 @@ use super::film::{IMAGE_NAMES, JPEG_QUALITY};
 use super::html::{db, escape, figure};
 use super::shown::{MEDIAN, ShownImage, WORST};
 
-/// Returns the HTML of the sliders of the median and the worst render. A slider shows two images of one view with a
-/// movable border between them.
+/// Returns the HTML of two sliders: for the render with the median PSNR and for the worst render. A slider shows two
+/// images of one view with a movable border between them.
 pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let median = place_of(first, MEDIAN);
@@ -20,7 +20,8 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
            made brighter until it can be seen.</p>\n"
 }
 
-/// Returns the HTML of the sliders of all chosen renders except the median and the worst one.
+/// Returns the HTML of the sliders (two images of one view with a movable border) of all chosen renders except the
+/// median and the worst one.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
@@ -48,8 +49,8 @@ struct Layer<'a> {
     note: String,
 }
 
-/// Returns the images of the chosen render with the index `place`: original, compressed models, differences, and the
-/// photograph if there is one.
+/// Returns the images of the chosen render with the index `place`, for a slider: original, compressed models,
+/// differences, and the photograph if there is one. `names` has the names of the compressed models.
 fn layers<'a>(results: &'a [Analysis], names: &[String], place: usize) -> Vec<Layer<'a>> {
     let image = |result: &'a Analysis, kind: &str| {
         let found = result.shown.get(place)?.images.iter().find(|image| image.0 == kind)?;
@@ -78,8 +79,8 @@ fn scores(shown: &ShownImage) -> String {
     format!("PSNR {}, SSIM {:.4}{flip}", db(shown.choice.psnr), shown.choice.ssim)
 }
 
-/// Returns the HTML of the slider for the chosen render with the index `place`. Its images lie on one another; CSS
-/// classes select the two that are visible.
+/// Returns the HTML of the slider for the chosen render with the index `place`. Its images lie on one another; the CSS
+/// classes select the two visible images.
 fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> String {
     let shown = &results[0].shown[place];
     let layers = layers(results, names, place);
@@ -114,8 +115,8 @@ fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> 
     out + &format!("</div>\n<p class=\"caption\">{}{shrunk}</p>\n</figure>\n", scores(shown))
 }
 
-/// Returns a remark on the size of images in which each pixel stands for `shrunk` × `shrunk` pixels of the render;
-/// empty if `shrunk` is 1.
+/// Returns a remark on the resolution of shown images: each shown pixel stands for `shrunk` × `shrunk` pixels of the
+/// render. Empty if `shrunk` is 1.
 fn at_size(shrunk: u32) -> String {
     match shrunk {
         1 => String::new(),

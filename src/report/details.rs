@@ -14,7 +14,7 @@ use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::StageRecord;
 use crate::pipeline::summary::Summary;
 
-/// Returns the HTML of the collapsed sections of the page. Each has a label and one line of explanation.
+/// Returns the HTML of the collapsed sections of the page, each with a label and one line of explanation.
 pub(super) fn details(
     results: &[Analysis],
     names: &[String],
@@ -85,12 +85,13 @@ pub(super) fn details(
         .collect()
 }
 
-/// Returns an HTML paragraph with the remark `text`, in place of data that do not exist.
+/// Returns an HTML paragraph with the remark `text`, which stands in the place of missing data.
 fn absent(text: &str) -> String {
     format!("<p class=\"note\">{text}</p>\n")
 }
 
-/// Returns HTML tables of all quality measures, of the render times, and of the parts of the size.
+/// Returns the HTML of tables with all quality measures, the render times, and the parts of the size of the compressed
+/// model `name`.
 fn numbers(result: &ResultData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(
@@ -135,8 +136,8 @@ fn numbers(result: &ResultData, name: &str) -> String {
 /// values are better.
 type Measure = (&'static str, fn(&QualityMeans) -> Option<f64>, fn(f64) -> String, bool);
 
-/// Returns HTML table rows, one per quality measure of the comparison `of`: the average, the worst frame and the worst
-/// view.
+/// Returns HTML table rows, one per quality measure of the comparison `of`, with its average, its worst frame and its
+/// worst view. `name` says what is compared.
 fn measures(name: &str, of: &Comparison) -> String {
     const MEASURES: [Measure; 4] = [
         ("PSNR", |means| Some(means.psnr), db, true),
@@ -193,7 +194,8 @@ fn stages(run: &RunFiles) -> String {
     out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
 }
 
-/// Returns a bar chart of one value per stage of the run; empty for fewer than two stages with a value.
+/// Returns a bar chart of the values that `value` returns for the stages of the run. Returns an empty text if fewer
+/// than two stages have a value.
 fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
     let bars: Vec<(String, f64)> =
         summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
@@ -255,7 +257,8 @@ fn histogram(of: &Histogram) -> String {
     .svg()
 }
 
-/// Returns the HTML of the omitted stages with their reasons, the percentiles of the terms of the score, and all notes.
+/// Returns the HTML of three lists: the omitted stages with their reasons, the percentiles of the terms of the score,
+/// and all notes.
 fn skipped(result: &ResultData, run: &RunFiles) -> String {
     let mut out = String::new();
     if let Some((summary, _)) = &run.summary {
@@ -287,7 +290,8 @@ fn skipped(result: &ResultData, run: &RunFiles) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-/// Returns the chart of the numbers of Gaussians that a search for a quality tried; empty if the run did not search.
+/// Returns the chart of a search for a quality goal: the numbers of Gaussians that it tried. Empty if the run did not
+/// search.
 fn searched(summary: &Summary) -> String {
     summary.goal.as_ref().map_or(String::new(), trade_off::search)
 }

@@ -1,7 +1,7 @@
-//! HTML files that need no network, and their parts.
+//! Frame of an HTML file that needs no network, and its building blocks.
 //!
 //! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
-//! load only the images inside and to run only the scripts named by their digests.
+//! load only images that the file contains and to run only the scripts whose digests it lists.
 
 use super::chart;
 use super::html::escape;
@@ -31,7 +31,7 @@ pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     )
 }
 
-/// Returns an HTML figure: the chart `svg` below the caption `caption`.
+/// Returns an HTML figure: the chart `svg` with the caption `caption` above it.
 pub(super) fn figure_of(caption: &str, svg: &str) -> String {
     format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
 }

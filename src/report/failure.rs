@@ -1,12 +1,12 @@
-//! Failure modes that the paper names, detected in renders.
+//! Failure modes (kinds of damage that the paper names), detected in renders.
 //!
 //! Input: the kinds of every Gaussian ([`mod@super::traits`]: fast, thin or changing in appearance) and the renders of
-//! both models. Output: for each kind the error where the kind is visible and elsewhere, the worst place, and a
-//! verdict. Where a kind is visible is known exactly: the original is rendered once more with colors that encode the
+//! both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst place, and a
+//! verdict. The visibility of a kind is known exactly: the original is rendered once more with colors that encode the
 //! kinds, which gives for every pixel the share w of each kind.
 //!
-//! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
-//! Memory: per thread one more render, and the original's state without its colors.
+//! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. Memory:
+//! per thread one more render, and the original's state without its colors.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,23 +19,25 @@ use crate::render::{Image, render};
 /// PSNR in dB below which an error counts as visible: at 40 dB the root mean square error is 1/100 of the range of
 /// colors.
 pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
-/// Minimum difference in dB between the PSNR where a kind of Gaussian is visible and the PSNR elsewhere for a failure
-/// mode to be flagged: 3 dB lower is twice the squared error.
+/// Minimum difference in dB for a failure mode to be flagged: by so much the PSNR where the kind of Gaussian is visible
+/// is below the PSNR elsewhere. 3 dB lower is twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
-/// Minimum fraction of the pixels that a kind of Gaussian must cover in a render to be judged there.
+/// Minimum share of a render's pixels that a kind of Gaussian must have for its failure mode to be judged in this
+/// render.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
-/// Minimum fraction of a kind's contribution to renders that must have been dropped or merged for its failure mode to
-/// be flagged.
+/// Minimum lost fraction of a kind's contribution to renders for its failure mode to be flagged. Lost is the
+/// contribution of Gaussians that were dropped or merged.
 pub const MIN_LOST_SHARE: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP_SIDE_PX: u32 = 64;
 
-/// Sums over the pixels of one view of the error between both models' renders, in total and for each kind of Gaussian.
+/// Error between the renders of both models in one view, summed over its pixels, in total and for each kind of
+/// Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewErrorSums {
     /// Error sums of each kind of Gaussian, in the order of [`GaussianKind::ALL`].
     kinds: [FailureSums; 3],
-    /// Sum over pixels of e², the squared difference of the two renders, averaged over channels.
+    /// Sum over pixels of e², the squared difference of the two renders, averaged over color channels.
     error: f64,
     pixels: f64,
 }
@@ -46,8 +48,8 @@ struct FailureSums {
     weight: f64,
     /// Sum over pixels of w e²: the share of the kind times the squared difference of the renders.
     error: f64,
-    /// Sums over pixels of w ∇c·∇o, and (`detail`) of w ∇o·∇o. w is the share of the kind, c and o are the brightness
-    /// of the compressed and the original render.
+    /// Sum over pixels of w ∇c·∇o, where w is the share of the kind, and c and o are the brightness of the compressed
+    /// and of the original render. `detail` is the sum of w ∇o·∇o.
     kept_detail: f64,
     detail: f64,
 }
@@ -62,7 +64,7 @@ pub enum Verdict {
     Unseen,
     /// No Gaussian of this kind was dropped or merged, or almost none.
     Untouched,
-    /// Where this kind is visible, the error is not visible or not much larger than elsewhere.
+    /// Where this kind is visible, the error is invisible or not much larger than elsewhere.
     Passed,
     /// Where this kind is visible, the error is visible and much larger than elsewhere.
     Flagged,
@@ -85,9 +87,9 @@ pub struct WorstPlace {
 /// Measurements and verdict of one failure mode: damage to one kind of Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FailureMode {
-    /// Name of the failure mode.
+    /// Name of the failure mode, as the page shows it.
     pub name: &'static str,
-    /// Description of the kind of Gaussian that the failure mode concerns.
+    /// Description of the kind of Gaussian that this failure mode concerns.
     #[serde(rename = "happens_to")]
     pub kind_description: String,
     /// Verdict on the failure mode.
@@ -100,10 +102,10 @@ pub struct FailureMode {
     /// Number of Gaussians of this kind that were merged; `None` without an index map (file that maps input to output
     /// Gaussians).
     pub merged: Option<usize>,
-    /// Contribution of this kind to renders, as a fraction of that of all Gaussians.
+    /// Contribution of the Gaussians of this kind to renders, as a fraction of the contribution of all Gaussians.
     pub coverage: f64,
-    /// Fraction of the contribution of this kind that was dropped or merged; `None` without an index map (file that
-    /// maps input to output Gaussians).
+    /// Fraction of this kind's contribution to renders that belongs to Gaussians that were dropped or merged; `None`
+    /// without an index map (file that maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
     /// Share of this kind in all pixels of all compared renders, from 0 to 1.
     #[serde(rename = "shown")]
@@ -112,25 +114,26 @@ pub struct FailureMode {
     /// nowhere visible.
     #[serde(rename = "psnr_there")]
     pub psnr_on_kind: Option<f64>,
-    /// PSNR where the kind is not visible, with each pixel weighted by the share of all others, dB.
+    /// PSNR where other Gaussians are visible, with each pixel weighted by the share that does not belong to the kind,
+    /// dB; `None` if no pixel has such a share.
     pub psnr_elsewhere: Option<f64>,
-    /// Fraction of the original's brightness gradients that the compressed renders lose where the kind is visible;
-    /// negative if they are exaggerated.
+    /// Lost fraction of the original's brightness gradients where the kind is visible; negative if the compressed model
+    /// exaggerates the gradients. `None` if the original has no gradients there.
     pub detail_lost: Option<f64>,
     /// Render in which the failure mode is worst; `None` if the kind cannot be judged in any render.
     pub worst: Option<WorstPlace>,
 }
 
-/// Counts and contribution of the Gaussians of one kind, known before rendering.
+/// Counts and contribution of the Gaussians of one kind. They are known before rendering.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KindMembers {
     /// Number of Gaussians of this kind.
     pub count: usize,
-    /// Numbers of Gaussians of this kind that were dropped and merged; `None` without an index map (file that maps
-    /// input to output Gaussians).
+    /// Numbers of Gaussians of this kind that were dropped and that were merged; `None` without an index map (file that
+    /// maps input to output Gaussians).
     pub fates: Option<(usize, usize)>,
-    /// Contribution of this kind to renders as a fraction of that of all Gaussians, and the fraction of it that was
-    /// dropped or merged.
+    /// Two fractions: contribution of this kind to renders, as a fraction of the contribution of all Gaussians; and the
+    /// fraction of this kind's contribution that belongs to Gaussians that were dropped or merged.
     pub shares: (f64, f64),
 }
 
@@ -152,8 +155,8 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[KindFlags], camera: &Camera
     render(&marked, camera, [0.0; 3])
 }
 
-/// Returns the sums of the error between the two renders `taken` of one view, for each kind of Gaussian. `state` holds
-/// the original's Gaussians, `traits` their kinds.
+/// Returns the error sums of one view, for each kind of Gaussian. `taken` has the renders of both models, `state` the
+/// original's Gaussians, `traits` their kinds.
 ///
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.
@@ -183,8 +186,8 @@ pub fn sum_errors(state: &Gaussians, traits: &[KindFlags], camera: &Camera, take
     found
 }
 
-/// Returns for each pixel the squared difference of `a` and `b`, averaged over the channels; values are first clamped
-/// to [0, 1].
+/// Returns for each pixel the squared difference of the images `a` and `b`, averaged over the channels; values are
+/// first clamped to [0, 1].
 pub fn squared_error(a: &Image, b: &Image) -> Vec<f64> {
     let square = |(a, b): (&f32, &f32)| (clamped(*a) - clamped(*b)).powi(2);
     let pixels = a.data.chunks_exact(3).zip(b.data.chunks_exact(3));
@@ -195,8 +198,8 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges the failure mode of one kind of Gaussian. `seen` holds the error sums of all renders, `names` their (frame,
-/// view).
+/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `seen` has the error
+/// sums of all renders, `names` the frame and the view of each render.
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
@@ -245,7 +248,8 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], n
     }
 }
 
-/// Returns the name of the failure mode of a kind of Gaussian, and a description of the Gaussians of this kind.
+/// Returns two texts for a kind of Gaussian: the name of its failure mode, and a description of the Gaussians of this
+/// kind.
 fn described(kind: GaussianKind) -> (&'static str, String) {
     use super::traits::{
         COLOR_CHANGE, MAX_STILL_MOTION, MIN_FAST_MOTION, MIN_NON_RIGID_CHANGE, MIN_THIN_RATIO, NEIGHBORS,
@@ -275,15 +279,16 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
     }
 }
 
-/// Returns the PSNR in dB for a weighted sum of squared errors and the sum of the weights; `None` if the weights sum to
-/// 0.
+/// Returns the PSNR in dB. `error` is a weighted sum of squared errors, `weight` the sum of the weights; `None` if the
+/// weights sum to 0.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Returns the upper left corner of the square with the largest error of one kind of Gaussian: the sum of w e² over its
-/// pixels, where w is the share of the kind and e² the squared difference of the renders. The square has a side of
-/// [`CROP_SIDE_PX`] pixels, or less in a smaller render. In a tie, the first square by rows is taken.
+/// Returns the upper left corner of the square in which the error of one kind of Gaussian is largest. The error is the
+/// sum of w e² over the pixels of the square, where w is the share of the kind in a pixel and e² the squared difference
+/// of the renders. The square has a side of [`CROP_SIDE_PX`] pixels, or less in a smaller render. Of equal squares the
+/// first is taken, row by row.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP_SIDE_PX as usize).min(width), (CROP_SIDE_PX as usize).min(height));
@@ -312,8 +317,8 @@ pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -
     best.1
 }
 
-/// Returns the part of `image` whose upper left pixel is (`left`, `top`), with [`CROP_SIDE_PX`] pixels along each side or fewer
-/// at the border.
+/// Returns the square part of `image` whose upper left pixel is (`left`, `top`). Its side is [`CROP_SIDE_PX`] pixels,
+/// or less at the border of the image.
 pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     let (width, height) = (CROP_SIDE_PX.min(image.width - left), CROP_SIDE_PX.min(image.height - top));
     let row = |y: u32| {
@@ -323,7 +328,7 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     Image { width, height, data: (top..top + height).flat_map(row).copied().collect() }
 }
 
-/// Returns the PSNR in dB, compressed against original, of the part of the renders that [`crop`] returns for `corner`.
+/// Returns the PSNR in dB, compressed against original, in the square that [`crop`] cuts out at `corner`.
 pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
     psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
 }

@@ -1,11 +1,10 @@
-//! Section of the report page about the failure modes.
+//! Section of the report page about the failure modes (damage to kinds of Gaussians that compression is known to hurt).
 
 use super::failure::{FailureMode, MIN_LOST_SHARE, MIN_PSNR_GAP_DB, VISIBLE_ERROR_PSNR_DB, Verdict};
 use super::findings::WorstPlaceImages;
 use super::html::{count, db, escape, figure, percent};
 
-/// Returns the HTML of a card for each failure mode, with its measurements and the part of a render in which it is
-/// worst.
+/// Returns the HTML of a card for each failure mode, with its measurements and images of the place where it is worst.
 pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String {
     let mut out = format!(
         "<p class=\"note\">Each pixel knows the share of its color that comes from a kind of Gaussian. A mode is flagged if \
@@ -45,7 +44,7 @@ pub(super) fn modes(modes: &[FailureMode], close: &[WorstPlaceImages]) -> String
     out + "</div>\n"
 }
 
-/// Returns the known measurements of a failure mode as text, each with its name.
+/// Returns the known measurements of a failure mode, each as its name and a text.
 fn rows(mode: &FailureMode) -> Vec<(&'static str, String)> {
     let of = |part: Option<usize>| part.map(|n| format!("{} ({})", count(n), percent(n as f64, mode.gaussians as f64)));
     let mut rows = vec![("Gaussians", Some(count(mode.gaussians)))];

@@ -1,8 +1,9 @@
-//! Animations of the page: one or two views over time, before and after, with the difference.
+//! Animations of the page: one or two views over time, rendered from the original and from the compressed model, with
+//! the difference.
 //!
-//! Input: the chosen renders, and both models. Output: JPEG files as data URIs. A page holds at most [`VIEWS`]
-//! animations of at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference:
-//! about 3 MB per result.
+//! Input: the chosen renders, and both models. Output: JPEG files as data URIs. A page has at most [`VIEWS`] animations
+//! of at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference: about 3 MB
+//! per result.
 
 use std::io;
 
@@ -20,13 +21,15 @@ use crate::model::FrameView;
 use crate::render::Image;
 use crate::scene::pictures::select_frames;
 
-/// Maximum number of animated views: the view of the worst render, and of the median one if it is another.
+/// Maximum number of animated views: the view of the worst render, and the view of the median render if it is another
+/// one.
 pub const VIEWS: usize = 2;
 /// Maximum number of frames of an animation, evenly spaced from first to last.
 pub const FRAMES: usize = 24;
 /// Maximum number of pixels of an image in an animation; larger renders are scaled down.
 pub const MAX_PIXELS: u64 = 90_000;
-/// Maximum number of pixels of a difference image in an animation. It is smaller because noise takes most bytes.
+/// Maximum number of pixels of a difference image in an animation. It is lower than [`MAX_PIXELS`], because noise in
+/// difference images takes most bytes.
 pub const MAX_PIXELS_OF_DIFFERENCE: u64 = 30_000;
 /// JPEG quality of the images of animations, from 1 to 100.
 pub const JPEG_QUALITY: u8 = 80;
@@ -50,7 +53,7 @@ pub struct FilmPanel {
     /// Width and height of the shown images, pixels.
     #[serde(skip)]
     pub size: (u32, u32),
-    /// Number of pixels of the render, along each axis, that one shown pixel stands for.
+    /// Number of render pixels along each axis that one shown pixel stands for.
     #[serde(skip)]
     pub shrunk: u32,
     /// Factor by which the difference images are brightened.
@@ -61,14 +64,15 @@ pub struct FilmPanel {
 /// Names of the three images of each frame, in the order of [`FilmPanel::images`].
 pub const IMAGE_NAMES: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Returns the bytes of memory of the animations and of the page that contains them, estimated at one byte per pixel
-/// each.
+/// Returns the number of bytes of memory for the animations and for the page that contains them, estimated at one byte
+/// per pixel each.
 pub fn memory_bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)
 }
 
-/// Renders the animations of the views of the worst and the median render in `shown`; none for a scene of one frame.
+/// Renders the animations of at most [`VIEWS`] views: the views of the worst and of the median render in `shown`.
+/// Returns no animation for a scene of one frame.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

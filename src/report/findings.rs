@@ -11,7 +11,8 @@ use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::RenderTime;
 
-/// Content of `report.json`. The fields of the first compressed model's data are at the top level.
+/// Content of `report.json`. The fields of [`ReportData::result`], the first compressed model, are at the top level of
+/// the file.
 #[derive(Debug, Serialize)]
 pub struct ReportData {
     /// Name and version of the program.
@@ -19,7 +20,7 @@ pub struct ReportData {
     /// Data of the first compressed model.
     #[serde(flatten)]
     pub result: ResultData,
-    /// Renders that the page shows.
+    /// Renders that the page shows, with the reasons for their choice.
     pub shown: Vec<ChosenRender>,
     /// Animations that the page shows.
     pub films: Vec<FilmPanel>,
@@ -38,39 +39,39 @@ pub struct ReportData {
 pub struct ResultData {
     /// Verdict in two or three sentences: size, visibility of the loss, and failure modes.
     pub verdict: String,
-    /// Comparison with the original: mean scores overall, by view and by frame.
+    /// Comparison with the original: mean scores over all renders, by view and by frame.
     pub evaluation: Evaluation,
     /// Scores of every compared render.
     pub pictures: Vec<ViewScores>,
     /// Time for rendering a view of the original and of the compressed model, if measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
-    /// For each kind of Gaussian (fast, thin, …), in the order of [`super::traits::GaussianKind::ALL`], whether the loss shows
-    /// where Gaussians of this kind are visible.
+    /// Measurements of the failure modes: for each kind of Gaussian (fast, thin, …), in the order of
+    /// [`super::traits::GaussianKind::ALL`], whether the loss is visible where Gaussians of this kind are visible.
     pub failure_modes: Vec<FailureMode>,
     /// Histograms of the scores of kept, merged and dropped Gaussians; `None` without an index map (file that maps
     /// input to output Gaussians).
     pub histograms: Option<Vec<Histogram>>,
     /// Content of the file `summary.json` of the run that wrote the compressed model, if it was found.
     pub run: Option<serde_json::Value>,
-    /// Names of the files that were not found beside the compressed model, with the reasons.
+    /// Texts about files that were not found beside the compressed model: name and reason.
     pub missing: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Notes about the cache folder, which are not part of the result.
+    /// Notes about the cache folder. They are shown to the user, but not written to the report.
     #[serde(skip)]
     pub work_notes: Vec<String>,
 }
 
-/// Images of the place where a failure mode is worst: a square part of a render of both models.
+/// Images of the place where a failure mode is worst: the same square of a render of both models.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct WorstPlaceImages {
     /// Index of the failure mode in [`ResultData::failure_modes`].
     pub(super) mode: usize,
-    /// Upper left pixel of the part in the render.
+    /// Upper left pixel of the square in the render.
     pub(super) corner: (u32, u32),
-    /// PSNR of the part, compressed against original, dB.
+    /// PSNR of the square, compressed against original, dB.
     pub(super) psnr: f64,
-    /// Data URIs of the part: original, compressed.
+    /// Data URIs of the two images of the square: original, compressed.
     pub(super) images: [String; 2],
 }

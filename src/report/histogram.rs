@@ -1,8 +1,8 @@
 //! Histograms of the scores of kept, merged and dropped Gaussians.
 //!
-//! Input: one value per Gaussian, and its fate (kept, merged or dropped). Output: counts per bin and fate. Bins have
-//! equal ratios over the positive values, because scores span many powers of ten; bins of fractions of frames have
-//! equal width from 0 to 1. Zeros are counted separately.
+//! Input: one value per Gaussian, and its fate (kept, merged or dropped). Output: counts per bin and fate. Bins of most
+//! scores have equal ratios of upper to lower edge, because scores span many powers of ten. Bins of values that are
+//! fractions of the frames have equal width from 0 to 1. Zeros are counted separately.
 
 use std::borrow::Cow;
 
@@ -15,11 +15,11 @@ use crate::statistics::score::{ScoredQuantity, Scores};
 
 /// Maximum number of bins of a histogram.
 const BINS: usize = 40;
-/// Lower edge of the first bin, as a fraction of the largest value; smaller positive values are counted in the first
+/// Lower edge of the first bin, as a fraction of the largest value. Smaller positive values are counted in the first
 /// bin.
 const DEEPEST: f64 = 1e-8;
 
-/// One value for each fate of Gaussians: kept, merged, dropped.
+/// Three values, one for each fate of Gaussians: kept, merged, dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ByFate<T> {
     /// Value for Gaussians that remain unchanged.
@@ -31,7 +31,7 @@ pub struct ByFate<T> {
 }
 
 impl<T> ByFate<T> {
-    /// Returns a mutable reference to the value for `fate`.
+    /// Returns a mutable reference to the value for the Gaussians with the fate `fate` (kept, merged or dropped).
     pub fn get_mut(&mut self, fate: Fate) -> &mut T {
         match fate {
             Fate::Kept => &mut self.kept,
@@ -48,19 +48,20 @@ pub struct Histogram {
     pub name: &'static str,
     /// Meaning of the score or statistic, with its unit.
     pub meaning: &'static str,
-    /// Whether all bins have the same ratio of upper to lower edge; otherwise they have equal width from 0 to 1.
+    /// Whether all bins have the same ratio of upper to lower edge. Otherwise all bins have the same width, from 0 to
+    /// 1.
     pub log: bool,
-    /// Edges of the bins in increasing order, one more than bins; empty if no value is positive.
+    /// Edges of the bins in increasing order, one more than there are bins; empty if no value is positive.
     pub edges: Vec<f64>,
-    /// Counts of Gaussians per bin and fate. A bin includes its lower edge, the last bin both edges; the first bin also
-    /// holds smaller positive values.
+    /// Numbers of Gaussians, per fate and per bin. A bin includes its lower edge, the last bin also its upper edge; the
+    /// first bin also has smaller positive values.
     pub bins: ByFate<Vec<usize>>,
-    /// Counts, by fate, of values that are not positive or not finite.
+    /// Numbers of Gaussians, per fate, whose value is not positive or not finite.
     pub zero: ByFate<usize>,
 }
 
-/// Returns the histograms of every score and statistic, divided by the fate of the Gaussians. `frames` is the number of
-/// frames.
+/// Returns the histograms of every score and statistic, with separate counts for each fate (kept, merged, dropped).
+/// `frames` is the number of frames.
 pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
@@ -87,15 +88,16 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
         .collect()
 }
 
-/// Returns the edges of bins of equal width from 0 to 1, for values that are a number of frames divided by `frames`.
-/// There are at most [`BINS`] bins and at most one per frame, so that no bin is narrower than 1 / `frames`.
+/// Returns the edges of bins of equal width from 0 to 1, for values that are multiples of 1 / `frames`. There are at
+/// most [`BINS`] bins, and at most `frames`, so that no bin is narrower than 1 / `frames`.
 fn even(frames: usize) -> Vec<f64> {
     let bins = frames.clamp(1, BINS);
     (0..=bins).map(|k| k as f64 / bins as f64).collect()
 }
 
 impl Histogram {
-    /// Counts `values` (one per Gaussian, with its fate in `fates`) in bins whose edges have equal ratios.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in bins whose edges have equal ratios. Returns the
+    /// histogram.
     fn from_values(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
@@ -120,7 +122,7 @@ impl Histogram {
         Histogram { log: true, ..Histogram::within(name, meaning, edges, values, fates) }
     }
 
-    /// Counts `values` (one per Gaussian, with its fate in `fates`) in the bins between `edges`.
+    /// Counts `values` (one per Gaussian, with its fate in `fates`) in the bins between `edges`. Returns the histogram.
     fn within(name: &'static str, meaning: &'static str, edges: Vec<f64>, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let bins = edges.len().saturating_sub(1);

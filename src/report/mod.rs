@@ -1,11 +1,11 @@
-//! Report: one page that shows what compression did to a model, with the data behind it.
+//! Report: one page that shows the effect of compression on a model, with the data behind it.
 //!
-//! Input: the original, one or more compressed models, their cameras, and the files that `compress` left beside its
+//! Input: the original, one or more compressed models, their cameras, and the files that `compress` wrote beside its
 //! results. Output: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
 //! The steps are `run` (files of `compress`), `traits` (Gaussians at risk), the evaluation observed by `failure`,
 //! `histogram`, `shown` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`, `details`.
 //!
-//! Memory: the memory of an evaluation and of scoring, one after the other, and the page.
+//! Memory: the memory of an evaluation or of scoring, which run one after the other, and the page.
 
 mod analysis;
 mod cards;
@@ -77,11 +77,12 @@ pub struct ReportOptions {
     pub render_time: bool,
     /// Path of the output folder.
     pub output: PathBuf,
-    /// Policy for an existing output.
+    /// Policy for an output path that already exists.
     pub overwrite: Replace,
 }
 
-/// Compares one or more compressed models with their original and writes the report.
+/// Compares one or more compressed models with their original and writes the report. Returns its data, unless the run
+/// computed only one shard (part of a divided stage).
 ///
 /// # Errors
 /// Fails if an input, the cameras, the photographs, the sweep or the output is invalid. Nothing is written then.
@@ -89,7 +90,7 @@ pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
     Completion::from_result(report_whole(options))
 }
 
-/// Runs [`report`] and returns its result. A run that computes only one shard (part of a divided stage) ends with the
+/// Runs [`report`] and returns its data. A run that computes only one shard (part of a divided stage) ends with the
 /// error [`Error::ShardDone`].
 ///
 /// # Errors
@@ -130,8 +131,8 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     Ok(report)
 }
 
-/// Compares the compressed model that `options` name with the original. The page will show the renders `wanted`; with
-/// `None` they are chosen here.
+/// Compares the compressed model that `options` name with the original. The page will show the renders `wanted`; if it
+/// is `None`, renders are chosen here. `render_time` requests that render times are measured.
 fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
@@ -199,10 +200,11 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     Ok(Analysis { data, run, shown, films, close })
 }
 
-/// Maximum size in bytes of a file that `sweep` or `precision` wrote. A thousand runs take less than one million bytes.
+/// Maximum size in bytes of a JSON file of `sweep` or `precision` that is read. A thousand runs take less than one
+/// million bytes.
 const MAX_FOUND: u64 = 16 << 20;
 
-/// Reads the JSON file at `path`, which the command `command` wrote.
+/// Reads the JSON file at `path`, which the command `command` (`sweep` or `precision`) wrote.
 fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
     let text = read_text(path, MAX_FOUND)?;
     serde_json::from_str(&text).map_err(|error| {
@@ -212,7 +214,8 @@ fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
     })
 }
 
-/// Returns a note if the summary beside the compressed model belongs to another original; otherwise none.
+/// Returns a note if the summary that was found beside the compressed model belongs to another original; otherwise no
+/// note.
 fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     let Some((summary, _)) = &run.summary else { return Ok(Vec::new()) };
     let digest = scene.input.digest()?;
@@ -225,8 +228,8 @@ fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     })
 }
 
-/// Returns the recipe found beside the compressed model, else the default one, changed so that Gaussians with NaN or
-/// infinite values are kept and do not stop the report.
+/// Returns the recipe with which the report scores Gaussians: the recipe found beside the compressed model, else the
+/// default. It is changed so that Gaussians with NaN or infinite values are kept and do not stop the report.
 fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     let mut recipe = match &run.recipe {
         Some(recipe) => recipe.clone(),
@@ -236,8 +239,8 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// Returns the views by which the run that wrote the compressed model scored Gaussians: the split with as many views as
-/// the run's summary states; if there is none, the training views, else all views.
+/// Returns the views by which the run that wrote the compressed model scored Gaussians. They are the split with as many
+/// views as the summary of the run states; if there is none, the training views, else all views.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -255,8 +258,8 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     first.map_or_else(|| scene.rig.schedule(times, None), Ok)
 }
 
-/// Returns a note if the percentiles of a term of the score differ from those of the run that wrote the compressed
-/// model. The scores in the report are then not those by which Gaussians were removed.
+/// Returns a note if the percentiles of a term of the score differ from the percentiles of the run that wrote the
+/// compressed model. The scores in the report then differ from the scores by which Gaussians were removed.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
@@ -273,8 +276,8 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     ))
 }
 
-/// Returns for each kind of Gaussian its number, the numbers of dropped and merged ones, and its contribution. `fates`
-/// is `None` without an index map (file that maps input to output Gaussians).
+/// Returns for each kind of Gaussian the counts and the contribution of its Gaussians. `traits` has the kinds of every
+/// Gaussian. `fates` is `None` without an index map (file that maps input to output Gaussians).
 fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -288,8 +291,8 @@ fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMe
     })
 }
 
-/// Renders the chosen views again, and for each failure mode the part of a render in which it is worst. Returns the
-/// images of both.
+/// Renders the chosen views once more for their images. Returns these images, and for each failure mode the images of
+/// the place where it is worst.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

@@ -7,7 +7,7 @@ use super::{cards, compare, details, quality};
 use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 
-/// JavaScript of the sliders.
+/// JavaScript of the sliders (two images with a movable border between them).
 const SLIDER: &str = include_str!("slider.js");
 /// JavaScript of the animations.
 const FILM: &str = include_str!("film.js");

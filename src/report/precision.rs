@@ -1,5 +1,5 @@
-//! Work-precision diagrams as a page: error against time and memory, a curve for every parameter, a mark for every
-//! value.
+//! Work-precision diagrams as a page: error against time and memory, with a curve for every parameter and a mark for
+//! every value of the parameter.
 //!
 //! Input: a [`PrecisionDiagram`]. Output: charts as SVG, and a page with charts.
 
@@ -15,7 +15,7 @@ use crate::evaluation::precision::{
 /// File name of the page that the command `precision` writes.
 pub const PAGE_FILE: &str = "precision.html";
 
-/// Measure of work (time or memory): its name, and the function that returns its value.
+/// Measure of work (time or memory): its axis label, and the function that returns its value for a measurement.
 type WorkMeasure = (&'static str, fn(&PrecisionSetting) -> Option<f64>);
 
 /// Measures of work along the horizontal axes of the charts.
@@ -49,7 +49,7 @@ pub fn page(found: &PrecisionDiagram) -> String {
     document(&title, &body, &[])
 }
 
-/// Returns the diagrams as an HTML section of a report.
+/// Returns the work-precision diagrams as an HTML section of a report.
 pub(super) fn section(found: &PrecisionDiagram) -> String {
     let knob = |knob: &PrecisionKnob| {
         format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
@@ -57,7 +57,7 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
-/// Returns the HTML of the conditions of the measurement and the notes.
+/// Returns the HTML of the conditions under which the diagrams were measured, and of the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
@@ -76,7 +76,7 @@ fn conditions(found: &PrecisionDiagram) -> String {
     said + &list(&found.notes)
 }
 
-/// Returns the HTML of the charts and tables of one knob (group of varied parameters).
+/// Returns the HTML of the charts and tables of one knob (group of parameters that were varied).
 fn turned(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
@@ -89,8 +89,9 @@ fn turned(knob: &PrecisionKnob) -> String {
     out
 }
 
-/// Returns the charts of one knob (group of varied parameters): each error against the time of all processors, and the
-/// first error also against wall time and memory. An error that is always 0 has no chart.
+/// Returns the charts of one knob (group of parameters that were varied). Each kind of error has a chart against the
+/// time of all processors; the first kind also has charts against wall time and memory. An error that is always 0 has
+/// no chart.
 pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     let mut errors: Vec<&String> =
         knob.curves.iter().flat_map(|curve| &curve.settings).flat_map(|m| m.errors.keys()).collect();
@@ -114,7 +115,7 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of the error called `error` against a measure of work, both on logarithmic axes.
+/// Returns the chart of the error called `error` against a measure of work (time or memory), both on logarithmic axes.
 fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
@@ -134,8 +135,8 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     (title, plot.svg())
 }
 
-/// Returns the label of a measurement in a chart: the value of the parameter, with a star if it is the value in the
-/// recipe.
+/// Returns the label of a measurement in a chart: the value of the varied parameter, with a star if the recipe has this
+/// value.
 fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
     let own = if curve.recipe_value == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))

@@ -1,12 +1,12 @@
 //! Charts of quality by frame and by view. Their axes cover only the range of the values, so that differences are
-//! visible; a chart without differences is left out.
+//! visible. A chart whose values are all equal is left out.
 
 use super::analysis::Analysis;
 use super::chart::{BarChart, ChartAxis, Plot, Series};
 use super::document::figure_of;
 use crate::evaluation::found::{Comparison, FrameMeans, QualityMeans, ViewMeans};
 
-/// Maximum number of views in a chart; of more views, the worst are shown.
+/// Maximum number of views in a chart. If there are more views, only the worst are shown.
 const MOST_VIEWS: usize = 16;
 
 /// Returns the HTML of the charts of PSNR by frame and by view; empty for a single view of a single frame.

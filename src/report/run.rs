@@ -18,10 +18,10 @@ use crate::pipeline::stages::write::{INDEX_MAP_FILE, RECIPE_FILE, companion_path
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 
-/// Result of compression for one Gaussian of the original.
+/// Fate of one Gaussian of the original: what compression did to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// The Gaussian remains, unmerged.
+    /// The Gaussian remains and was not merged.
     Kept,
     /// The Gaussian was merged with others into a proxy (one Gaussian that replaces them).
     Merged,
@@ -32,21 +32,21 @@ pub enum Fate {
 /// Files of `compress` that were found beside a compressed model and belong to it.
 #[derive(Debug, Default)]
 pub struct RunFiles {
-    /// Parsed summary of the run, and the whole JSON content of its file.
+    /// Summary of the run, parsed and as the whole JSON content of its file.
     pub summary: Option<(Summary, Value)>,
     /// Recipe (parameters) of the run.
     pub recipe: Option<Recipe>,
     /// Fate of every Gaussian of the original (kept, merged or dropped), from the index map.
     pub fates: Option<Vec<Fate>>,
-    /// For each file that was not used, its name and the reason.
+    /// Texts about files that were not used: name and reason.
     pub missing: Vec<String>,
 }
 
 impl RunFiles {
-    /// Reads the files that `compress` left beside the compressed model at `result`, which has `compressed` Gaussians;
-    /// its original has `original` Gaussians.
+    /// Reads the files that `compress` wrote beside the compressed model at `result`. `original` and `compressed` are
+    /// the numbers of Gaussians of the two models.
     ///
-    /// A file that is absent or does not fit is no error: any two models can be compared.
+    /// A file that is absent or does not fit these numbers is no error: any two models can be compared.
     pub fn read_files_beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
         let is_folder = result.is_dir();
         let mut run = RunFiles::default();
@@ -68,9 +68,9 @@ impl RunFiles {
     }
 }
 
-/// Maximum size of a summary file in bytes.
+/// Maximum size of a summary file that is read, in bytes.
 const MAX_SUMMARY: u64 = 16 << 20;
-/// Maximum size of a recipe file in bytes.
+/// Maximum size of a recipe file that is read, in bytes.
 const MAX_RECIPE: u64 = 1 << 20;
 
 fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
@@ -101,8 +101,9 @@ fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fat
     fates(&map, compressed)
 }
 
-/// Returns the fate of each Gaussian of the original from the index map `map`, which holds its index in the output or
-/// −1. Gaussians with the same index were merged. Fails if an index is not below `compressed`.
+/// Returns the fate of each Gaussian of the original. `map` is the index map: the index of each Gaussian in the output,
+/// or −1. Gaussians that share an index were merged. Fails if an index is not below `compressed`, the number of
+/// Gaussians of the output.
 fn fates(map: &[i64], compressed: usize) -> Result<Vec<Fate>, String> {
     let mut sharers = vec![0u32; compressed];
     for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place != -1) {

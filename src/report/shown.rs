@@ -1,8 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
-//! Input: the scores of all renders, from which some renders are chosen, and then the images of the chosen renders,
-//! which the caller renders a second time. Output: PNG files as data URIs. A page holds at most [`MAX_SHOWN`] renders of
-//! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! Input: first the scores of all renders, from which some renders are chosen; then the chosen renders, which the
+//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_SHOWN`] renders of at most
+//! [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 
@@ -27,13 +27,13 @@ pub const MAX_SHOWN: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
-/// Minimum fraction of the values of a difference image that must not be clipped when it is brightened.
+/// Minimum fraction of the values of a difference image that must not exceed 1 after the image is brightened.
 const UNCLIPPED: f64 = 0.999;
 /// Maximum factor by which difference images are brightened. At 64, a difference of 1/255 becomes a quarter of the
 /// range.
 const MAX_FACTOR: u32 = 64;
 
-/// Render that the page shows, with its scores.
+/// Render that is chosen for the page, with its scores.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ChosenRender {
     /// Reasons for the choice, such as "worst render".
@@ -95,8 +95,8 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
     chosen
 }
 
-/// Returns the renders `choices`, which were chosen for another compressed model of the same original, with their
-/// scores in the evaluation `found`.
+/// Returns the renders `choices` with their scores in `found`, the evaluation of another compressed model. The renders
+/// were chosen for the first compressed model of the same original.
 pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
         let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;
@@ -105,7 +105,7 @@ pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<Chose
     choices.iter().map(scored).collect()
 }
 
-/// Images of a render that the page shows.
+/// Chosen render with its images.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
     /// Chosen render, with its scores.
@@ -114,7 +114,7 @@ pub struct ShownImage {
     pub images: Vec<(&'static str, String)>,
     /// Width and height of the shown images, pixels.
     pub size: (u32, u32),
-    /// Number of pixels of the render, along each axis, that one shown pixel stands for.
+    /// Number of render pixels along each axis that one shown pixel stands for.
     pub shrunk: u32,
     /// Factor by which the difference image is brightened.
     pub factor: u32,
@@ -167,8 +167,8 @@ pub(super) fn brighter(image: &Image, factor: u32) -> Image {
     Image { data: image.data.iter().map(|v| v * factor as f32).collect(), ..*image }
 }
 
-/// Returns the largest power of two, at most [`MAX_FACTOR`], by which the difference image can be multiplied so that at
-/// most the fraction 1 − [`UNCLIPPED`] of its values exceeds 1.
+/// Returns the factor by which the image `difference` is brightened: the largest power of two, at most [`MAX_FACTOR`],
+/// for which at most the fraction 1 − [`UNCLIPPED`] of its values exceeds 1.
 fn brightening(difference: &Image) -> u32 {
     let mut values = difference.data.clone();
     if values.is_empty() {

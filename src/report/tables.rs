@@ -4,7 +4,7 @@ use super::failure::FailureMode;
 use crate::files::csv::{known, table};
 use crate::journal::records::StageRecord;
 
-/// Returns a CSV table with one line per failure mode.
+/// Returns a CSV table of the measurements of all failure modes, one line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     let names = [
         "failure_mode",
@@ -43,7 +43,7 @@ pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     table(&names, modes.iter().map(row))
 }
 
-/// Returns a CSV table with one line per stage of the run.
+/// Returns a CSV table of the stages of the run that wrote the compressed model, one line per stage.
 pub(super) fn stages(stages: &[StageRecord]) -> String {
     let row = |of: &StageRecord| {
         vec![

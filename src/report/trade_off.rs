@@ -1,4 +1,5 @@
-//! Curves of a sweep: quality against Gaussians, bytes, time and memory.
+//! Curves of a sweep (measurements of several methods at several sizes): quality against Gaussians, bytes, time and
+//! memory.
 //!
 //! Input: a [`TradeOff`]. Output: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with charts.
 
@@ -12,10 +13,10 @@ use crate::pipeline::summary::GoalSummary;
 /// File name of the page that the command `sweep` writes.
 pub const PAGE_FILE: &str = "sweep.html";
 
-/// Chart: its title, and its `<svg>` element.
+/// Chart: its caption, and its `<svg>` element.
 pub type Chart = (String, String);
 
-/// Function that returns one coordinate of a point in a chart; `None` if it is not known.
+/// Function that returns one coordinate of a measurement in a chart; `None` if it is not known.
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
 /// Returns the HTML of the page that the command `sweep` writes.
@@ -53,7 +54,8 @@ pub(super) fn section(found: &TradeOff) -> String {
     out + "</div>\n" + &list(&found.notes)
 }
 
-/// Returns the HTML of a chart of the numbers of Gaussians that a search for a quality tried, with the quality of each.
+/// Returns the HTML of a chart of a search for a quality goal: the numbers of Gaussians that it tried, and the quality
+/// of each.
 pub(super) fn search(goal: &GoalSummary) -> String {
     let mut tried: Vec<(f64, f64)> = goal.tried.iter().map(|&(size, quality)| (size as f64, quality)).collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -73,8 +75,8 @@ pub(super) fn search(goal: &GoalSummary) -> String {
     format!("<div class=\"charts\">\n{}</div>\n", figure_of(&title, &plot.svg()))
 }
 
-/// Returns all charts of a sweep: quality against size, time and memory with a series per method, and a chart for each
-/// varied parameter.
+/// Returns all charts of a sweep: quality against size, time and memory with a series per method, and a chart of error
+/// against run time for each varied parameter.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let curves = curves(found);
     let kept = |point: &TradeOffPoint| Some(100.0 * found.kept_fraction(point));
@@ -106,8 +108,8 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of error against run time for the values of one parameter, with the result of the same method
-/// without refinement at the same number of Gaussians.
+/// Returns the chart of error against run time for the tried values of the parameter `knob`. For comparison it also has
+/// the result of the same method without refinement at the same number of Gaussians.
 fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
@@ -156,7 +158,7 @@ struct MethodCurve<'a> {
     name: &'a str,
     /// Measurements by increasing number of Gaussians.
     points: Vec<&'a TradeOffPoint>,
-    /// Whether the method listed before this one is the same method with refinement.
+    /// Whether this method differs from the method listed before it only by its lack of refinement.
     paired: bool,
 }
 

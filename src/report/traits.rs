@@ -1,9 +1,9 @@
-//! Kinds of Gaussian that compression is known to hurt.
+//! Kinds of Gaussian that compression is known to hurt: fast, thin, or changing in appearance.
 //!
-//! Input: the original's frames and statistics. Output: the [`KindFlags`] (membership in each kind) of every Gaussian. The
-//! kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. The
-//! paper gives no thresholds; the thresholds here are this project's. Memory: where colors vary, one frame of colors
-//! and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
+//! Input: the original's frames and statistics. Output: the [`KindFlags`] (membership in each kind) of every Gaussian.
+//! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
+//! The paper gives no thresholds; the thresholds here are this project's. Memory: where colors vary, one frame of
+//! colors and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
 
 use rayon::prelude::*;
 
@@ -17,38 +17,38 @@ use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Minimum trajectory magnitude D of a fast Gaussian, as a fraction of the scene extent per frame: one pixel per frame
-/// in a render that shows the scene over 500 pixels.
+/// Minimum trajectory magnitude D of a fast Gaussian, as a fraction of the scene extent per frame. It is one pixel per
+/// frame in a render that shows the scene over 500 pixels.
 pub const MIN_FAST_MOTION: f64 = 2e-3;
-/// Minimum relative change of the distance between neighbors that counts as non-rigid motion: root mean square over
-/// time, exceeded for half of the neighbors.
+/// Minimum relative change over time of the distances between a Gaussian and its neighbors that counts as non-rigid
+/// motion. The change is a root mean square over time, and at least half of the neighbors must reach it.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
-/// Minimum distance by which a change of distance is divided, as a fraction of the scene extent; closer neighbors may
-/// change places invisibly.
+/// Minimum divisor for relative changes of a distance between neighbors, as a fraction of the scene extent. Neighbors
+/// that are closer than this may change places invisibly.
 const NEAREST: f64 = 1e-3;
-/// Number of nearest neighbors of a Gaussian whose distances are measured over time.
+/// Number of nearest neighbors of a Gaussian to which distances are measured over time.
 pub const NEIGHBORS: usize = 8;
 /// Minimum ratio of the largest to the middle scale of a thin Gaussian.
 pub const MIN_THIN_RATIO: f64 = 5.0;
 /// Maximum trajectory magnitude D of a still Gaussian, as a fraction of the scene extent per frame.
 pub const MAX_STILL_MOTION: f64 = 5e-4;
-/// Minimum standard deviation of the opacity over the life span (frames in which the Gaussian is alive) that counts as
-/// a change of appearance.
+/// Minimum change of opacity that counts as a change of appearance: standard deviation over the frames in which the
+/// Gaussian is alive.
 pub const OPACITY_CHANGE: f64 = 0.05;
-/// Minimum standard deviation of the base color over the life span (frames in which the Gaussian is alive) that counts
-/// as a change of appearance: root mean square over the channels, colors in [0, 1]; five steps of 1/255.
+/// Minimum change of the base color that counts as a change of appearance: standard deviation over the frames in which
+/// the Gaussian is alive, root mean square over the channels, colors in [0, 1]. It is five steps of 1/255.
 pub const COLOR_CHANGE: f64 = 0.02;
-/// Maximum number of frames, evenly spaced, at which distances and colors are measured.
+/// Maximum number of frames at which distances and colors are measured. They are evenly spaced.
 pub const MAX_SAMPLED_FRAMES: usize = 24;
 
 /// Kind of Gaussian that compression is known to damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GaussianKind {
-    /// Fast, and moving differently from its neighbors.
+    /// Fast Gaussian that moves differently from its neighbors.
     Motion,
-    /// Much longer than wide: the largest scale is at least [`MIN_THIN_RATIO`] times the middle one.
+    /// Thin Gaussian, much longer than wide: the largest scale is at least [`MIN_THIN_RATIO`] times the middle one.
     Thin,
-    /// Hardly moving, but changing in opacity or color.
+    /// Gaussian that hardly moves, but changes its opacity or color.
     Appearance,
 }
 
@@ -73,7 +73,7 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
     ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.filling_blocks()] }
 }
 
-/// Membership of one Gaussian in each kind, in the order of [`GaussianKind::ALL`].
+/// Kinds to which one Gaussian belongs: one flag per kind, in the order of [`GaussianKind::ALL`].
 pub type KindFlags = [bool; 3];
 
 /// Determines to which kinds every Gaussian belongs. A Gaussian that is never visible belongs to none.
@@ -107,8 +107,9 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
     Ok(found)
 }
 
-/// Returns for each kind of Gaussian its contribution to renders as a fraction of that of all Gaussians, and the
-/// fraction of it that belongs to Gaussians for which `is_lost` is true.
+/// Returns two fractions for each kind of Gaussian: the contribution of its Gaussians to renders, as a fraction of the
+/// contribution of all Gaussians; and the part of the kind's contribution that belongs to Gaussians for which `is_lost`
+/// is true, as a fraction.
 pub fn contribution_shares(rows: &Rows, traits: &[KindFlags], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
@@ -133,11 +134,11 @@ fn samples(frames: usize) -> Vec<usize> {
     (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
 }
 
-/// Measures the non-rigid motion around the Gaussians `ids`. For each Gaussian and each of its nearest visible
-/// neighbors at the reference frame, computes the change of their distance over time (root mean square), divided by the
-/// distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the lower median
-/// over its neighbors. A rigid motion, rotations included, gives 0. The median ignores neighbors that belong to another
-/// object.
+/// Measures how non-rigidly each of the Gaussians `ids` and its neighbors move. The neighbors are the nearest visible
+/// Gaussians at the reference frame. For each neighbor, the change of its distance over time (root mean square) is
+/// divided by the distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the
+/// lower median over its neighbors. A rigid motion, rotations included, gives 0. The median ignores neighbors that
+/// belong to another object.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -193,8 +194,8 @@ fn bending(
         .collect())
 }
 
-/// Returns the standard deviation of every Gaussian's base color over the sampled frames in which it is alive (opacity
-/// at least `alpha_min`), root mean square over the channels; empty if colors do not vary.
+/// Returns the standard deviation of every Gaussian's base color over the sampled frames `frames` in which it is alive
+/// (opacity at least `alpha_min`), root mean square over the channels. Returns an empty list if colors do not vary.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
@@ -235,7 +236,7 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::{BlockReader, Ids};
 
-    /// Frame source for tests: the function sets the attributes of a Gaussian at a frame.
+    /// Frame source for tests, made of a function that sets the attributes of a Gaussian at a frame.
     struct Made<F>(SequenceInfo, F);
 
     impl<F: Fn(usize, usize, &mut Gaussians, usize) + Sync + Send> FrameSource for Made<F> {

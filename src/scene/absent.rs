@@ -42,7 +42,8 @@ impl Absent {
     }
 }
 
-/// Reader of Gaussians of which some are absent.
+/// Reader that makes some of the Gaussians of another reader invisible: those that are excluded from the scene, because
+/// a value of theirs is NaN or infinite.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     /// Rows of the absent Gaussians among those that are read.

@@ -1,13 +1,14 @@
 //! Cameras outside the rig of a scene: viewing directions that none of its cameras, and no path between two of them,
 //! has. In a player or in VR, people move there.
 
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 
 use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
 use super::between::{SplitMix64, cameras_between, meeting_point};
-use crate::model::{Camera, ViewSchedule};
+use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of the views from cameras outside the rig, which no data set has.
 const VIEW_NUMBER: u32 = u32::MAX;
@@ -15,13 +16,15 @@ const VIEW_NUMBER: u32 = u32::MAX;
 const CAMERAS_PER_VIEW: usize = 8;
 const MAX_CAMERAS: usize = 64;
 /// Angle outside the rig from which a camera counts as outside, radians (2°).
-const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
+pub const MIN_ANGLE: f64 = 2.0 * PI / 180.0;
 /// Number of random cameras that are tried for each new camera.
 const TRIES: usize = 64;
 /// Maximum number of directions that the search for the nearest direction of a rig tries, and the gain below which it
 /// ends.
 const MAX_DIRECTIONS: usize = 64;
 const EXACT_ENOUGH: f64 = 1e-12;
+/// Sine of the angle below which a direction counts as being on a face of the cone, and two faces as the same.
+const FLAT: f64 = 1e-6;
 
 /// Directions in which the cameras of a rig see the scene: the convex cone of the directions from the point where their
 /// optical axes meet to the cameras.
@@ -31,17 +34,47 @@ pub struct RigCone {
 }
 
 impl RigCone {
-    /// Returns the cone of the directions of `cameras`.
+    /// Returns the cone of the directions of `cameras`. If the optical axes do not meet in front of all of them, as for
+    /// parallel cameras, nothing is outside the cone.
     pub fn new(cameras: &[Camera]) -> RigCone {
         let focus = meeting_point(cameras);
+        let is_ahead = |camera: &Camera| (camera.rotation * (focus - camera.center())).z > 0.0;
         let direction = |camera: &Camera| (camera.center() - focus).try_normalize();
-        RigCone { focus, directions: cameras.iter().filter_map(direction).collect() }
+        let directions =
+            if cameras.iter().all(is_ahead) { cameras.iter().filter_map(direction).collect() } else { Vec::new() };
+        RigCone { focus, directions }
     }
 
     /// Returns the angle in radians, 0 to π/2, between the direction of `camera` and the nearest direction of the cone.
     /// It is 0 inside the cone, and for a camera at the point where the optical axes meet.
     pub fn angle_outside(&self, camera: &Camera) -> f64 {
-        (camera.center() - self.focus).try_normalize().map_or(0.0, |direction| self.angle(direction))
+        let direction = (camera.center() - self.focus).try_normalize().filter(|_| !self.directions.is_empty());
+        direction.map_or(0.0, |direction| self.angle(direction))
+    }
+
+    /// Returns the point where the optical axes of the cameras meet.
+    pub fn focus(&self) -> DVec3 {
+        self.focus
+    }
+
+    /// Returns the inward unit normals of the flat faces of the cone. A direction is inside if its dot product with
+    /// none of them is negative. Takes time in proportion to the cube of the number of cameras.
+    pub fn faces(&self) -> Vec<DVec3> {
+        let all = &self.directions;
+        let pairs = (0..all.len()).flat_map(|i| (0..all.len()).filter(move |&j| j != i).map(move |j| (i, j)));
+        let normals = pairs.filter_map(|(i, j)| all[i].cross(all[j]).try_normalize());
+        let mut faces: Vec<DVec3> = Vec::new();
+        for normal in normals.filter(|normal| all.iter().all(|own| normal.dot(*own) > -FLAT)) {
+            if faces.iter().all(|face| face.distance(normal) > FLAT) {
+                faces.push(normal);
+            }
+        }
+        faces
+    }
+
+    /// Returns whether `camera` is outside the rig by more than a small angle.
+    pub fn is_outside(&self, camera: &Camera) -> bool {
+        self.angle_outside(camera) >= MIN_ANGLE
     }
 
     /// Returns the angle in radians between the unit vector `direction` and the cone.
@@ -103,9 +136,10 @@ fn least_squares(used: &[(DVec3, f64)], direction: DVec3) -> Option<Vec<f64>> {
 }
 
 /// Returns at most `count` cameras outside the rig of `cameras`. Each is one of `cameras`, or a camera between two of
-/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from the
-/// mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly anything
-/// outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in every run.
+/// them, turned about the point where the optical axes meet, away from the mean direction of the rig: its angle from
+/// the mean direction is multiplied by a random factor from 1 to `max_factor`. Returns fewer if there is hardly
+/// anything outside, as for a rig all around the scene or for parallel cameras. The random numbers are the same in
+/// every run.
 pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec<Camera> {
     let cone = RigCone::new(cameras);
     let Some(middle) = cone.directions.iter().sum::<DVec3>().try_normalize() else { return Vec::new() };
@@ -123,11 +157,18 @@ pub fn cameras_outside(cameras: &[Camera], count: usize, max_factor: f64) -> Vec
         let angle = middle.angle_between(offset);
         let more = angle.min(PI - angle).min((factor - 1.0) * angle);
         let turned = turned_about(base, cone.focus, DQuat::from_axis_angle(axis, more));
-        if cone.angle_outside(&turned) >= MIN_ANGLE {
+        if cone.is_outside(&turned) {
             found.push(turned);
         }
     }
     found
+}
+
+/// Returns the cameras of `rig` that took training views.
+pub fn training_cameras(rig: &Rig) -> Vec<Camera> {
+    let training = rig.shots.iter().filter(|shot| shot.split == Split::Train).map(|shot| shot.camera);
+    let training: BTreeSet<u32> = training.collect();
+    training.into_iter().map(|camera| rig.cameras[camera as usize].clone()).collect()
 }
 
 /// Returns `camera` turned by `turn` about the point `focus`. The scene looks from there as it does from `camera` after
@@ -144,15 +185,14 @@ impl Scene {
     /// 1 + `reach`, and every frame gets `reach` times as many views outside the rig as it has inside. Adds none if
     /// `reach` is 0 or the rig has no outside (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
-        let most = self.schedule.max_views_per_frame();
-        let cameras = match reach > 0.0 {
-            true => cameras_outside(&self.rig_cameras(), (CAMERAS_PER_VIEW * most).min(MAX_CAMERAS), 1.0 + reach),
-            false => Vec::new(),
-        };
+        if reach == 0.0 {
+            return;
+        }
+        let rig_cameras = self.rig_cameras();
+        let count = (CAMERAS_PER_VIEW * self.schedule.max_views_per_frame()).min(MAX_CAMERAS);
+        let cameras = cameras_outside(&rig_cameras, count, 1.0 + reach);
         if cameras.is_empty() {
-            if reach > 0.0 {
-                self.notes.push("outside: the cameras leave no views outside their rig to be added".to_owned());
-            }
+            self.notes.push("outside: the cameras leave no views outside their rig to be added".to_owned());
             return;
         }
         let (first, count) = (self.schedule.cameras.len(), cameras.len());
@@ -164,8 +204,8 @@ impl Scene {
             let outside = more.map(|k| (VIEW_NUMBER, (first + k % count) as u32));
             schedule.push_frames(1, &views.iter().copied().chain(outside).collect::<Vec<_>>());
         }
-        let of_rig = self.rig_cameras().len();
-        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {of_rig}"));
+        let rig_count = rig_cameras.len();
+        self.notes.push(format!("outside: {count} cameras outside the rig are used beside its {rig_count}"));
         (self.schedule, self.outside) = (schedule, reach);
         self.depend_on_views();
     }
@@ -205,6 +245,19 @@ mod tests {
     }
 
     #[test]
+    fn faces_divide_inside_from_outside() {
+        let lower = arc(5, 60.0);
+        let raised = |camera: &Camera| Camera::look_at(camera.center() + DVec3::Z, DVec3::ZERO, 0.8, (64, 48));
+        let cameras = [lower.clone(), lower.iter().map(raised).collect()].concat();
+        let (cone, faces) = (RigCone::new(&cameras), RigCone::new(&cameras).faces());
+        assert!((4..=10).contains(&faces.len()), "{}", faces.len());
+        let is_inside = |camera: &Camera| faces.iter().all(|face| face.dot(camera.center().normalize()) > -1e-4);
+        assert!(cameras_between(&cameras, 30).iter().all(is_inside));
+        let outer = cameras_outside(&cameras, 30, 1.5);
+        assert!(outer.iter().all(|camera| cone.is_outside(camera) && !is_inside(camera)));
+    }
+
+    #[test]
     fn new_cameras_are_outside_and_see_the_focus() {
         let cameras = arc(7, 60.0);
         let (cone, found) = (RigCone::new(&cameras), cameras_outside(&cameras, 40, 2.0));
@@ -220,10 +273,15 @@ mod tests {
     }
 
     #[test]
-    fn rigs_all_around_have_no_outside() {
+    fn rigs_all_around_and_parallel_ones_have_no_outside() {
         let eyes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
         let around = eyes.map(|eye| Camera::look_at(3.0 * eye + DVec3::splat(0.01), DVec3::ZERO, 0.8, (64, 48)));
         assert!(cameras_outside(&around, 5, 2.0).is_empty());
+        let aside =
+            |x: f64| Camera { translation: DVec3::new(x, 0.0, 0.0), rotation: DMat3::IDENTITY, ..around[0].clone() };
+        let parallel = [aside(0.0), aside(1.0), aside(2.0)];
+        assert!(cameras_outside(&parallel, 5, 2.0).is_empty());
+        assert_eq!(RigCone::new(&parallel).angle_outside(&around[4]), 0.0);
         assert!(cameras_outside(&[], 5, 2.0).is_empty() && cameras_outside(&around[..1], 5, 2.0).is_empty());
     }
 }

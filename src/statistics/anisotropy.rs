@@ -1,5 +1,6 @@
-//! Anisotropy E of every Gaussian: how long it is compared with its other axes. Computed from one set of scales: the
-//! canonical scales of the model, or else those of the reference frame (the frame in which most Gaussians are alive).
+//! Anisotropy E of every Gaussian: how long its longest axis is compared with its other axes. Computed from one set of
+//! scales: the canonical scales of the model, or else those of the reference frame (the frame in which most Gaussians
+//! are alive).
 
 use crate::model::{AttributeValues, Flags, Rows};
 use crate::recipe::Anisotropy;

@@ -24,8 +24,8 @@ pub(crate) enum StatisticsRows {
 pub(crate) struct SpilledRows {
     file: Spill,
     count: usize,
-    /// Statistics that the file contains, in their order. A statistic without values (such as W if it was not computed)
-    /// is not stored.
+    /// Statistics that the file contains, in the order of their values in the file. A statistic without values (such as
+    /// W if it was not computed) is not stored.
     columns: Vec<Statistic>,
 }
 

@@ -64,7 +64,7 @@ impl LifeSpans {
         self.alive
     }
 
-    /// Adds the repeated frames to the counts in `frames`; must be called before results are read.
+    /// Adds the frames counted by `repeats` to the counts in `frames`; must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {

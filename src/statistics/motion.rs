@@ -31,9 +31,8 @@ const BORN_BEFORE: u8 = 4;
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Number of frames directly before the current one that have the same opacities as the frame before them, so that
-    /// the same Gaussians are alive. `steps`, `turns` and `history` do not count these frames yet. Used only by
-    /// `MotionParams::Runs`.
+    /// Number of the latest frames whose opacities equal those of the frame before them, so that the same Gaussians are
+    /// alive. `steps`, `turns` and `history` do not count these frames yet. Used only by `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,
@@ -71,8 +70,8 @@ impl MotionSums {
     }
 
     /// Adds a frame with these positions (`[3, len]`) and opacities. `steps` holds the durations of the latest time
-    /// step and of the one before, each divided by the mean duration of a step. `steady`: the opacities have been the
-    /// same in every frame so far, this one included.
+    /// step and of the one before, each divided by the mean duration of a step. `steady` is true if the opacities have
+    /// been the same in every frame so far, this one included.
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
@@ -125,7 +124,7 @@ impl MotionSums {
         }
     }
 
-    /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame with the opacities of all frames before. Which
+    /// Adds a frame like [`MotionSums::add_frame_of_runs`], if its opacities equal those of all frames before. Which
     /// steps and turns count is then known without reading the history, so half as much memory is accessed (`cargo
     /// bench --bench scan`).
     #[inline(always)]
@@ -192,8 +191,8 @@ impl MotionSums {
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
-    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if none of its turns counts. `life`
-    /// holds the number of frames in which each is alive.
+    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if no turn (second difference of its
+    /// positions) counts. `life` holds the number of frames in which each is alive.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()
@@ -239,9 +238,10 @@ fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns the square of the last step and the length of the turn about the previous frame, both per mean step. The
-/// positions are those in the current frame, the previous one and the one before. `step` and `step_before` are the
-/// durations of the last two steps, in mean steps. With fewer than three frames the values are meaningless.
+/// Returns the square of the last step and the length of the turn (second difference of the positions) about the
+/// previous frame, both per mean step. The positions are those in the current frame, the previous one and the one
+/// before. `step` and `step_before` are the durations of the last two steps, in mean steps. With fewer than three
+/// frames the values are meaningless.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);

@@ -28,8 +28,8 @@ pub fn ulp(x: f32) -> f64 {
 }
 
 /// Sets every trajectory magnitude D below 2 ulp and curvature κ below 4 ulp of `largest_coordinate` to exactly 0,
-/// flags these rows, and returns their numbers. `largest_coordinate` is the largest |coordinate| of the whole scene, at
-/// least 0. Values that are 0 already are neither flagged nor counted.
+/// flags these rows, and returns how many values of D and of κ were set to 0. `largest_coordinate` is the largest
+/// |coordinate| of the whole scene, at least 0. Values that are 0 already are neither flagged nor counted.
 pub fn snap_noise_to_zero(rows: &mut Rows, largest_coordinate: f32) -> SnapCounts {
     let ulp = ulp(largest_coordinate);
     SnapCounts {

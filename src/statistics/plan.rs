@@ -19,8 +19,8 @@ const LEAST_STEP: f64 = 1e-50;
 /// reserve.
 const CONTRIBUTION_BITS: i32 = 51;
 
-/// Number of contributions that fit into a u64 sum before its high bits must be carried: 2¹² contributions of at most
-/// 2⁵¹, with one bit in reserve.
+/// Number of contributions that fit into a u64 sum before its high bits must be moved to another counter: 2¹²
+/// contributions of at most 2⁵¹, with one bit in reserve.
 pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 
 /// Parameters of the scan of any block of Gaussians; all blocks of a sequence use the same plan.

@@ -82,7 +82,7 @@ pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageSca
     project_planes(&view, planes, scale, sums);
 }
 
-/// Does the same as [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
+/// Adds coverage like [`project_planes`], compiled for AVX2: the same operations, four Gaussians at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
@@ -116,8 +116,8 @@ impl ScanView {
     }
 }
 
-/// Adds the coverage of one view to `sums`, [`BLOCK_LANES`] Gaussians at a time. Inlined into every function that is
-/// compiled for one instruction set.
+/// Adds the covered pixels times opacity of each Gaussian in one view to `sums`, [`BLOCK_LANES`] Gaussians at a time.
+/// Inlined, so that each instruction set has its own compiled version.
 #[inline(always)]
 fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let n = planes.opacity.len();
@@ -240,8 +240,8 @@ impl<const N: usize> ProjectedBlock<N> {
     }
 }
 
-/// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate by position:
-/// f/z·(w − slope·w₂), with the camera axis w of this coordinate and the viewing axis w₂.
+/// Returns a row of J·W (Jacobian times camera rotation), which is the gradient of one pixel coordinate with respect to
+/// the position: f/z·(w − slope·w₂), with the camera axis w of this coordinate and the viewing axis w₂.
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))

@@ -21,8 +21,8 @@ pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
 /// 2⁵² fixed-point units times the opacity, rounds to 0.
 const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 
-/// Number of low bits that remain in a sum of contributions when its high bits are carried. 2³² contributions of at
-/// most 2⁵¹ leave 31 bits above them, which fit into u32.
+/// Number of low bits that remain in a sum of contributions when its high bits are moved to a separate u32. After 2³²
+/// contributions of at most 2⁵¹, the sum has 31 bits above its low bits, which fit into the u32.
 const CARRY_BITS: u32 = 52;
 
 /// Attributes that a scan needs of every model; SH coefficients may be omitted.
@@ -47,7 +47,7 @@ pub struct BlockScan<'a> {
     /// `carried · 2^CARRY_BITS + coverage`.
     coverage: Vec<u64>,
     carried: Vec<u32>,
-    /// Number of (frame, view) pairs added to `coverage` since its high bits were last carried.
+    /// Number of (frame, view) pairs added to `coverage` since its high bits were last moved to `carried`.
     uncarried: usize,
     touched: Vec<u32>,
     alive_per_frame: Vec<u32>,
@@ -134,16 +134,16 @@ impl<'a> BlockScan<'a> {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Does the same as [`BlockScan::advance_portable`], compiled for AVX2: the same operations, several Gaussians at a
-    /// time.
+    /// Adds a frame like [`BlockScan::advance_portable`], compiled for AVX2: the same operations, several Gaussians at
+    /// a time.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.advance_portable(t, gaussians, changed);
     }
 
-    /// Adds a frame to decoded attributes, life spans and motion. Inlined, with the loops it calls, into the copy of
-    /// each instruction set.
+    /// Updates the decoded attributes, the life spans and the motion sums with frame `t`. The compiler inlines this
+    /// function and the loops it calls into the copy for each instruction set.
     #[inline(always)]
     fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);

@@ -14,14 +14,15 @@ const MAX_LOG_SCALE: f64 = 100.0;
 /// frame they are found in the first-level cache.
 pub(super) const CHUNK: usize = 256;
 
-/// Opacities, axes and flags of a block of Gaussians at the current frame.
+/// Opacities, axes (rotation times scales) and flags of a block of Gaussians at the current frame.
 pub(super) struct BlockState {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
     /// Matrix R·S (rotation times scales) of each Gaussian: entry (row, axis) is in array 3·row + axis. Valid as of the
     /// last update of the Gaussian's chunk.
     pub(super) axes: [Vec<f64>; 9],
-    /// For each chunk of Gaussians, whether rotations or scales have changed since the axes were computed.
+    /// For each chunk of Gaussians, whether rotations or scales have changed since the axes (rotation times scales)
+    /// were computed.
     axes_outdated: Vec<bool>,
     pub(super) flags: Vec<Flags>,
     /// Largest finite |coordinate| of the positions so far, scene units.
@@ -42,7 +43,8 @@ impl BlockState {
     }
 
     /// Takes over the attributes `changed` of the next frame, and flags non-finite values and zero quaternions in them.
-    /// Axes are only needed for projection and are computed later, by [`BlockState::update_axes`].
+    /// The axes (rotation times scales) are needed only for projection. [`BlockState::update_axes`] computes them
+    /// later.
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {

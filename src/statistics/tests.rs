@@ -276,8 +276,8 @@ fn zero_quaternion_is_flagged_and_counts_as_identity() {
     assert_eq!((got.c, got.flags), (expected.c, vec![Flags::ZERO_ROTATION, Flags::empty()]));
 }
 
-/// For one Gaussian in one view: returns the area, the visibility, and the area as the slow reference (oracle) computes
-/// it.
+/// Returns the area and the visibility of one Gaussian in one view, then its area as the slow reference (oracle)
+/// computes it.
 fn one_view(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
     let schedule = schedule(1, 1);
     let mut g = Gaussians::zeros(1, 0);

@@ -13,8 +13,9 @@ const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
 const COLOR_UNIT: f32 = 0.1;
-/// Parameters of the test by which two Gaussians are near-duplicates: `REACH` is the distance, in sizes of the smaller
-/// Gaussian, that adds 1 to the cost; `STRICTNESS` is the factor of the difference in appearance.
+/// Parameters of the cost by which two Gaussians are near-duplicates ([`ComparedAppearance::distance_cost`]):
+/// `DUPLICATE_REACH` is the distance, in sizes of the smaller Gaussian, that adds 1 to the cost; `DUPLICATE_STRICTNESS`
+/// is the factor by which the difference in appearance is multiplied.
 const DUPLICATE_REACH: f32 = 0.25;
 const DUPLICATE_STRICTNESS: f32 = 4.0;
 
@@ -37,7 +38,7 @@ pub(super) struct ComparedAppearance {
 }
 
 impl ComparedAppearance {
-    /// Returns the appearance of every Gaussian of a frame, in their order.
+    /// Returns the appearance of every Gaussian of the frame `state`, in the order of the Gaussians.
     pub(super) fn all_from_state(state: &Gaussians) -> Vec<ComparedAppearance> {
         (0..state.len())
             .into_par_iter()
@@ -67,7 +68,7 @@ impl ComparedAppearance {
         }
     }
 
-    /// Returns this appearance, moved to `position`.
+    /// Returns a copy of this appearance with the position `position`, scene units.
     pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
         ComparedAppearance { position, ..self }
     }

@@ -6,7 +6,8 @@ use super::track::{Candidates, NONE, OpenTrack, Round};
 
 /// Largest accepted fraction of a frame's links that is expected to be wrong.
 pub(super) const MAX_WRONG: f64 = 0.005;
-/// Difference below which two costs of links count as equal.
+/// Cost that is added to the numerator and to the denominator of each ratio of link costs. Two costs whose difference
+/// is smaller then count as equal.
 const COST_TOLERANCE: f32 = 1e-6;
 /// Assumed probability that a track's own Gaussian is absent from a frame, although an unrelated one lies within reach.
 const ABSENCE_PROBABILITY: f32 = 0.25;
@@ -17,8 +18,10 @@ pub(super) struct LinkConfidence {
     expected_wrong: f64,
     /// Probability and track number of each link that is wrong with a probability above [`MAX_WRONG`].
     doubtful: Vec<(f32, u32)>,
-    /// For every track, how well the best rival of its link would do: (cost of the link + cost of the rival link) /
-    /// (their cost with the Gaussians exchanged). Holds the largest ratio over all rivals; 0 without a rival.
+    /// For every track the largest ratio R over all rivals of its link; 0 without a rival. A rival is another track or
+    /// another Gaussian with which one end of the link could be linked instead. R is the cost of the present links of
+    /// the tracks concerned, divided by the cost after they exchange their Gaussians. The larger R is, the more likely
+    /// the link is wrong.
     ratios: Vec<f32>,
 }
 
@@ -27,8 +30,8 @@ impl LinkConfidence {
         LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
-    /// Adds the links made in a round of linking (rounds have increasing limits of cost). `candidates_by_track` holds,
-    /// for the tracks that took part, the Gaussians that might have continued them.
+    /// Adds to the estimates the links that one round of linking made. `candidates_by_track` holds, for each track that
+    /// took part in the round, the Gaussians that might have continued it. Costs of links are those of `round`.
     pub(super) fn add_round(
         &mut self,
         links: &Links,
@@ -82,8 +85,8 @@ impl LinkConfidence {
         }
     }
 
-    /// Removes the least certain links until the number of wrong ones among the rest is expected to be at most the
-    /// fraction [`MAX_WRONG`]. Returns the Gaussians whose links were removed.
+    /// Removes the least certain links until at most the fraction [`MAX_WRONG`] of the remaining links is expected to
+    /// be wrong. Returns the Gaussians whose links were removed.
     pub(super) fn drop_doubtful(mut self, links: &mut Links) -> Vec<u32> {
         self.doubtful.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let count = links.count();

@@ -9,23 +9,24 @@ use super::appearance::{ComparedAppearance, mix};
 
 /// Maximum number of Gaussians that a search visits in one cell, so that crowded cells do not make searches slow.
 const MAX_PER_CELL: usize = 64;
-/// Maximum number of cells along an axis that a search visits. The distance within which the fastest track is searched
-/// never takes more.
+/// Maximum number of cells along an axis that a search visits. Even the search for the continuation of the fastest
+/// track, which reaches farthest, never needs more cells.
 const MAX_CELLS_PER_AXIS: i64 = 8;
 
 /// Some of the Gaussians of a frame, sorted by the cells of the grid in which they lie.
 pub(super) struct CellGrid {
     reach: f64,
     mask: usize,
-    /// Index in `entries` of the first Gaussian of each hash bucket, and the total count at the end.
+    /// For each hash bucket the index in `entries` of its first Gaussian, followed by the total number of entries.
     starts: Vec<u32>,
-    /// Cell of each entry of `entries`, in the same order. A list of its own, so that Gaussians of other cells in a
-    /// bucket are skipped without loading their entries into the cache.
+    /// Hash of the cell of each entry of `entries`, in the same order. The hashes are kept apart from the entries, so
+    /// that a search skips Gaussians of other cells in a bucket without loading their entries into the processor's
+    /// cache.
     cells: Vec<u64>,
     entries: Vec<CellEntry>,
 }
 
-/// Gaussian in the grid.
+/// Gaussian in the grid: its appearance, and its number in the frame.
 struct CellEntry {
     appearance: ComparedAppearance,
     number: u32,

@@ -5,13 +5,14 @@ use crate::model::Gaussians;
 
 /// Maximum number of Gaussians that are compared for a pair of frames.
 const MAX_COMPARED: usize = 4096;
-/// Two frames are in the same order if the median difference between Gaussians at the same index is at most this
-/// fraction of that between unrelated Gaussians.
+/// Largest median difference between Gaussians at the same index with which two frames count as being in the same
+/// order, as a fraction of the median difference between unrelated Gaussians.
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
 /// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
-/// Largest difference that may come from rounding by the program that wrote the frames. A distance is in sizes of a
-/// Gaussian; a difference in appearance is in the units of link costs. Smaller differences count as 0.
+/// Difference up to which two Gaussians count as equal (difference 0), because it may come from rounding by the program
+/// that wrote the frames. Applies to distances in sizes of a Gaussian, and to differences in appearance in the units of
+/// link costs.
 const NEGLIGIBLE: f64 = 1e-3;
 
 /// Differences between the Gaussians of two frames at the same index, and between unrelated ones. All are medians.

@@ -31,7 +31,7 @@ const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 /// after the [`Linker`] has linked it.
 pub struct Joiner([JoinedTracks; 2]);
 
-/// Tracks that are joined by one of the two rules.
+/// Pairs of tracks that are or may be joined by one of the two [`RULES`].
 struct JoinedTracks {
     rule: &'static Round,
     /// Pairs of tracks that may still be joined, in the order of the later track, then of cost.
@@ -65,8 +65,8 @@ impl Default for Joiner {
 }
 
 impl Joiner {
-    /// Bytes of memory for each track begun so far, including the result. The lists grow by being copied to twice their
-    /// length.
+    /// Bytes of memory of the joiner for each track begun so far, the result of [`Joiner::finish`] included. Each list
+    /// is counted twice, because it is copied when it grows.
     pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
     /// Bytes of memory for each open track, that is, each track that may still continue.
     pub const BYTES_PER_OPEN_TRACK: usize = 2 * size_of::<ComparedAppearance>()
@@ -133,8 +133,8 @@ impl Joiner {
         }
     }
 
-    /// Ends the joining; to be called after the last frame. Returns for each join rule (`ALIKE` first) the index of the
-    /// joined track of every track, in the order in which the tracks began, and the number of joined tracks.
+    /// Ends the joining; to be called after the last frame. Returns a pair for each rule (`ALIKE` first): for every
+    /// track, in the order in which tracks began, the index of its joined track; and the number of joined tracks.
     pub fn finish(self, linker: &Linker) -> [(Vec<u32>, usize); 2] {
         self.0.map(|joined| joined.finish(linker))
     }
@@ -204,7 +204,8 @@ impl JoinedTracks {
         }
     }
 
-    /// Returns for each track the index of its joined track, and the number of joined tracks.
+    /// Ends the joining by one rule. Returns for each track the index of its joined track, and the number of joined
+    /// tracks.
     fn finish(mut self, linker: &Linker) -> (Vec<u32>, usize) {
         let open_tracks = linker.open_tracks();
         self.pairs.retain_mut(|pair| {

@@ -13,9 +13,10 @@ use crate::model::Gaussians;
 
 /// Maximum number of consecutive frames in which a track may have no Gaussian before it ends.
 pub const MAX_GAP_FRAMES: u32 = 3;
-/// Parameters of the test whether a Gaussian takes the place of a track that has no Gaussian in this frame: distance
-/// from the expected position, in sizes of the Gaussian, that costs 1; and factor of the difference in appearance. The
-/// Gaussian passes with a cost of at most 1.
+/// Parameters of the test whether a Gaussian has taken the place of a track that has no Gaussian in this frame. The
+/// first is the distance from the expected position, in sizes of the Gaussian, that adds 1 to the cost. The second is
+/// the factor by which the difference in appearance is multiplied. The Gaussian passes the test if the cost is at most
+/// 1.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
 /// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
 const MIN_FOR_CUT: usize = 16;
@@ -39,15 +40,15 @@ pub struct FrameLinks {
     pub linked: usize,
     /// Number of Gaussians whose link to a track was dropped because it was probably wrong. They begin new tracks.
     pub doubtful: usize,
-    /// Whether this frame shows something else than the previous frame (a cut), so that no track continues.
+    /// Whether this frame is a cut: it shows something else than the previous frame, so that all tracks end before it.
     pub is_cut: bool,
 }
 
 impl Linker {
     /// Bytes of memory for each Gaussian of the frame that is being linked, not counting the frame itself.
     pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<ComparedAppearance>() + 9 * size_of::<u32>();
-    /// Bytes of memory for each open track (track that may continue), in a list that grows by being copied to twice its
-    /// length.
+    /// Bytes of memory for each open track (track that may continue). The list of tracks is counted twice, because it
+    /// is copied when it grows.
     pub const BYTES_PER_TRACK: usize =
         2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + MAX_CANDIDATES * size_of::<Candidate>() + size_of::<f32>();
 
@@ -93,9 +94,9 @@ impl Linker {
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. Gaussians that are
-    /// not linked begin tracks; those in `in_doubt` lost a link that was probably wrong, and their tracks are marked
-    /// so.
+    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. Each Gaussian without
+    /// a link begins a track. `in_doubt` lists the Gaussians whose link was removed because it was probably wrong; the
+    /// tracks that they begin are marked ([`OpenTrack::is_in_doubt`]).
     fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
@@ -123,8 +124,8 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the numbers of the tracks that are missing for the first time although a Gaussian at their expected
-    /// position looks like them.
+    /// Returns the indices in `tracks` of the tracks that are missing for the first time although a Gaussian at their
+    /// expected position looks like them.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

@@ -6,7 +6,7 @@ use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Maximum number of times that all tracks are tried for exchanges of their Gaussians.
+/// Maximum number of passes over all tracks in which tracks exchange their Gaussians to lower the costs of links.
 const MAX_EXCHANGES: usize = 4;
 
 /// Links between the open tracks and the Gaussians of a frame, in both directions.
@@ -96,8 +96,9 @@ impl Links {
         candidates_by_track
     }
 
-    /// Exchanges the Gaussians of two tracks if that lowers the total cost of their links. Goes through the tracks in
-    /// order. Returns whether any exchange was made.
+    /// Exchanges the Gaussians of two tracks wherever that lowers the total cost of their links. Goes through the
+    /// tracks in order. `cost` returns the cost of the link between a track and a Gaussian. Returns whether any
+    /// exchange was made.
     fn exchange(&mut self, candidates_by_track: &[(u32, Candidates)], cost: impl Fn(u32, u32) -> f32) -> bool {
         let mut any = false;
         for (track, candidates) in candidates_by_track {
@@ -118,7 +119,8 @@ impl Links {
         any
     }
 
-    /// Links tracks to their candidates, cheapest first; ties in the order of track, then Gaussian.
+    /// Links tracks to their candidates (the Gaussians that could continue them) in the order of cost; ties in the
+    /// order of track, then Gaussian. Skips tracks and Gaussians that already have a link.
     fn link_by_cost(&mut self, candidates_by_track: &[(u32, Candidates)]) {
         let mut best = vec![(f32::INFINITY, NONE); self.track_of_gaussian.len()];
         for (track, candidates) in candidates_by_track {

@@ -3,8 +3,8 @@
 //! Input: frames in order, each with any number of Gaussians in any order. Output: for every Gaussian the number of a
 //! *track*, which is one Gaussian followed through the frames. Memory: [`Linker::BYTES_PER_GAUSSIAN`] for every
 //! Gaussian of the frame that is being linked, and [`Linker::BYTES_PER_TRACK`] for every open track. A track is open if
-//! it had a Gaussian in this frame or in one of the [`MAX_GAP_FRAMES`] frames before it. Time: linear in the number of Gaussians,
-//! wherever they lie.
+//! it had a Gaussian in this frame or in one of the [`MAX_GAP_FRAMES`] frames before it. Time: linear in the number of
+//! Gaussians, wherever they lie.
 //!
 //! The appearance of a Gaussian is its position x, its size s (the root mean square of its three scales), its shape Ŝ
 //! (the covariance divided by its trace), its opacity α and its base color c. A track last seen n frames ago has the

@@ -201,7 +201,8 @@ impl SlowLinker {
         self.extend_tracks(&all, &gaussian_of)
     }
 
-    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian.
+    /// Advances the open tracks by a frame and returns the number of the track of every Gaussian. `gaussian_of` maps
+    /// each linked track to its Gaussian; all other Gaussians begin tracks.
     fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {
@@ -242,11 +243,11 @@ impl SlowLinker {
     }
 }
 
-/// For each track, its Gaussian at each frame in which it was seen.
+/// For each track a map from each frame in which it was seen to its Gaussian at that frame.
 pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
 
-/// Returns the position of a track at a frame after its first, observed or extrapolated, and the number of frames since
-/// it was last seen.
+/// Returns the position of a track at `frame`, observed or extrapolated, in scene units, and the number of frames since
+/// the track was last seen. `frame` must not be before the first frame of the track.
 fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
     let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
     let mut velocity: Option<[f64; 3]> = None;

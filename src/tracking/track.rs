@@ -28,8 +28,8 @@ pub(super) struct Round {
     pub(super) includes_missing: bool,
 }
 
-/// Track that may still continue: it had a Gaussian in the last frame or in one of the [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames
-/// before.
+/// Track that may still continue: it had a Gaussian in the frame that was linked last or in one of the
+/// [`MAX_GAP_FRAMES`](super::MAX_GAP_FRAMES) frames before that.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
@@ -45,7 +45,7 @@ pub(super) struct OpenTrack {
     pub(super) is_succeeded: bool,
 }
 
-/// Gaussian that may continue a track, and the cost of linking the two.
+/// Gaussian that may continue a track, and the cost of the link between the track and it.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) struct Candidate {
     pub(super) cost: f32,
@@ -103,8 +103,8 @@ impl OpenTrack {
         (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// Returns the Gaussians in `grid` that may continue the track. `round` limits their distance and difference: matching starts
-    /// with narrow limits and repeats with wider ones.
+    /// Returns the Gaussians in `grid` that may continue the track, because their cost by the rules of `round` is at
+    /// most 1.
     pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
         let mut candidates = Candidates::default();
         let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());
@@ -115,7 +115,7 @@ impl OpenTrack {
     }
 }
 
-/// The Gaussians that may continue a track at the least cost, in the order of cost.
+/// Gaussians that may continue a track, at most [`MAX_CANDIDATES`]: those with the lowest costs, in the order of cost.
 pub(super) struct Candidates {
     best: [Candidate; MAX_CANDIDATES],
 }
@@ -127,7 +127,8 @@ impl Default for Candidates {
 }
 
 impl Candidates {
-    /// Adds the Gaussian if its cost is at most 1 and among the lowest costs so far.
+    /// Adds the Gaussian to the candidates if its cost is at most 1 and among the [`MAX_CANDIDATES`] lowest costs so
+    /// far.
     pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
             self.add(Candidate { cost, gaussian });

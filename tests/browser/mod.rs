@@ -1,5 +1,5 @@
-//! A headless Chromium, driven through its debugging pipe (Chrome DevTools Protocol): real mouse, keys and fingers, and
-//! a record of every request, console message and exception.
+//! Headless Chromium, driven through its debugging pipe (Chrome DevTools Protocol). It gets real events of mouse, keys
+//! and touch, and records every request, console message and exception.
 
 #![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
 
@@ -15,7 +15,7 @@ use tempfile::TempDir;
 
 const NAMES: [&str; 5] =
     ["chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
-/// Longest wait for an answer of the browser.
+/// Maximum time to wait for an answer of the browser.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Returns the browser to use: `SPLATSIEVE_BROWSER`, else an installed one. Panics if there is none.
@@ -29,14 +29,14 @@ pub(crate) fn installed() -> PathBuf {
     found.expect("an installed Chromium (apt-get install chromium-headless-shell)")
 }
 
-/// A browser with one page.
+/// Running browser with one page.
 pub(crate) struct Browser {
     process: Child,
     to: File,
     from: Receiver<Value>,
     session: String,
     last: u64,
-    /// Events of the browser, in order.
+    /// Events that the browser sent, in order.
     pub(crate) events: Vec<Value>,
     _home: TempDir,
 }
@@ -86,7 +86,7 @@ impl Browser {
         browser
     }
 
-    /// Sends a command and waits for its result.
+    /// Sends the command `method` with `parameters` to the browser and returns its result.
     pub(crate) fn ask(&mut self, method: &str, parameters: Value) -> Value {
         self.last += 1;
         let mut message = json!({ "id": self.last, "method": method, "params": parameters });
@@ -106,7 +106,7 @@ impl Browser {
         }
     }
 
-    /// Opens a file and waits until all of it is loaded.
+    /// Opens the file `page` in the browser and waits until it is fully loaded.
     pub(crate) fn open(&mut self, page: &Path) {
         let page = fs::canonicalize(page).unwrap();
         self.ask("Page.navigate", json!({ "url": format!("file://{}", page.display()) }));
@@ -116,7 +116,8 @@ impl Browser {
         }
     }
 
-    /// Returns the value of an expression in the page. Waits for a promise.
+    /// Evaluates a JavaScript expression in the page and returns its value. If the value is a promise, waits for its
+    /// result.
     pub(crate) fn value(&mut self, expression: &str) -> Value {
         let mut parameters = json!({ "expression": expression, "returnByValue": true });
         parameters[concat!("await", "Promise")] = json!(true);
@@ -125,7 +126,8 @@ impl Browser {
         found["result"]["value"].clone()
     }
 
-    /// Presses the mouse at the first point, moves it over the others and lets go at the last.
+    /// Presses the mouse button at the first point, moves the mouse to the other points and releases the button at the
+    /// last.
     pub(crate) fn drag(&mut self, points: &[[f64; 2]]) {
         let mut send = |kind: &str, [x, y]: [f64; 2], buttons: u32| {
             let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": 1 });
@@ -138,8 +140,8 @@ impl Browser {
         send("mouseReleased", points[points.len() - 1], 0);
     }
 
-    /// Puts fingers on the screen at the points of the first list, moves them over the other lists, and takes them
-    /// away.
+    /// Simulates touch. Each entry of `steps` has the points of all fingers. The fingers touch the screen at the first
+    /// entry, move to the others, and leave the screen.
     pub(crate) fn touch(&mut self, steps: &[Vec<[f64; 2]>]) {
         let mut send = |kind: &str, points: &[[f64; 2]]| {
             let points: Vec<Value> =
@@ -153,7 +155,7 @@ impl Browser {
         send("touchEnd", &[]);
     }
 
-    /// Shows the page on a screen of this size, in pixels, in light or dark colors.
+    /// Gives the browser a screen of `width` × `height` pixels. `scheme` selects light or dark colors.
     pub(crate) fn screen(&mut self, width: u32, height: u32, scheme: &str) {
         let is_phone = width < 600;
         let device = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone });
@@ -162,7 +164,7 @@ impl Browser {
         self.ask("Emulation.setEmulatedMedia", json!({ "features": features }));
     }
 
-    /// Returns the serious violations of accessibility rules that axe-core finds, whose script is `axe`.
+    /// Returns the serious violations of accessibility rules in the page. The script `axe` (axe-core) finds them.
     pub(crate) fn serious_violations(&mut self, axe: &str) -> Vec<String> {
         self.ask("Runtime.evaluate", json!({ "expression": axe }));
         let found = self.value(
@@ -173,7 +175,7 @@ impl Browser {
         serde_json::from_value(found).unwrap()
     }
 
-    /// Presses and lets go of a key that writes nothing.
+    /// Presses and releases the key `name`, which enters no text.
     pub(crate) fn key(&mut self, name: &str, code: u32) {
         for kind in ["rawKeyDown", "keyUp"] {
             let event = json!({ "type": kind, "key": name, "code": name, "windowsVirtualKeyCode": code });
@@ -181,7 +183,8 @@ impl Browser {
         }
     }
 
-    /// Returns the faults of the page: exceptions, messages, and requests for anything but itself and its data URIs.
+    /// Returns the faults of the page so far: exceptions, console messages, and requests for anything but the page and
+    /// its data URIs.
     pub(crate) fn complaints(&self) -> Vec<String> {
         let complaint = |event: &Value| {
             let about = &event["params"];

@@ -1,5 +1,5 @@
-//! Tests of runs beside other runs, other programs and files of other people. A run leaves foreign files alone and
-//! removes its own temporary files, however it ends.
+//! Tests of runs beside other runs, other programs and foreign files. A run leaves foreign files alone and removes its
+//! own temporary files, however it ends.
 
 #![cfg(unix)]
 
@@ -26,7 +26,7 @@ fn start_piped(workplace: &Workplace, mut command: Command) -> Child {
 }
 
 /// Starts the program, which waits for its standard input. Resets the signal handlers to their defaults first, because
-/// this process may ignore signals (a shell that starts a job in the background makes it do so).
+/// the test process may ignore signals (a shell ignores some for jobs in the background).
 fn start_program(workplace: &Workplace, arguments: &str) -> Child {
     let mut command = Command::new(program());
     command.args(arguments.split_whitespace());
@@ -56,8 +56,8 @@ fn send(signal: &str, child: &Child) {
     assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
 }
 
-/// Returns a command that runs the program in its own process id namespace, as in a container, with a process id above
-/// `before`.
+/// Returns a command that runs the program as in a container: in a process id namespace of its own, with a process id
+/// above `before`.
 fn in_container(workplace: &Workplace, before: usize, arguments: &str) -> Command {
     let mut command = crate::unshare(&["-p", "--fork", "--mount-proc"]);
     // Processes that have ended take every process id up to `before`.

@@ -11,7 +11,7 @@ use splatsieve::files::container::Container;
 const CLOUD: &str = "model/point_cloud/iteration_7/point_cloud.ply";
 const FIELD: &str = "model/point_cloud/iteration_7/deformation.pth";
 
-/// Returns a folder with a copy of the tiny model in `model`, for tests to damage.
+/// Returns a folder with a copy of the tiny model in `model`, which tests can damage.
 fn with_model() -> Workplace {
     let workplace = Workplace::new();
     for (name, bytes) in files(&tiny()) {
@@ -26,7 +26,7 @@ fn with_model() -> Workplace {
     workplace
 }
 
-/// Checks that every command that reads the model refuses it with a message that contains all `parts`.
+/// Checks that every command that reads a model refuses the folder `model`, with a message that contains all `parts`.
 fn model_refused(workplace: &Workplace, parts: &[&str]) {
     for verb in
         ["compress model -o out", "compress model -o out.gseq", "score model -o rows.npz", "convert model a.gseq"]
@@ -204,7 +204,7 @@ fn hostile_pickle_is_refused_and_not_executed() {
     }
 }
 
-/// Returns a zip archive of uncompressed entries.
+/// Returns a zip archive of uncompressed entries, given as (name, content).
 fn stored_zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
     use std::io::Write;
     let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
@@ -239,7 +239,7 @@ fn missing_head_and_wrong_shape_name_the_tensor() {
     model_refused(&workplace, &["deformation_net.feature_out.0.weight", "shape"]);
 }
 
-/// Returns the archive with `from` replaced by `to` everywhere in its pickle.
+/// Returns `archive` with `from` replaced by `to` everywhere in its pickle.
 fn rewrite_pickle(archive: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
     let mut read = zip::ZipArchive::new(std::io::Cursor::new(archive)).unwrap();
     let mut entries = Vec::new();

@@ -1,7 +1,8 @@
 //! Tests of README and user documentation: commands parse, links lead to files, generated pages are up to date, and the
 //! README is short.
 //!
-//! `SPLATSIEVE_WRITE_DOCS=1` writes the generated pages, `docs/cli.md` and `docs/parameters.md`, instead of comparing them.
+//! `SPLATSIEVE_WRITE_DOCS=1` writes the generated pages, `docs/cli.md` and `docs/parameters.md`, instead of comparing
+//! them.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -40,7 +41,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Returns the README, the other pages for people at the top, and the pages of `docs`, with their paths.
+/// Returns path and text of the README, of the other top-level pages for people, and of the pages in `docs`.
 fn pages() -> Vec<(PathBuf, String)> {
     let docs = fs::read_dir(root().join("docs")).unwrap().map(|entry| entry.unwrap().path());
     let top = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"].map(|name| root().join(name));
@@ -84,7 +85,8 @@ fn shell_lines(text: &str) -> Vec<String> {
     lines
 }
 
-/// Returns the words of every command of a shell line: quotes removed, cut at `|`, `&&`, `;`, redirections and comments.
+/// Returns the words of every command of a shell line: quotes removed, cut at `|`, `&&`, `;`, redirections and
+/// comments.
 fn shell_commands(line: &str) -> Vec<Vec<String>> {
     let mut commands = vec![Vec::new()];
     let (mut word, mut quote, mut is_word, mut is_redirected) = (String::new(), None, false, false);
@@ -116,7 +118,7 @@ fn shell_commands(line: &str) -> Vec<Vec<String>> {
     commands
 }
 
-/// Returns the arguments of the program if `words` run it, from the path or by `cargo run`.
+/// Returns the arguments of the program if the command `words` runs it, directly or by `cargo run`.
 fn arguments(words: &[String]) -> Option<&[String]> {
     match words {
         [name, rest @ ..] if name == "splatsieve" => Some(rest),
@@ -129,9 +131,9 @@ fn arguments(words: &[String]) -> Option<&[String]> {
     }
 }
 
-/// Returns the arguments of every call of the program in the shell blocks and between single backquotes of `text`.
+/// Returns the arguments of every call of the program in `text`, in shell blocks and between single backquotes.
 ///
-/// Calls with words in capitals, such as `splatsieve COMMAND -h`, show a form and are left out.
+/// Calls with words in capitals, such as `splatsieve COMMAND -h`, are patterns and are left out.
 fn calls(text: &str) -> Vec<Vec<String>> {
     let quoted = text.lines().flat_map(|line| line.split('`').skip(1).step_by(2)).map(str::to_owned);
     let inline = quoted.filter(|code| code.starts_with("splatsieve ") && !code.contains(['…', '│']));
@@ -241,7 +243,8 @@ fn readme_is_short() {
     assert!(words <= README_WORDS, "{words} words, at most {README_WORDS} expected");
 }
 
-/// Compares a generated page with the file, or writes the file if `SPLATSIEVE_WRITE_DOCS` is set.
+/// Compares the generated text with the page `name` in `docs`. If `SPLATSIEVE_WRITE_DOCS` is set, writes the page
+/// instead.
 fn check_generated(name: &str, text: &str) {
     let path = root().join("docs").join(name);
     if std::env::var_os("SPLATSIEVE_WRITE_DOCS").is_some() {
@@ -254,7 +257,7 @@ fn check_generated(name: &str, text: &str) {
     assert!(found == text, "{name} is out of date ({different:?}); write it anew: {advice}");
 }
 
-/// Returns the values of a preset's text by section and key, as they are written.
+/// Returns the parameters in the text of a preset, each as (section, key, value as it is written).
 fn values(text: &str) -> Vec<(String, String, String)> {
     let (mut section, mut found) = (String::new(), Vec::new());
     for line in text.lines().filter(|line| !line.starts_with('#')) {

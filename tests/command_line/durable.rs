@@ -9,8 +9,8 @@ use std::process::Command;
 
 use crate::scene::{Workplace, files, tiny};
 
-/// C source of the library that passes `fsync` and `rename` on unchanged and appends each call to the file named by
-/// NOTES, in order.
+/// C source of a library that records system calls: it passes `fsync` and `rename` on unchanged and appends each call
+/// to the file that the environment variable NOTES names, in order.
 const NOTES: &str = r#"
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -42,7 +42,7 @@ int rename(const char *from, const char *to) {
 }
 "#;
 
-/// System call that the program made.
+/// Recorded system call of the program.
 #[derive(Debug, PartialEq)]
 enum Call {
     Sync(PathBuf),

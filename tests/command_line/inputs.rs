@@ -110,7 +110,7 @@ fn text_files_may_have_byte_order_marks_and_hints_fit() {
     workplace.done("compress {tiny} --drop-ids ids.txt -o out --dry-run --prune-only --no-refine --quiet");
 }
 
-/// Messages are for users: none may contain Rust debug formatting.
+/// Messages are for users, so none may contain Rust debug formatting.
 #[test]
 fn no_message_contains_debug_formatting() {
     // Numbers, which look the same in debug formatting.
@@ -159,7 +159,7 @@ fn no_message_contains_debug_formatting() {
     workplace.refused(2, "compress {tiny} --drop-ids ids.txt -o out", &["\"3<U+200B>x<U+0007>\""]);
 }
 
-/// Each run fills its own 24 KiB file system.
+/// Each run fills a file system of 24 KiB that only this test uses.
 #[test]
 #[ignore = "needs namespaces of process ids"]
 fn full_disk_error_names_the_file_being_written() {

@@ -14,7 +14,8 @@ use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
-/// Scores and prunes by formula, because stages that use renders take much time but no memory that grows with frames.
+/// Options for scoring and pruning by formula. Stages that use renders take much time but no memory that grows with
+/// frames.
 const REQUEST: &str = "--set coverage=projected --prune-only --no-refine --set choose_by_views=false --ratio 0.5 \
      --set bands=all";
 
@@ -66,7 +67,7 @@ fn run_without_input(workplace: &Workplace, arguments: &str) -> Output {
     piped(workplace, arguments, LongSequence { gaussians: 0, frames: 0 })
 }
 
-/// Returns the number between `before` and `after` in `text`.
+/// Returns the number in `text` that stands between `before` and `after`.
 fn number(text: &str, before: &str, after: &str) -> f64 {
     let (_, rest) = text.split_once(before).unwrap_or_else(|| panic!("{before:?} is not in {text:?}"));
     rest.split_once(after).unwrap().0.trim().parse().unwrap()
@@ -82,8 +83,8 @@ fn assert_within_memory(output: &Output, what: &str, budget: f64) {
     }
 }
 
-/// Packs `sequence`, compresses it as a container and as a stream, each within `budget` MiB, and checks that the
-/// results are equal.
+/// Writes `sequence` to a container and compresses it as a container and as a stream, each within `budget` MiB. Checks
+/// that the results are equal.
 fn check_file_and_stream(sequence: LongSequence, budget: u64) {
     let workplace = Workplace::new();
     let limits = format!("--memory {budget}MiB --explain");

@@ -14,14 +14,14 @@ use splatsieve::source::{BlockReader, FrameSource, Ids};
 
 const GAUSSIANS: usize = 30_000;
 const FRAMES: usize = 48;
-/// Few small images from a camera that sees all Gaussians, which keeps the tests fast.
+/// Options for few small images from a camera that sees all Gaussians, which keeps the tests fast.
 const REQUEST: &str = "--cameras cameras.json --split all --set frame_stride=6";
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Gaussians in a box in which every value except the colors differs in every frame: 63 MB of values.
+/// Scene of 63 MB: Gaussians in a box, in which every value except the colors differs in every frame.
 struct ChangingScene(SequenceInfo);
 
 impl ChangingScene {
@@ -73,7 +73,7 @@ impl BlockReader for Block {
     }
 }
 
-/// Returns a folder with the scene as `packed.gseq` and `raw.gseq`, and its cameras.
+/// Returns a folder with the scene, compressed as `packed.gseq` and uncompressed as `raw.gseq`, and its cameras.
 fn scene_workplace() -> Workplace {
     let workplace = Workplace::new();
     for (name, compression) in [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::Raw)] {
@@ -85,7 +85,7 @@ fn scene_workplace() -> Workplace {
     workplace
 }
 
-/// Returns the minimum that the refusal of `--memory 1MiB` names, in MiB.
+/// Returns the minimum memory in MiB that a run needs. The message that refuses `--memory 1MiB` states it.
 fn minimum_memory(workplace: &Workplace, arguments: &str) -> u64 {
     let run = workplace.run(&format!("{arguments} --memory 1MiB"));
     assert_eq!(run.code, 2, "{}", run.stderr);

@@ -1,4 +1,5 @@
-//! Tests of work divided into shards: for any number and order of shards the joined result has the bytes of one run.
+//! Tests of work divided into shards. For any number and order of shards, the joined result has the same bytes as the
+//! result of one undivided run.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -39,11 +40,11 @@ fn workplace(gaussians: usize) -> Workplace {
     workplace
 }
 
-/// Numbers of shards to test. Most stages have fewer units of work than the largest.
+/// Numbers of shards to test. Most stages have fewer units of work than 64, so that some shards are empty.
 const SHARD_COUNTS: [usize; 4] = [1, 2, 7, 64];
 
-/// Runs all `count` shards of `line`, in descending order and then shard 1 again, until none has work left. Returns the
-/// outputs of all runs.
+/// Runs all `count` shards of the command `line`, in descending order and then shard 1 again, until none has work left.
+/// Returns the standard outputs of all runs.
 fn run_parts(workplace: &Workplace, line: &str, count: usize) -> Vec<String> {
     let mut said = Vec::new();
     for _ in 0..100 {
@@ -61,8 +62,8 @@ fn run_parts(workplace: &Workplace, line: &str, count: usize) -> Vec<String> {
     panic!("{line}: parts without end: {:?}", said.last());
 }
 
-/// Checks that `line`, which writes `output`, prints and writes the same by itself and after its shards were computed
-/// separately.
+/// Checks that the command `line`, which writes `output`, gives the same result in two ways: in one run, and in a run
+/// after its shards were computed separately. `numbers` are the numbers of shards to test.
 fn assert_joined_equals_single_run(workplace: &Workplace, line: &str, output: &str, numbers: &[usize]) {
     let run = |more: &str| {
         let said = workplace.done(&format!("--quiet {line} {more}"));
@@ -275,7 +276,8 @@ fn damaged_shards_are_computed_again() {
     }
 }
 
-/// Checks that compressing in shards writes what one run writes. Returns the stages that were divided.
+/// Checks that compressing in shards writes the same files as one run. Returns the names of the stages that were
+/// divided.
 fn assert_compresses_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) -> BTreeSet<String> {
     let compress = format!("compress scene.gseq --cameras cameras.json -o out.gseq {line}");
     let outputs = ["out.gseq", "out.gseq.index_map.npy", "out.gseq.recipe.toml"];

@@ -1,5 +1,6 @@
-//! Readers and writers of other programs: splat-transform of PlayCanvas and the loaders of three.js. They open our files,
-//! and we open theirs. `SPLATSIEVE_NODE_MODULES` names the folder `node_modules` with both.
+//! Tests with readers and writers of other programs: splat-transform of PlayCanvas and the loaders of three.js. They
+//! open files of this program, and this program opens theirs. `SPLATSIEVE_NODE_MODULES` names the folder `node_modules`
+//! with both.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -12,10 +13,11 @@ use splatsieve::passes::gather_all;
 
 use crate::scene::Workplace;
 
-/// Number of Gaussians.
+/// Number of Gaussians in the test files.
 const COUNT: usize = 60;
 
-/// Returns Gaussians without any symmetry: other ranges on each axis, other scales, other SH coefficients.
+/// Returns Gaussians without any symmetry: each axis has another range of positions and other scales, and every SH
+/// coefficient is different.
 fn asymmetrical(degree: usize) -> Gaussians {
     let mut made = Gaussians::zeros(COUNT, degree);
     let fill = |values: &mut [f32], seed: usize, middle: f32, width: f32| {
@@ -64,7 +66,7 @@ fn sorted(gaussians: &Gaussians) -> Gaussians {
     gaussians.pick(&rows)
 }
 
-/// Largest differences that two readings of a file, or a file and its original, may have.
+/// Maximum differences between two readings of a file, or between a file and its original.
 struct Steps {
     position: f64,
     log_scale: f64,

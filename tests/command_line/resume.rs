@@ -13,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use crate::scene::{Workplace, program, stderr_text};
 
-/// Run with many Gaussians for the file size of its scene, in which every stage can be cached.
+/// Arguments of a run in which every stage can be cached. It keeps many Gaussians, compared with the size of the scene.
 const RUN: &str = "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
 
 fn command(workplace: &Workplace, arguments: &str) -> Command {
@@ -35,7 +35,7 @@ fn workplace_with_scene(gaussians: usize) -> Workplace {
     workplace
 }
 
-/// Returns the files of a result except its summary, which contains times.
+/// Returns the files of the result `name` except its summary, which contains times.
 fn result_files(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>> {
     let mut found = BTreeMap::new();
     for ending in ["", ".recipe.toml", ".index_map.npy"] {
@@ -45,7 +45,8 @@ fn result_files(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>
     found
 }
 
-/// Returns the time of writing of every cache entry, except entries that are overwritten while their stage runs.
+/// Returns the name and the modification time of every cache entry. Entries that are overwritten while their stage runs
+/// are left out.
 fn cache_entries(folder: &Path) -> BTreeMap<String, SystemTime> {
     let Ok(entries) = fs::read_dir(folder) else { return BTreeMap::new() };
     let entry_time =
@@ -54,7 +55,8 @@ fn cache_entries(folder: &Path) -> BTreeMap<String, SystemTime> {
     entries.filter(|(name, _)| name.ends_with(".piece") && !name.starts_with("refine-steps.")).collect()
 }
 
-/// Kills runs with a cache at `kills` moments in total, over as many complete runs as that takes.
+/// Kills runs with a cache at `kills` moments in total. A killed run is resumed from its cache; when it completes, the
+/// next run begins with an empty cache. Checks the result of every complete run.
 fn check_killed_runs(gaussians: usize, kills: usize) {
     let workplace = workplace_with_scene(gaussians);
     let start = Instant::now();
@@ -203,7 +205,7 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
     }
 }
 
-/// A small full file system of its own, if the system allows tests to mount one.
+/// The cache lies on a small file system of its own, which is full, if the system allows tests to mount one.
 #[test]
 #[ignore = "needs namespaces of process ids"]
 fn full_cache_disk_is_named_and_a_larger_one_resumes() {

@@ -5,8 +5,8 @@ use crate::scene::{Run, Workplace, lasting_files, shared};
 use serde_json::Value;
 use splatsieve::pipeline::summary::{SCHEMA, Summary};
 
-/// Runs a compression as asked and again with the recipe it wrote, and checks that both write the same files. Returns
-/// the first run.
+/// Runs a compression with `arguments`, and again with the recipe that the first run wrote. Checks that both write the
+/// same files. Returns the first run.
 fn assert_recipe_repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
     let first = workplace.run(&format!("compress {arguments} -o {name}_first"));
     assert_eq!(first.code, 0, "{}", first.stderr);
@@ -125,7 +125,8 @@ fn dry_run_reports_what_the_run_reports() {
     }
 }
 
-/// Runs a compression of a container and checks that it read no more than planned. Returns the number of full reads.
+/// Runs a compression of a container and checks that it read no more than its plan states. Returns the number of full
+/// reads (every frame of the input once).
 fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
     let summary = workplace.summary(arguments);
     let planned = summary["planned_reads"].as_f64().unwrap();

@@ -28,7 +28,7 @@ fn run(command: &mut Command, workplace: &Workplace) -> Vec<u8> {
     output.stdout
 }
 
-/// Packs the stream that `exporter` writes and opens the container.
+/// Runs `exporter`, which writes a frame stream to standard output, converts the stream to a container and opens it.
 fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Container {
     let stream = run(exporter, workplace);
     fs::write(workplace.path("stream"), stream).unwrap();

@@ -3,7 +3,7 @@
 
 use crate::scene::Workplace;
 
-/// Names of the cases, in the order of the pipeline.
+/// Names of the cases of the self-check, in the order of the pipeline.
 const CASES: [&str; 28] = [
     "motion and life",
     "motion far away",

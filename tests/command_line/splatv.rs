@@ -1,5 +1,5 @@
-//! Tests of `.splatv` files of other programs: rows that no player draws, infinite temporal widths, textures without
-//! padding.
+//! Tests of `.splatv` files of other programs: Gaussians that no player draws, infinite temporal widths, textures
+//! without padding.
 
 use std::fs;
 use std::path::Path;
@@ -28,8 +28,8 @@ fn valid_gaussian(i: usize) -> SplatvGaussian {
     }
 }
 
-/// Returns texture rows with defects: row 3 has no position, row 10 neither position nor rotation, rows 20 to 24 no
-/// rotation, row 30 no width; rows 40 to 47 have infinite temporal widths.
+/// Returns the texture rows of Gaussians, one each, some with defects: row 3 has no position, row 10 neither position
+/// nor rotation, rows 20 to 24 no rotation, row 30 no width; rows 40 to 47 have infinite temporal widths.
 fn rows() -> Vec<[u32; WORDS_PER_GAUSSIAN]> {
     let mut rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = (0..ROWS).map(|i| encode_words(&valid_gaussian(i))).collect();
     rows[3][1] = f32::NAN.to_bits();
@@ -60,7 +60,7 @@ fn json(workplace: &Workplace, arguments: &str) -> Value {
     serde_json::from_str(&workplace.done(arguments)).unwrap()
 }
 
-/// Returns the notes of `info` or of a compression summary about the rows.
+/// Returns the notes about defective rows in `found`, the output of `info` or the summary of a compression.
 fn notes(found: &Value) -> Vec<String> {
     let notes = found["notes"].as_array().unwrap().iter().map(|note| note.as_str().unwrap().to_owned());
     notes.filter(|note| note.contains(" rows ")).collect()
@@ -155,7 +155,8 @@ fn texture_that_ends_within_a_row_is_refused() {
     workplace.refused(1, "info cut.splatv", &["cut.splatv", "65536", &whole, &found, "cut short"]);
 }
 
-/// Checks that `info`, `compress` and `evaluate` accept a captured file. Returns the notes of the compression.
+/// Checks that `info`, `compress` and `evaluate` accept the file `name`, which another program wrote. Returns the notes
+/// of the compression.
 fn captured(name: &str) -> Vec<String> {
     let workplace = Workplace::new();
     let folder = shared("captured");

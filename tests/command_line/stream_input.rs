@@ -28,7 +28,7 @@ fn tiny_stream(workplace: &Workplace) -> Vec<u8> {
     done(workplace.piped("convert {tiny} -", b""))
 }
 
-/// Returns the names of files in a folder that are no results: hidden files and scratch files.
+/// Returns the names of leftover files in a folder: hidden files and scratch files of the program.
 fn leftover_files(folder: &Path) -> Vec<PathBuf> {
     files(folder).into_keys().filter(|name| name.to_str().unwrap().contains("splatsieve")).collect()
 }
@@ -109,7 +109,7 @@ fn stream_scores_equal_those_of_packed_frames() {
     assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
 }
 
-/// Returns the stream with its time stamps changed by `time`, a function of the frame number.
+/// Returns `stream` with other time stamps: `time` returns the time stamp of a frame, given its number.
 fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
     let mut bytes = stream.to_owned();
     let (mut frame, mut at) = (0, 0);
@@ -200,7 +200,7 @@ fn closed_pipe_while_streaming_is_no_failure() {
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Waits until `folder` holds a scratch file of the run. Panics if the run ends or after 60 s.
+/// Waits until `folder` holds a scratch file of the run. Panics if the run ends before that or after 60 s.
 fn wait_for_scratch(folder: &Path, child: &mut Child) {
     let start = Instant::now();
     while leftover_files(folder).is_empty() {

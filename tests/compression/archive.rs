@@ -1,4 +1,5 @@
-//! Tests of archives (`.gsz`): writing, unpacking, reading as input, damage.
+//! Tests of archives (`.gsz`): how they are written, converted to other formats and read as input, and how damaged
+//! archives are refused.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +9,7 @@ use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models::{InputModel, ModelFolder};
 use splatsieve::outputs::container::write_container;
 
-/// Arguments that archive the tiny model at 50 dB without refinement.
+/// Arguments of a run that writes the tiny model as an archive of 50 dB without refinement.
 const TINY: &str = "{tiny} --cameras {tiny} --ratio 0.5 --no-refine --prune-only --archive-psnr 50";
 
 /// Returns a workplace with `small.gsz`, the archive of the tiny model, and the summary of the run.

@@ -10,11 +10,12 @@ use crate::scene::{
 };
 use serde_json::Value;
 
-/// Entry of the summary if the stage runs and removes nothing.
+/// Name of the stage in the summary's list of omitted work. The list has it if the stage runs and removes
+/// nothing.
 const LOWER_DEGREE: &str = "lower SH degree";
 
-/// Writes the tiny model without its SH head, and with coefficients above `degree` scaled by 1e-6, to `model` in the
-/// workplace.
+/// Writes a copy of the tiny model to `model` in the workplace. The copy has no SH head, and its coefficients above
+/// `degree` are scaled by 1e-6.
 fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     let model = workplace.path("model");
     without_sh_head(&tiny(), &model);

@@ -12,8 +12,8 @@ use splatsieve::source::FrameSource;
 
 const BOUNDS: &str = "position=2e-3,rotation=5e-3,log_scale=1e-2,opacity_logit=2e-2,sh=1e-2";
 
-/// Returns the largest difference between the finite values of an attribute in the two containers, and whether all
-/// other values are equal.
+/// Compares the attribute `column` in the containers `exact.gseq` and `within.gseq`. Returns the largest difference
+/// between finite values, and whether all other values are equal.
 fn largest_difference(workplace: &Workplace, column: Attributes) -> (f64, bool) {
     let [exact, within] = ["exact.gseq", "within.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
     let (mut largest_difference, mut kept) = (0.0f64, true);

@@ -12,7 +12,8 @@ use splatsieve::models::ModelFolder;
 use splatsieve::source::FrameSource;
 
 const COUNT: usize = 300;
-/// Returns the rows of the input that make up each place of the output, from the index map.
+/// Returns, for each Gaussian of the output, the indices of the input Gaussians that it stands for. `map` is the index
+/// map.
 fn members(map: &[i64]) -> Vec<Vec<usize>> {
     let count = map.iter().max().map_or(0, |&last| last + 1) as usize;
     let mut members = vec![Vec::new(); count];
@@ -22,8 +23,8 @@ fn members(map: &[i64]) -> Vec<Vec<usize>> {
     members
 }
 
-/// Checks that the output folder is the input with fewer rows: every Gaussian that was not merged keeps its bytes in
-/// the file and its bits at each of `frames`.
+/// Compresses `model` and checks that the output folder is the input with fewer Gaussians: every Gaussian that was not
+/// merged keeps its bytes in the PLY file, and its state at each of `frames` to the bit.
 fn assert_kept_are_untouched(workplace: &Workplace, model: &Path, preset: &str, frames: &[usize]) {
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));

@@ -1,5 +1,5 @@
-//! Tests of a property of every model format: the frame states of a compressed model are those of the written model
-//! read again, whichever attributes refinement changed.
+//! Tests of a property of every model format: a compressed model in memory has the same frame states as the model that
+//! is written from it and read again, whichever attributes refinement changed.
 
 use std::path::Path;
 
@@ -13,13 +13,13 @@ use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
 use splatsieve::recipe::{FieldPrecision, Recipe};
 
-/// Opens `path`, and gives it three times if its model has none of its own.
+/// Opens the model at `path`. If the model has no times of its own, gives it three times.
 fn open(path: &Path) -> Box<dyn InputModel> {
     let input = models::open(path, &OpenOptions::default()).unwrap();
     if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
 }
 
-/// Returns every third Gaussian of `input` as a compressed model, two of them merged with a neighbor.
+/// Returns a compressed model with every third Gaussian of `input`, two of which were merged with a neighbor.
 fn compress_by_three(input: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let kept: Vec<u32> = (0..input.source().info().count as u32).step_by(3).collect();
@@ -46,7 +46,8 @@ fn delta_of_every_third(count: usize, columns: Attributes) -> ParamDelta {
     ParamDelta(delta)
 }
 
-/// Returns the frame states of `compressed`, and those of the model written from it as `kind` and read again.
+/// Returns two lists of frame states: those of `compressed`, and those of the model that is written from it as `kind`
+/// and read again.
 fn states_before_and_after_writing(
     workplace: &Workplace,
     input: &dyn InputModel,

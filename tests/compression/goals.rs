@@ -6,18 +6,18 @@ use std::path::Path;
 use crate::scene::{Workplace, files};
 use serde_json::Value;
 
-/// Returns a workplace with a generated scene, `demo/scene.gseq`, and its cameras.
+/// Returns a workplace with a generated scene, `demo/scene.gseq`, and its cameras, `demo/cameras.json`.
 fn with_demo() -> Workplace {
     let workplace = Workplace::new();
     workplace.done("test-scene --gaussians 800 --frames 4 -o demo");
     workplace
 }
 
-/// Arguments for a short refinement.
+/// Arguments for the generated scene and a short refinement.
 const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
 
-/// Returns the bytes of all files below the output folder, or of the output file and the files beside it that begin
-/// with its name.
+/// Returns the total number of bytes of all files below the output folder, or of the output file and the files beside
+/// it that begin with its name.
 fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
     let belongs = |name: &Path| name.starts_with(output) || name.to_string_lossy().starts_with(&format!("{output}."));
     files(&workplace.path("")).into_iter().filter(|(name, _)| belongs(name)).map(|(_, bytes)| bytes.len() as u64).sum()

@@ -11,7 +11,8 @@ fn len(path: &Path) -> u64 {
     fs::metadata(path).unwrap().len()
 }
 
-/// Entry of the summary if the field stays as it is.
+/// Name of the stage in the summary's list of omitted work. The list has it if the stage runs and keeps
+/// the field in full precision.
 const HALF_PRECISION: &str = "half precision of the field";
 
 const QUICKLY: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwrite";
@@ -88,7 +89,8 @@ fn original_loader_opens_a_half_precision_field() {
     assert!(accepted && text.contains("tensors in half precision") && text.contains("can open it"), "{text}");
 }
 
-/// Checks that the whole folder with 10% of the Gaussians has at most 40% of the bytes of the original.
+/// Compresses the trained model `name` to 10% of its Gaussians and checks that the whole folder has at most 40% of the
+/// bytes of the original.
 fn assert_tenth_is_small(name: &str) {
     let model = shared(name);
     let workplace = Workplace::new();

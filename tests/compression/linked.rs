@@ -20,7 +20,7 @@ fn uniform(seed: u64) -> f32 {
     (hash_id(seed) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Writes Gaussian `i` at frame `frame` to row `at` of `out`; each Gaussian moves on its own circle.
+/// Writes the state of Gaussian `i` at frame `frame` to row `at` of `out`. Each Gaussian moves on a circle of its own.
 fn write_row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     let value = |k: u64| uniform(64 * i as u64 + k);
     let angle = 0.05 * frame as f32 + 6.0 * value(0);
@@ -32,8 +32,8 @@ fn write_row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     out.sh.set_row(at, [13, 14, 15].map(|k| 3.0 * value(k) - 1.5));
 }
 
-/// Returns frame `frame` with the Gaussians of `0..count` that are alive by `is_alive`, in an order that differs by frame,
-/// and their ids.
+/// Returns the state at frame `frame` of those of the Gaussians `0..count` for which `is_alive` is true, and their ids.
+/// Their order differs from frame to frame.
 fn frame(count: usize, frame: usize, is_alive: impl Fn(usize) -> bool) -> (Gaussians, Vec<usize>) {
     let mut order: Vec<usize> = (0..count).filter(|&i| is_alive(i)).collect();
     order.sort_by_key(|&i| hash_id((i as u64) << 20 | frame as u64));
@@ -42,7 +42,8 @@ fn frame(count: usize, frame: usize, is_alive: impl Fn(usize) -> bool) -> (Gauss
     (out, order)
 }
 
-/// Returns whether a Gaussian is alive: each begins and ends at its own frames and is absent for two frames in between.
+/// Returns whether Gaussian `i` is alive at frame `frame`. Each Gaussian has a first and a last frame of its own and is
+/// absent for two frames in between.
 fn is_alive(i: usize, frame: usize) -> bool {
     let begins = (hash_id(i as u64) % 60) as usize;
     let age = (frame + 30).wrapping_sub(begins);
@@ -156,8 +157,9 @@ fn frames_are_written_with_the_gaussians_alive_in_them() {
     workplace.done("info half");
 }
 
-/// Returns frame `t` of Gaussians that are replaced every seven frames. The old one fades out over two frames while the
-/// new one fades in, and both together are as opaque as `write_row` makes one.
+/// Returns the state at frame `t` of a scene in which every Gaussian is replaced by a copy every seven frames. The old
+/// one fades out over two frames while the new one fades in. Both together are as opaque as one Gaussian of
+/// `write_row`.
 fn fading_frame(count: usize, t: usize) -> Gaussians {
     let parts = |i: usize| match (t + (hash_id(i as u64) % 7) as usize) % 7 {
         phase @ (0 | 1) if t > phase => vec![(phase + 1) as f64 / 3.0, (2 - phase) as f64 / 3.0],
@@ -219,8 +221,8 @@ fn lives_that_fade_into_one_another_become_one_track() {
     assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
 }
 
-/// Returns frame `t` of Gaussians whose attributes vary by amounts of their own, so that each attribute is steady in
-/// some Gaussians and not in others.
+/// Returns the state at frame `t` of Gaussians whose attributes vary by different amounts, so that each attribute is
+/// steady in some Gaussians and not in others.
 fn varying_frame(count: usize, t: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {
@@ -245,8 +247,9 @@ fn varying_frame(count: usize, t: usize) -> Gaussians {
     out.pick(&order)
 }
 
-/// Computes in f64, for one track, what makes an attribute constant along it (`src/models/linked/steady.rs`): the mean
-/// of rotation, scales, opacity logit and colors, each with its variation divided by its bound.
+/// Computes, for one track, the numbers that decide whether attributes count as constant along it
+/// (`src/models/linked/steady.rs`), in f64. Returns for rotation, scales, opacity logit and colors the mean, and the
+/// variation divided by its bound.
 fn mean_and_variation(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let values = |column: &dyn Fn(&Gaussians) -> Vec<f32>| -> Vec<Vec<f64>> {
         frames.iter().map(|frame| column(frame).into_iter().map(f64::from).collect()).collect()
@@ -459,8 +462,8 @@ fn unlinkable_frames_are_refused_by_name() {
     workplace.done("info alone --link always");
 }
 
-/// Links the frames of a model after shuffling their rows and adding noise to positions, `noise` times the size of a
-/// Gaussian. Returns the fractions of links that are right, wrong and given up.
+/// Shuffles the Gaussians in the frames of a model, adds noise of `noise` times the size of a Gaussian to positions,
+/// and links the frames. Returns the fractions of links that are right, wrong and missing.
 fn link_fractions(model: PathBuf, noise: f32) -> [f64; 3] {
     let options = InputOptions { path: model.clone(), cameras: Some(model.clone()), ..InputOptions::default() };
     let scene = open_scene(&options).unwrap();
@@ -513,7 +516,7 @@ fn shuffled_frames_of_trained_models_are_relinked() {
     }
 }
 
-/// Returns a stream of version 2 (format/STREAM.md) with frames at even times.
+/// Returns a stream of version 2 (format/STREAM.md) with the frames `frames` at evenly spaced times.
 fn stream(frames: &[Gaussians]) -> Vec<u8> {
     let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
     for field in [2, 1, 0, 0, 31, 0] {

@@ -1,4 +1,4 @@
-//! Tests of compressed models: what the stages keep, merge, refine and write.
+//! Tests of compressed models: which Gaussians the stages keep, merge and refine, and how the result is written.
 
 mod archive;
 mod bands;

@@ -1,5 +1,5 @@
-//! Tests that compare clusters and proxies of complete models with a plain implementation of method.md, section 5:
-//! neighbors by comparing all pairs, tests by their formulas, leaders one after the other.
+//! Tests of merging. They compare clusters and proxies of complete models with a plain implementation of method.md,
+//! section 5: neighbors by comparing all pairs, tests by their formulas, cluster leaders one after the other.
 
 use std::path::{Path, PathBuf};
 
@@ -15,7 +15,7 @@ use splatsieve::recipe::{
 };
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
-/// Change to the merging parameters that tightens one test.
+/// Change of the merging parameters that makes one of the tests for a pair stricter.
 type Tighten = fn(&mut MergeParams);
 
 /// Model with all its frames in memory.
@@ -126,7 +126,8 @@ fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pa
     similarity > pass.tau_m && drift <= merge.max_drift * unit && dead <= merge.max_dead_time
 }
 
-/// Returns the members of every cluster as ids, the leader first; clusters ascend by leader.
+/// Returns the clusters by the plain implementation, as lists of ids with the leader first. Clusters are in increasing
+/// order of their leaders.
 fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
     let merge = &recipe.merge;
     let unit = merge.length_unit.in_scene_units(all_frames.extent);
@@ -177,7 +178,7 @@ fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Re
     groups
 }
 
-/// Returns the ids in ascending order with weights ∝ C·Vis.
+/// Returns the ids of a cluster in ascending order, each with its weight in the proxy, which is proportional to C·Vis.
 fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     let mut ids = group.to_vec();
     ids.sort_unstable();
@@ -193,7 +194,8 @@ fn options(output: &Path, recipe: &Recipe, only: PruneOrMerge) -> Request {
     Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
 }
 
-/// Compresses the tiny model and checks its clusters and proxies. Returns how many Gaussians joined others.
+/// Compresses the tiny model and checks its clusters and proxies. Returns the number of Gaussians that were merged into
+/// the leader of their cluster.
 fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
@@ -216,9 +218,9 @@ fn assert_merges_as_specified(recipe: &Recipe, only: PruneOrMerge) -> usize {
     kept.len() - expected.len()
 }
 
-/// Checks a merged state against its definition over the members with weights w: position μ = Σ w x, or that of the
-/// leader; covariance Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, in which the area is a quarter
-/// of the surface of the ellipsoid.
+/// Checks the merged state of a cluster against its definition by the members with weights w. Position: μ = Σ w x, or
+/// the position of the leader. Covariance: Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ). Colors: Σ w c. Opacity: by its rule, in which
+/// the area is a quarter of the surface of the ellipsoid.
 fn assert_is_mixture(
     merged: &ProxyState,
     members: &[(u32, f64)],
@@ -281,10 +283,11 @@ fn assert_is_mixture(
 }
 
 /// Checks the proxies that a run wrote to `output`, at the reference frame (the frame in which a group is merged):
-/// - The stored parameters of a proxy are its merged state minus what the field adds to its leader.
+///
+/// - The stored parameters of a proxy are its merged state minus the deformation that the field adds to its leader.
 /// - The quaternion of a proxy has the length of the leader's quaternion.
-/// - If proxies are placed at their leaders, the state of a proxy is its merged state up to rounding, and its position is
-///   exactly that of the leader at every frame.
+/// - If proxies are placed at their leaders, the state of a proxy is its merged state up to rounding, and its position
+///   is exactly that of the leader at every frame.
 fn assert_solved_at_leaders(
     output: &Path,
     scene: &Scene,
@@ -407,8 +410,8 @@ fn every_merging_test_binds_as_specified() {
     }
 }
 
-/// Writes a folder of eight frames with twelve pairs, 0.1 apart. `offset` gives the displacement by frame and by
-/// whether the Gaussian is the second of its pair.
+/// Writes a folder of eight PLY frames with twelve pairs of Gaussians. Neighboring pairs are 0.1 apart. `offset`
+/// returns the displacement of a Gaussian, given the frame and whether it is the second of its pair.
 fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> PathBuf {
     for frame in 0..8 {
         let mut cloud = Gaussians::zeros(24, 0);
@@ -424,7 +427,7 @@ fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> Pat
     workplace.path("frames")
 }
 
-/// Merges explicit trajectories without pruning. Returns the index map and the number of proxies.
+/// Merges the Gaussians of the frames of [`pairs`] without pruning. Returns the index map and the number of proxies.
 fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<u32>>, usize) {
     let (input, output) =
         (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));

@@ -1,5 +1,5 @@
-//! Tests of the other model formats: their frame states against those of the code of their trainers, and results read
-//! back.
+//! Tests of the other model formats. Their frame states are compared with those of their trainers' code, and compressed
+//! models are read back.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,11 +17,11 @@ fn open(model: &Path, cameras: &Path) -> Scene {
     open_scene(&options).unwrap()
 }
 
-/// Name of the colors in the reference files.
+/// Name of the array with the colors in the reference files.
 const COLOR_KEY: &str = concat!("col", "our");
 
-/// Absolute tolerance of a scale, for scales that are the small sum of two numbers of a few hundredths: the trainers'
-/// f32 code is off by up to 8e-9 there.
+/// Absolute tolerance of a scale that is the small sum of two numbers of a few hundredths. The trainers' f32 code is
+/// off by up to 8e-9 there.
 const CANCELLED: f64 = 1e-9;
 
 /// Largest differences of the values that a renderer reads, over all Gaussians and all recorded frames.
@@ -29,7 +29,7 @@ const CANCELLED: f64 = 1e-9;
 struct StateErrors {
     position: f64,
     rotation: f64,
-    /// Relative difference beyond [`CANCELLED`].
+    /// Largest relative difference of a scale, beyond the absolute tolerance [`CANCELLED`].
     scale: f64,
     opacity: f64,
     color: f64,
@@ -110,8 +110,8 @@ fn dynamic_3d_gaussians_states_match_their_trainer() {
     }
 }
 
-/// Returns the largest differences of position and opacity, and of the covariance relative to its largest entry, for
-/// models that record covariances.
+/// Returns three largest differences, for models that record covariances: of position, of opacity, and of the
+/// covariance relative to its largest entry.
 fn covariance_errors(scene: &Scene, model: &Path) -> [f64; 3] {
     let expected = arrays(&model.join("states.npz"));
     let (source, mut errors) = (scene.source(), [0.0f64; 3]);
@@ -357,7 +357,7 @@ fn native_4d_gaussians_states_match_their_trainer() {
     assert!(errors[0] <= 2e-6 && errors[1] <= 5e-7 && errors[2] <= 5e-6 && errors[3] <= 1e-6, "{errors:?}");
 }
 
-/// Returns R diag(s)² Rᵀ of a Gaussian as xx, xy, xz, yy, yz, zz.
+/// Returns the covariance R diag(s)² Rᵀ of Gaussian `i` as xx, xy, xz, yy, yz, zz.
 fn covariance(state: &Gaussians, i: usize) -> [f64; 6] {
     let q = state.rotation.row::<4>(i).map(f64::from);
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -437,7 +437,8 @@ fn slow_every_command_accepts_deep_networks() {
     ]);
 }
 
-/// Runs every command on models given by name, scene, kind and number of Gaussians.
+/// Runs every command on trained models, each given by the name of the model, the name of the scene with its cameras,
+/// the name of its format, and its number of Gaussians.
 fn check_every_command(models: &[(&str, &str, &str, f64)]) {
     let workplace = Workplace::new();
     for &(name, scene_name, kind, count) in models {

@@ -1,5 +1,5 @@
-//! Tests of `precision`: exact settings have no error, converging ones converge at the rate that theory predicts, and
-//! only the diagrams remain.
+//! Tests of `precision`: exact settings have no error, the error of converging settings falls at the rate that theory
+//! predicts, and the output folder has only the diagrams.
 
 use std::fs;
 
@@ -10,7 +10,7 @@ fn read(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
 }
 
-/// Returns cameras in the file format of 3DGS as transforms with the last camera as test view.
+/// Converts cameras from the file format of 3DGS to `transforms.json`. The last camera becomes the test view.
 fn held_out(cameras: &Value) -> Value {
     let cameras = cameras.as_array().unwrap();
     let frame = |(view, camera): (usize, &Value)| {
@@ -27,7 +27,7 @@ fn held_out(cameras: &Value) -> Value {
     json!({"frames": cameras.iter().enumerate().map(frame).collect::<Vec<_>>()})
 }
 
-/// Returns the curves of a setting.
+/// Returns the curves of the varied setting `knob`.
 fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
     let knobs = found["knobs"].as_array().unwrap();
     knobs.iter().find(|entry| entry["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"]
@@ -35,7 +35,7 @@ fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
         .unwrap()
 }
 
-/// Returns the errors of one kind at all marks of a curve.
+/// Returns the errors of kind `kind` at all measured values of a curve.
 fn errors(curve: &Value, kind: &str) -> Vec<f64> {
     curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][kind].as_f64().unwrap()).collect()
 }

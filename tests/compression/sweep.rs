@@ -1,4 +1,5 @@
-//! Tests of `sweep`: every point is what `compress` and `evaluate` give, and only the curves remain.
+//! Tests of `sweep`: every point has the figures that `compress` and `evaluate` give, and the output folder has only
+//! the curves.
 
 use std::fs;
 
@@ -94,9 +95,9 @@ fn refinement_step_points_equal_compress() {
     assert_eq!(knob["parameter"], "refine_steps");
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
-    // Each prune step during refinement takes 8% of the steps, as in the preset.
+    // Before each prune step there are 2/15 of the steps, as in the preset: 25 · 2/15, rounded up.
     workplace
-        .done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=2");
+        .done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=4");
     let evaluated = json(&workplace.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
     let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
     for name in ["psnr", "ssim"] {

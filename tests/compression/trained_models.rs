@@ -13,7 +13,8 @@ fn assert_close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
 }
 
-/// Place in a model, formatted only if a comparison fails, because millions of values are compared.
+/// Place of a value in a model, for messages. It is formatted only if a comparison fails, because millions of values
+/// are compared.
 struct At<'a, F> {
     model: &'a Path,
     what: &'a str,

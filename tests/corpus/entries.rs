@@ -1,8 +1,8 @@
-//! Readers of user-supplied bytes as functions of those bytes. The saved corpus (`tests/corpus`) and the fuzz
+//! Readers of user-supplied bytes, each as a function of those bytes. The saved corpus (`tests/corpus`) and the fuzz
 //! targets (`fuzz`) run them.
 //!
-//! Input: bytes. Result: success, or the message that refuses them. Formats with checksums are read a second time with
-//! repaired checksums; otherwise nothing behind the checksums would be reached.
+//! Input: bytes. Result: success, or the message that refuses the bytes. Formats with checksums are read a second time
+//! with repaired checksums; otherwise no code behind the checksums would be reached.
 
 use std::error::Error;
 use std::fs;
@@ -31,18 +31,19 @@ use crate::memory;
 /// Success, or the reason why the bytes were refused.
 pub(crate) type Outcome = Result<(), Box<dyn Error>>;
 
-/// Reader of user-supplied bytes.
+/// Reader of user-supplied bytes, with its memory limit.
 pub(crate) struct Entry {
     /// Name of the fuzz target.
     pub(crate) name: &'static str,
-    /// Name of its folder in the corpus.
+    /// Name of the folder with saved inputs of this reader in the corpus.
     pub(crate) corpus: &'static str,
     /// Function that reads the bytes; it may write to the folder.
     pub(crate) read: fn(&[u8], &InputFolder) -> Outcome,
     /// Function that returns the bytes with every checksum repaired, or `None` if the format has none or they cannot be
     /// located.
     pub(crate) repair_checksums: fn(&[u8]) -> Option<Vec<u8>>,
-    /// Maximum number of bytes allocated at a time, beyond [`PER_BYTE`] for each byte read.
+    /// Maximum number of bytes that the reader may have allocated at any time, in addition to [`PER_BYTE`] for each
+    /// byte read.
     pub(crate) most_bytes: usize,
 }
 
@@ -74,15 +75,15 @@ impl Entry {
 const RUST_DEBUG_TEXT: [&str; 11] =
     ["Some(", "None)", "Ok(", "Err(", "Error(", "Error {", "ErrorKind", "Custom {", "Id {", "Record {", "Stats {"];
 
-/// Bytes that may be allocated for each byte read, in addition to the limit of the entry.
+/// Number of bytes that a reader may allocate for each byte read, in addition to its own limit.
 pub(crate) const PER_BYTE: usize = 512;
 
-/// Memory limit, in bytes, of most readers for any input.
+/// Memory limit of most readers, in bytes.
 const SMALL_BYTES: usize = 32 << 20;
 /// Memory limit of the readers of JSON, in bytes. They read through a buffer and keep one string of at most a megabyte
 /// at a time.
 const JSON_BYTES: usize = 4 << 20;
-/// Memory limit of the reader of pickles, in bytes, plus space for messages.
+/// Memory limit of the reader of pickles, in bytes: the 1 MiB that it is given, and space for messages.
 const PICKLE_BYTES: usize = (1 << 20) + (64 << 10);
 /// Memory limit of the reader of containers, in bytes. A tile may hold 256 MiB (format/SPEC.md), decoded next to its
 /// encoded bytes.
@@ -198,10 +199,10 @@ pub(crate) const ENTRIES: [Entry; 25] = [
     Entry { name: "stream", corpus: "stream", read: stream, repair_checksums: |_| None, most_bytes: SMALL_BYTES },
 ];
 
-/// Temporary folder, in memory if possible, with small models in it.
+/// Temporary folder with small models in it. It lies in memory if the system allows this.
 pub(crate) struct InputFolder(tempfile::TempDir);
 
-/// Files of models with six Gaussians; a target replaces one of the files.
+/// Files of models with six Gaussians, given as (path, content). A fuzz target replaces one of the files.
 const MODELS: [(&str, &[u8]); 8] = [
     ("of_config/cfg_args", include_bytes!("cfg_args/whole")),
     ("of_config/point_cloud/iteration_7/point_cloud.ply", include_bytes!("ply/whole")),
@@ -266,8 +267,8 @@ fn archive(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(unpacked?)
 }
 
-/// Reads the sections of an archive before compression: three lengths, then table, point cloud, field and blobs. Most
-/// changes of a compressed table would fail to decompress.
+/// Reads the sections of an archive before they are compressed. `bytes` has three lengths, then the sections table,
+/// point cloud, field and blobs. Most changes of a compressed table would only fail to decompress.
 fn archive_sections(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let mut rest = bytes.get(12..).unwrap_or_default();
     let mut sections: [&[u8]; 4] = [&[]; 4];
@@ -299,7 +300,8 @@ fn cameras(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(())
 }
 
-/// Reads the length of `cameras`, then `cameras` and `images`, as both kinds of COLMAP files.
+/// Reads COLMAP files, first as binary and then as text files. `bytes` has the length of `cameras`, then the contents
+/// of `cameras` and `images`.
 fn colmap(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let rest = bytes.get(4..).unwrap_or_default();
     let (cameras, images) = rest.split_at((number::<4>(bytes, 0).unwrap_or(0) as usize).min(rest.len()));
@@ -313,7 +315,7 @@ fn colmap(bytes: &[u8], folder: &InputFolder) -> Outcome {
     Ok(binary.or(text)?)
 }
 
-/// Opens a model of any format, with two times if it has no frames of its own.
+/// Opens a model of any format and reads its first and last frame. If it has no times of its own, gives it two.
 fn model(path: &Path) -> Outcome {
     let mut model = models::open(path, &OpenOptions::default())?;
     if model.source().info().times.is_empty() {
@@ -322,7 +324,7 @@ fn model(path: &Path) -> Outcome {
     read_first_and_last_frame(model.source())
 }
 
-/// Reads the bytes as a single file, which names its own format, and as a file of a model folder.
+/// Reads the bytes twice: as a single file, whose format is known from its content, and as a file of a model folder.
 fn checkpoint(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let alone = model(&folder.write_file("a.pt", bytes));
     folder.write_file("of_splats/chkpnt7.pth", bytes);
@@ -356,7 +358,7 @@ fn tsog(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.tsog", bytes))
 }
 
-/// Reads a file of one frame within 8 MiB of memory: a small file may declare any number of Gaussians.
+/// Reads a file of one frame with a memory limit of 8 MiB, because a small file may declare any number of Gaussians.
 fn still(name: &str, bytes: &[u8], folder: &InputFolder) -> Outcome {
     let path = folder.write_file(name, bytes);
     let options = OpenOptions {
@@ -372,7 +374,7 @@ fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.path("of_field"))
 }
 
-/// Reads a pickle without its archive, within one MiB of memory.
+/// Reads a pickle that is not in a zip archive, with a memory limit of 1 MiB.
 fn pickle_bytes(bytes: &[u8], _: &InputFolder) -> Outcome {
     in_memory::check_pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
 }
@@ -402,7 +404,7 @@ fn ply(bytes: &[u8], folder: &InputFolder) -> Outcome {
     model(&folder.write_file("a.ply", bytes))
 }
 
-/// Checks only the header, in memory, without writing or opening a file.
+/// Checks only the header of a PLY, in memory, without writing or opening a file.
 fn ply_header(bytes: &[u8], _: &InputFolder) -> Outcome {
     check_header(bytes, Path::new("a.ply"))?;
     Ok(())
@@ -426,15 +428,16 @@ fn number<const N: usize>(bytes: &[u8], at: usize) -> Option<u64> {
     Some(digits.iter().rev().fold(0, |sum, &digit| sum << 8 | u64::from(digit)))
 }
 
-/// Writes the checksum of the bytes in `range` to the eight bytes from `at` on.
+/// Computes the checksum of the bytes in `range` and writes it to the eight bytes from `at` on. Returns `None` if a
+/// range is outside of `bytes`.
 fn write_checksum(bytes: &mut [u8], range: std::ops::Range<usize>, at: usize) -> Option<()> {
     let checksum = xxh3_64(bytes.get(range)?);
     bytes.get_mut(at..at.checked_add(8)?)?.copy_from_slice(&checksum.to_le_bytes());
     Some(())
 }
 
-/// Repairs a zip archive: the directory has offset, length and checksum of each file, and the file has its checksum
-/// too.
+/// Returns a zip archive with repaired checksums. Its directory has offset, length and checksum of each file, and each
+/// file has its checksum too.
 fn repair_zip(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let mut at = (0..bytes.len()).find(|&at| bytes[at..].starts_with(b"PK\x01\x02"))?;
@@ -457,7 +460,8 @@ fn repair_zip(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Repairs an archive (format/ARCHIVE.md): four sections after a header that has their lengths and checksums.
+/// Returns an archive (format/ARCHIVE.md) with repaired checksums. It has four sections after a header with their
+/// lengths and checksums.
 fn repair_archive(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let mut at = 116;
@@ -471,8 +475,8 @@ fn repair_archive(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Repairs a container (format/SPEC.md): a header, records at multiples of 64 bytes, an index with copies of the
-/// records, a trailer.
+/// Returns a container (format/SPEC.md) with repaired checksums. It has a header, records at multiples of 64 bytes, an
+/// index with copies of the records, and a trailer.
 fn repair_container(bytes: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = bytes.to_vec();
     let header = usize::try_from(number::<4>(&bytes, 12)?).ok()?;

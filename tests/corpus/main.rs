@@ -1,6 +1,6 @@
 //! Tests that damaged inputs of every format are read or refused in plain words, within a stated memory, and never
-//! cause a panic. The inputs are those of `make.py` and findings of the fuzz targets (`fuzz`), as they are, cut short,
-//! and with changed bytes; they are the same in every run.
+//! cause a panic. The inputs are those that `make.py` made and those that the fuzz targets (`fuzz`) found. They are
+//! read unchanged, cut short, and with changed bytes; the changes are the same in every run.
 
 mod entries;
 mod memory;
@@ -19,13 +19,13 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 /// Lock that lets one test run at a time, because memory is counted for the whole process.
 static COUNTED: Mutex<()> = Mutex::new(());
 
-/// Number of cut and of changed copies of each saved input.
+/// Number of copies of each saved input that are cut short (`CUTS`), and with changed bytes (`CHANGES`).
 const CUTS: u64 = 24;
 const CHANGES: u64 = 76;
-/// Number of rounds of copies for each `whole` input.
+/// Number of times that `CUTS` + `CHANGES` damaged copies are made of each saved input named `whole`.
 const ROUNDS_OF_WHOLE: u64 = 8;
 
-/// Returns the saved inputs of an entry with their paths.
+/// Returns path and content of each saved input of `entry`.
 fn saved(entry: &Entry) -> Vec<(PathBuf, Vec<u8>)> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(entry.corpus);
     let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|file| file.unwrap().path()).collect();
@@ -33,7 +33,7 @@ fn saved(entry: &Entry) -> Vec<(PathBuf, Vec<u8>)> {
     files.into_iter().map(|path| (path.clone(), fs::read(path).unwrap())).collect()
 }
 
-/// Pseudorandom numbers that are the same in every run.
+/// Generator of pseudorandom numbers that are the same in every run.
 struct Random(u64);
 
 impl Random {
@@ -43,7 +43,7 @@ impl Random {
     }
 }
 
-/// Returns change number `k` of `bytes`.
+/// Returns damaged copy number `k` of `bytes`: cut short if `k` is below [`CUTS`], otherwise with changed bytes.
 fn changed(bytes: &[u8], k: u64, random: &mut Random) -> Vec<u8> {
     if k < CUTS {
         return bytes[..random.below(bytes.len())].to_vec();

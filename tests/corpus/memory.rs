@@ -1,9 +1,9 @@
-//! The system allocator with a counter of the bytes allocated at a time.
+//! System allocator with a counter of the bytes that are allocated at the same time.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// System allocator that counts bytes.
+/// System allocator that counts the bytes allocated at present, and their maximum.
 pub(crate) struct Counting;
 
 static NOW: AtomicUsize = AtomicUsize::new(0);
@@ -30,8 +30,8 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// Runs `work`. Returns its result, and the maximum number of bytes that all threads had allocated at a time beyond
-/// those allocated before.
+/// Runs `work` and measures its memory. Returns the result of `work`, and the maximum number of bytes that all threads
+/// had allocated at any time, less the bytes allocated before.
 pub(crate) fn peak<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.load(Relaxed);
     PEAK.store(before, Relaxed);

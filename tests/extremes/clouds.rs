@@ -6,7 +6,7 @@ use super::scene::{self, PlyRows, Workplace, index_map};
 use super::{CAMERA, balls, list_contains};
 use splatsieve::model::Gaussians;
 
-/// Change that makes a scene unusual.
+/// Change of some Gaussians that makes a scene unusual.
 type Edit = fn(&mut Gaussians);
 
 fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {

@@ -1,5 +1,5 @@
-//! Tests of extreme inputs through the program and the public library. The table lists the numbered cases and their tests.
-//! Cases named "selfcheck" are run by `splatsieve selfcheck`, which prints their bounds:
+//! Tests of extreme inputs through the program and the public library. The table lists the numbered cases and their
+//! tests. Cases named "selfcheck" are run by `splatsieve selfcheck`, which prints their bounds:
 //!
 //! | case | input | test |
 //! |---|---|---|
@@ -47,8 +47,8 @@
 //! | 42 | T = 1,000,000; N = 10,000,000 | `tests/command_line/long.rs` |
 //! | 43 | another N, other attributes | `clouds::frames_with_unequal_counts_are_named`, `streams::frames_of_another_size_or_attributes_are_named` |
 //!
-//! C, E and Vis, which no case names, are compared with slow definitions in selfcheck "projected area", "needle on screen"
-//! and "contributions", and E in `invariance`.
+//! C, E and Vis, which no case names, are compared with slow definitions in selfcheck "projected area", "needle on
+//! screen" and "contributions", and E in `invariance`.
 
 mod clouds;
 mod invariance;
@@ -95,15 +95,15 @@ fn assert_close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got:e}, expected {expected:e}, tolerance {tolerance:e}");
 }
 
-/// Statistics by name, one value per Gaussian.
+/// Statistics of a sequence by name, with one value per Gaussian.
 type Rows = BTreeMap<String, Vec<f64>>;
 
-/// Runs the program while `write` writes to its standard input; the program may stop reading early.
+/// Runs the program while `write` writes to its standard input. The program may stop reading early.
 fn piped(workplace: &Workplace, arguments: &str, write: impl FnOnce(&mut dyn Write) + Send + 'static) -> Output {
     scene::piped(&mut workplace.command(arguments), move |pipe| write(&mut BufWriter::new(pipe)))
 }
 
-/// Sequence that is made frame by frame and read by the program as a stream.
+/// Sequence that is generated frame by frame and passed to the program as a stream.
 struct Sequence {
     frames: usize,
     header: StreamHeader,
@@ -114,7 +114,7 @@ struct Sequence {
 }
 
 impl Sequence {
-    /// Returns `frames` frames of `count` balls, of which the attributes `varying` may be set in each frame.
+    /// Returns a sequence of `frames` frames with `count` balls. The attributes `varying` can be set in each frame.
     fn new(count: usize, frames: usize, varying: Attributes) -> Sequence {
         let header = StreamHeader { count, sh_degree: 0, varying, is_unlinked: false };
         Sequence { frames, header, state: balls(count), cameras: None, time: |t| t as f64 }
@@ -125,7 +125,8 @@ impl Sequence {
         self
     }
 
-    /// Runs the program on the sequence; `fill` sets the state of each frame.
+    /// Runs the program with the sequence on its standard input. `fill` sets the state of each frame, given the frame
+    /// number.
     fn run(
         self,
         workplace: &Workplace,
@@ -151,14 +152,14 @@ impl Sequence {
         output
     }
 
-    /// Returns the statistics of the sequence.
+    /// Runs `score` on the sequence and returns the statistics. `fill` sets the state of each frame.
     fn rows(self, flags: &str, fill: impl Fn(usize, &mut Gaussians) + Send + 'static) -> Rows {
         let workplace = Workplace::new();
         self.run(&workplace, &format!("score - -o rows.npz {flags}"), fill);
         scene::arrays(&workplace.path("rows.npz"))
     }
 
-    /// Returns the summary of compressing the sequence.
+    /// Runs `compress` on the sequence and returns the summary. `fill` sets the state of each frame.
     fn summary(self, flags: &str, fill: impl Fn(usize, &mut Gaussians) + Send + 'static) -> serde_json::Value {
         let output = self.run(&Workplace::new(), &format!("compress - -o out.gseq --json {flags}"), fill);
         serde_json::from_slice(&output.stdout).unwrap()

@@ -1,4 +1,4 @@
-//! Tests of merging, from input file to output file: pairs that merge, pairs that must not, and their proxies.
+//! Tests of merging, from input file to output file: pairs that merge, pairs that must not merge, and proxies.
 
 use std::fs;
 
@@ -8,17 +8,18 @@ use splatsieve::model::Gaussians;
 use super::scene::{PlyRows, Workplace, arrays, index_map};
 use super::{CAMERA, assert_close, balls};
 
-/// Options with which only the merging tests decide, not renders.
+/// Options with which the merging tests alone decide, without renders.
 const MERGE: &str = "--merge-only --no-refine --set choose_by_views=false --set coverage=projected --overwrite";
 
-/// Returns two equal balls at the same position, and one far away that gives the scene an extent.
+/// Returns three Gaussians: two equal balls at the same position, and a ball far away that gives the scene an extent.
 fn twins() -> Gaussians {
     let mut cloud = balls(1).pick(&[0, 0, 0]);
     cloud.position.set_row(2, [3.0, 2.0, 1.0]);
     cloud
 }
 
-/// Returns how many of the first two of [`twins`] remain if `edit` changes the states at frame t.
+/// Returns how many of the two equal balls of [`twins`] remain after merging. `edit` changes the state of each frame,
+/// given the frame number.
 fn count_after_merging(frames: usize, edit: impl Fn(usize, &mut Gaussians)) -> usize {
     let workplace = Workplace::new();
     for t in 0..frames {
@@ -99,7 +100,8 @@ fn different_colors_never_merge() {
     assert_eq!(colored([[-1.78; 3], [-2.5; 3]]), 1);
 }
 
-/// Merges two Gaussians changed by `edit` to one. Returns its scales, its axes as columns, and its row.
+/// Merges two equal Gaussians, changed by `edit`, to one. Returns the scales of the result, its axes as columns, and
+/// its PLY row.
 fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRows) {
     let workplace = Workplace::new();
     let mut cloud = balls(1).pick(&[0, 0]);
@@ -114,7 +116,7 @@ fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, Pl
     (scales, DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()), rows)
 }
 
-/// Options with lengths in scene units, by which pairs may merge at a distance of one unit with any differences.
+/// Options with lengths in scene units. With them, pairs up to one unit apart merge, whatever their differences.
 const WIDE: &str = "--set length_unit=scene --set passes=1,1e9,-1,-1";
 
 /// Case 21 of the table in `main.rs`, for needles along every axis and with any order of axes.
@@ -354,7 +356,8 @@ fn crowded_voxel_is_truncated_and_noted() {
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 
-/// Case 33 of the table in `main.rs`: balls along a line, ordered by size, in which each is the leader of the next.
+/// Case 33 of the table in `main.rs`: balls along a line, ordered by size, in which each ball is the leader of the next
+/// one.
 #[test]
 fn sorted_chain_merges_by_the_sequential_rule() {
     const N: usize = 4000;

@@ -1,4 +1,4 @@
-//! Tests of the statistics of trajectories and life spans, from a stream to scores.
+//! Tests of the statistics of trajectories and life spans, from a stream of frames to scores.
 
 use std::f64::consts::TAU;
 
@@ -8,11 +8,12 @@ use super::{Rows, Sequence, assert_close};
 
 const ALIVE: f32 = 0.0;
 const DEAD: f32 = -7.0;
-/// Presets of both definitions of motion. Noise removal is off, because these scenes have no noise.
+/// Options for each of the two definitions of motion. Noise removal is off, because these scenes have no noise.
 const RUNS: &str = "--preset default --set snap_noise=false";
 const LITERAL: &str = "--preset paper --set snap_noise=false";
 
-/// Returns the statistics of Gaussians that move along x by `x(i, t)`, with opacity logits `life(i, t)`.
+/// Returns the statistics of Gaussians that move along the x axis. At frame t, Gaussian i has x coordinate `x(i, t)`
+/// and opacity logit `life(i, t)`.
 fn move_along_x(
     count: usize,
     frames: usize,
@@ -28,7 +29,7 @@ fn move_along_x(
     })
 }
 
-/// Returns a statistic of Gaussian `i`.
+/// Returns the statistic `name` of Gaussian `i`.
 fn statistic(rows: &Rows, name: &str, i: usize) -> f64 {
     rows[name][i]
 }

@@ -7,7 +7,7 @@ use splatsieve::model::Attributes;
 use splatsieve::outputs::frame_stream::StreamWriter;
 use std::path::Path;
 
-/// Returns a stream of five frames with four balls.
+/// Returns the bytes of a stream of five frames with four balls.
 fn stream() -> Vec<u8> {
     let (mut bytes, state) = (Vec::new(), balls(4));
     let header = StreamHeader { count: 4, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
@@ -17,13 +17,14 @@ fn stream() -> Vec<u8> {
     bytes
 }
 
-/// Returns the byte offset of frame `t`: header, four balls without positions, then for each frame a mark of 24 bytes
-/// and positions.
+/// Returns the byte offset of frame `t` in the stream. The stream has a header, four balls without positions, then for
+/// each frame a mark of 24 bytes and positions.
 fn frame_offset(t: usize) -> usize {
     32 + 4 * 4 * (4 + 3 + 1 + 3) + t * (24 + 4 * 4 * 3)
 }
 
-/// Checks that every command that reads streams refuses `bytes` with these parts in its message, and leaves no files.
+/// Checks that every command that reads streams refuses `bytes`, that its message contains all `parts`, and that it
+/// leaves no files.
 fn refused(bytes: &[u8], parts: &[&str]) {
     for arguments in ["compress - -o out", "convert - a.gseq", "score - -o rows.npz", "info -"] {
         let (workplace, bytes) = (Workplace::new(), bytes.to_owned());

@@ -1,5 +1,5 @@
-//! Tests of binary inputs that announce more than they hold: PLY files, frame streams, containers, archives and arrays;
-//! and files of other kinds than regular ones in their place.
+//! Tests of binary inputs that announce more content than they have: PLY files, frame streams, containers, archives and
+//! arrays. Also of devices and other special files in place of regular files.
 //!
 //! Large inputs are sparse files: they take no space on disk and no memory of the test process.
 
@@ -17,9 +17,9 @@ use zip::{CompressionMethod, ZipWriter};
 
 use crate::runner::{Folder, MIB, Outcome, Random, SMALL_MEMORY, is_optimized, seed};
 
-/// Properties of a PLY of SH degree 0.
+/// Names of the properties of a PLY of SH degree 0.
 const NAMES: &str = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
-/// Bytes of a row with these properties.
+/// Number of bytes of a PLY row with the properties [`NAMES`].
 const ROW: u64 = 14 * 4;
 
 /// Writes a file with `head` and then zeros up to `len` bytes; the zeros take no space on disk.
@@ -29,7 +29,7 @@ fn sparse(folder: &Folder, name: &str, head: impl AsRef<[u8]>, len: u64) -> Path
     path
 }
 
-/// Returns the header of a PLY of `count` Gaussians with `extra` further properties.
+/// Returns the header of a PLY of `count` Gaussians in the encoding `format`, with `extra` additional properties.
 fn ply_header(format: &str, count: u64, extra: usize) -> String {
     let mut header = format!("ply\nformat {format} 1.0\nelement vertex {count}\n");
     NAMES.split(' ').for_each(|name| header += &format!("property float {name}\n"));
@@ -37,7 +37,7 @@ fn ply_header(format: &str, count: u64, extra: usize) -> String {
     header + "end_header\n"
 }
 
-/// Returns row `i` of a PLY with `extra` further properties.
+/// Returns row `i` of a PLY with `extra` additional properties.
 fn ply_row(i: usize, extra: usize) -> Vec<u8> {
     let values = [(i % 31) as f32, (i % 17) as f32, (i % 7) as f32, 0.5, 0.5, 0.5, 2.0, -3.0, -3.0, -3.0, 1.0];
     let mut row: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
@@ -45,7 +45,7 @@ fn ply_row(i: usize, extra: usize) -> Vec<u8> {
     row
 }
 
-/// Runs a command within 64 MiB.
+/// Runs the program with a memory limit of 64 MiB and checks that it keeps the limit.
 fn small(folder: &Folder, arguments: &str) -> Outcome {
     let (memory, bytes) = SMALL_MEMORY;
     folder.attack(&format!("{arguments} --memory {memory}")).run().within(bytes)
@@ -143,7 +143,7 @@ fn text_ply_is_parsed_once_for_any_number_of_blocks() {
     assert!(outcome.seconds < 10.0, "{} s", outcome.seconds);
 }
 
-/// Writes a text PLY of SH degree 0.
+/// Writes a text PLY of SH degree 0 with `rows` Gaussians.
 fn text_ply(folder: &Folder, name: &str, rows: u64) {
     let mut out = BufWriter::new(File::create(folder.path(name)).unwrap());
     out.write_all(ply_header("ascii", rows, 0).as_bytes()).unwrap();
@@ -161,12 +161,13 @@ fn stream_header(version: u32, gaussians: u64, columns: u32) -> Vec<u8> {
     out
 }
 
-/// Returns the bytes in front of a frame of `bytes` bytes.
+/// Returns the mark that precedes a frame of `bytes` bytes in a stream.
 fn stream_frame(bytes: u64) -> Vec<u8> {
     [&b"FRAM"[..], &0u32.to_le_bytes(), &0f64.to_le_bytes(), &bytes.to_le_bytes()].concat()
 }
 
-/// Runs a command within 64 MiB with this file as standard input.
+/// Runs the program with the file `stdin` as standard input and a memory limit of 64 MiB, and checks that it keeps the
+/// limit.
 fn small_with_stdin(folder: &Folder, arguments: &str, stdin: &Path) -> Outcome {
     let (memory, bytes) = SMALL_MEMORY;
     let attack = folder.attack(&format!("{arguments} --memory {memory}"));
@@ -197,7 +198,8 @@ fn stream_with_constant_rows_beyond_memory_is_refused() {
     small_with_stdin(&folder, "info -", &path).refused(1, &["standard input, byte 16", "constant columns"]);
 }
 
-/// Returns an archive with these stored sections and declared lengths of their content (format/ARCHIVE.md).
+/// Returns an archive (format/ARCHIVE.md) with the sections `stored`, whose header declares the lengths `content` of
+/// their decompressed contents.
 fn archive(stored: [&[u8]; 4], content: [u64; 4]) -> Vec<u8> {
     let mut out = b"\x89GSZ\r\n\x1a\n\x01\0\0\0".to_vec();
     for (bytes, length) in stored.iter().zip(content) {
@@ -208,7 +210,7 @@ fn archive(stored: [&[u8]; 4], content: [u64; 4]) -> Vec<u8> {
     out
 }
 
-/// Returns `count` zeros as a zstd frame.
+/// Returns `count` zero bytes, compressed as a zstd frame.
 fn packed_zeros(count: u64) -> Vec<u8> {
     let mut encoder = zstd::stream::Encoder::new(Vec::new(), 1).unwrap();
     io::copy(&mut io::repeat(0).take(count), &mut encoder).unwrap();
@@ -257,12 +259,12 @@ fn sparse_archives_are_refused_by_their_header() {
     small(&folder, "info longer.gsz").refused(1, &["longer.gsz, end", "nothing after the last section"]);
 }
 
-/// Adds a NumPy array of zeros.
+/// Adds a NumPy array of zeros to a zip archive.
 fn zeros(archive: &mut ZipWriter<File>, name: &str, shape: &[u64]) {
     array(archive, name, shape, &mut io::repeat(0));
 }
 
-/// Adds a NumPy array of f32 with these bytes.
+/// Adds a NumPy array of f32 with the content `bytes` to a zip archive.
 fn array(archive: &mut ZipWriter<File>, name: &str, shape: &[u64], bytes: &mut dyn Read) {
     let options = FileOptions::default().compression_method(CompressionMethod::Deflated);
     archive.start_file(format!("{name}.npy"), options).unwrap();
@@ -429,7 +431,7 @@ fn slow_input_cut_short_at_200_moments_is_an_error() {
     cut_while_read(200);
 }
 
-/// Packs a PLY `runs` times and cuts it short at another moment each time.
+/// Converts a PLY to a container `runs` times. Each time, the PLY is cut short at another moment while it is read.
 fn cut_while_read(runs: u64) {
     let folder = Folder::new();
     let (extra, rows) = (200, 30_000);

@@ -8,7 +8,7 @@ use splatsieve::model::{AttributeValues, Gaussians};
 
 use crate::runner::{Attack, Folder, Outcome};
 
-/// Options with which a run of a few Gaussians takes little time.
+/// Options that make a run with a few Gaussians short.
 const QUICK: &str =
     "--cameras cameras.json --set refine_pictures=26 --set refine_steps=12 --set refine_cut_steps=3 --quiet";
 
@@ -26,7 +26,7 @@ fn cloud(count: usize) -> Gaussians {
     cloud
 }
 
-/// Returns a folder with `cameras.json` (six small images from all sides) and the given Gaussians as `in.ply`.
+/// Returns a folder with the Gaussians `cloud` as `in.ply`, and `cameras.json` (six small images from all sides).
 fn folder_with(cloud: &Gaussians) -> Folder {
     let folder = Folder::new();
     write_inria(cloud, &[], &folder.path("in.ply")).unwrap();
@@ -44,7 +44,7 @@ fn folder_with(cloud: &Gaussians) -> Folder {
     folder
 }
 
-/// Prepares `compress in.ply -o OUTPUT` with options.
+/// Prepares a run of `compress in.ply -o OUTPUT` with the additional options `options`.
 fn compress(folder: &Folder, output: &str, options: &str) -> Attack {
     folder.attack(&format!("compress in.ply -o {output} {QUICK} {options}"))
 }
@@ -159,10 +159,10 @@ fn lossy_files_are_refused_if_an_outlier_takes_all_bits() {
     assert_eq!(folder.names(), before);
 }
 
-/// Change of Gaussian 3, by name.
+/// Name and function of a change to Gaussian 3.
 type Edit = (&'static str, fn(&mut Gaussians));
 
-/// Values that are not finite, one per attribute.
+/// Changes that set a value to NaN or infinity, in every attribute.
 const NOT_FINITE: [Edit; 8] = [
     ("position nan", |cloud| cloud.position.plane_mut(1)[3] = f32::NAN),
     ("position inf", |cloud| cloud.position.plane_mut(1)[3] = f32::INFINITY),
@@ -174,7 +174,7 @@ const NOT_FINITE: [Edit; 8] = [
     ("harmonic nan", |cloud| cloud.sh.plane_mut(7)[3] = f32::NAN),
 ];
 
-/// Finite values far beyond those of any scene.
+/// Changes that set a value to a finite number far beyond those of any scene.
 const EXTREME: [Edit; 12] = [
     ("position 1e30", |cloud| cloud.position.plane_mut(1)[3] = 1e30),
     ("position 1e7", |cloud| cloud.position.plane_mut(0)[3] = 1e7),

@@ -1,4 +1,5 @@
-//! Tests of links, devices, shared outputs, kills and failures in place of ordinary output files.
+//! Tests of unusual outputs: links and devices in place of ordinary files, outputs shared by runs, killed runs and
+//! failures to write.
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -19,7 +20,7 @@ use super::runner::{Folder, Outcome, Random, SMALL_MEMORY, is_optimized, program
 const COUNT: usize = 40;
 /// First line of the lock file in a workspace of the program, defined in `src/files/atomic/workspace.rs`.
 const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// User without privileges, for tests that the superuser runs.
+/// Id of a user without privileges, for tests that the superuser runs.
 const NOBODY: u32 = 65534;
 
 /// Writes a PLY of [`COUNT`] Gaussians as `in.ply`, and a camera of a few pixels as `views.json`.
@@ -51,18 +52,18 @@ fn folder_with_input() -> Folder {
     folder
 }
 
-/// Returns the names in the folder except the input.
+/// Returns the names of all entries in the folder except the input files.
 fn outputs(folder: &Folder) -> Vec<String> {
     folder.names().into_iter().filter(|name| name != "in.ply" && name != "views.json").collect()
 }
 
-/// Returns the arguments of the fastest run that writes four files, or a folder, and keeps `count` Gaussians.
+/// Returns the arguments of the fastest run that keeps `count` Gaussians and writes four files, or a folder.
 fn compress(output: &str, count: u64) -> String {
     let fast = "--cameras views.json --prune-only --no-refine --threads 1 --quiet";
     format!("compress in.ply -o {output} --count {count} {fast}")
 }
 
-/// Returns the number of Gaussians in a PLY.
+/// Returns the number of Gaussians that the header of a PLY declares.
 fn ply_count(path: &Path) -> usize {
     let bytes = fs::read(path).unwrap();
     let header = String::from_utf8_lossy(&bytes[..bytes.len().min(200)]).into_owned();
@@ -70,8 +71,8 @@ fn ply_count(path: &Path) -> usize {
     count.parse().unwrap()
 }
 
-/// Returns the number of Gaussians in a result and in each file beside it, which are equal if all files belong to one
-/// run. Returns `None` if no file of the result exists.
+/// Returns the number of Gaussians that each file of a result states: the output itself and the files beside it. The
+/// numbers are equal if all files belong to one run. Returns `None` if no file of the result exists.
 fn counts_of_set(folder: &Folder, output: &str) -> Option<Vec<usize>> {
     let path = |name: &str| match folder.path(output).is_dir() {
         true => folder.path(output).join(name),
@@ -105,13 +106,14 @@ fn check_set(folder: &Folder, output: &str) {
     }
 }
 
-/// Checks that no workspace of the program is left in the folder, except `foreign` entries with such names.
+/// Checks that no workspace of the program is left in the folder. Entries in `foreign` have such names, but are not the
+/// program's, and may remain.
 fn check_no_leftovers(folder: &Folder, foreign: &[&str]) {
     let left: Vec<String> = folder.names().into_iter().filter(|name| name.contains("splatsieve-tmp")).collect();
     assert_eq!(left, foreign);
 }
 
-/// Returns all entries below a folder: contents of files, targets of links.
+/// Returns all entries below a folder by path, with the contents of files and the targets of links.
 fn tree(path: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for entry in fs::read_dir(path).unwrap() {
@@ -140,7 +142,8 @@ fn is_superuser() -> bool {
     unsafe { libc::geteuid() == 0 }
 }
 
-/// Makes the folder writable for everybody. Returns the change that starts a program as an unprivileged user.
+/// Makes the folder writable for everybody. Returns a function that changes a command so that it runs as an
+/// unprivileged user.
 fn ordinary_user(folder: &Folder) -> impl Fn(&mut Command) {
     fs::set_permissions(folder.path(""), fs::Permissions::from_mode(0o777)).unwrap();
     |command: &mut Command| {
@@ -437,7 +440,7 @@ fn slow_a_fifo_without_a_reader_is_an_error() {
     assert_eq!(outputs(&folder), ["fifo.ply"]);
 }
 
-/// Starts commands of the tests as the same user as the program.
+/// Extension of commands that lets a test start other programs as the same user as the program under test.
 trait WithUser {
     fn with_user(&mut self, user: impl Fn(&mut Command)) -> &mut Command;
 }
@@ -449,12 +452,13 @@ impl WithUser for Command {
     }
 }
 
-/// Number of runs that the stress test starts at the same time.
+/// Number of runs that the stress test starts at the same time in each round.
 const PARALLEL_RUNS: usize = 3;
 /// Names of outputs that share a folder: three files with their companions, and a folder.
 const SHARED: [&str; 4] = ["a.ply", "b.ply", "c.ply", "d"];
 
-/// Prepares the folder of the stress test: links and folders with names of leftovers, foreign files beside and in outputs.
+/// Prepares the folder of the stress test: links and folders whose names look like leftovers of the program, and
+/// foreign files beside and in outputs. Returns the names of the former.
 fn prepare_stress(folder: &Folder) -> Vec<&'static str> {
     folder.write("victim/thesis", "years of work");
     folder.write("victim/lock", LOCK_LINE);
@@ -469,7 +473,7 @@ fn prepare_stress(folder: &Folder) -> Vec<&'static str> {
     vec![links[0], ".b.ply.AbCdEf.splatsieve-tmp", links[1], links[2]]
 }
 
-/// Returns the entries that no run may change.
+/// Returns the content of each entry in the folder that no run may change.
 fn foreign_entries(folder: &Folder) -> Vec<BTreeMap<PathBuf, Vec<u8>>> {
     let file = |name: &str| {
         let path = folder.path(name);
@@ -486,7 +490,7 @@ fn foreign_entries(folder: &Folder) -> Vec<BTreeMap<PathBuf, Vec<u8>>> {
     ]
 }
 
-/// Returns the arguments of a run of the stress test.
+/// Returns random arguments for a run of the stress test that writes `output`.
 fn stress_line(random: &mut Random, output: &str) -> String {
     // --overwrite would replace the folder with the foreign file in it.
     let flags =

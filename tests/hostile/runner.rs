@@ -1,4 +1,4 @@
-//! Starts the program under test and measures what it uses.
+//! Starts the program under test and measures its time and memory.
 
 #![allow(dead_code, reason = "each attack uses a part of this module")]
 
@@ -15,7 +15,7 @@ use tempfile::TempDir;
 /// Bytes of one MiB.
 pub(crate) const MIB: u64 = 1 << 20;
 
-/// Memory limit of every test of an oversized input, as the value of `--memory` and in bytes.
+/// Memory limit of every test of an oversized input: the value of `--memory`, and the same in bytes.
 pub(crate) const SMALL_MEMORY: (&str, u64) = ("64MiB", 64 * MIB);
 
 /// Returns the time limit of one run in seconds; longer for an unoptimized program.
@@ -48,7 +48,7 @@ pub(crate) fn seed(default: u64) -> u64 {
     seed
 }
 
-/// Random numbers that depend only on the seed (the SplitMix64 generator of Steele, Lea and Flood, 2014).
+/// Generator of random numbers that depend only on the seed (SplitMix64 of Steele, Lea and Flood, 2014).
 pub(crate) struct Random(u64);
 
 impl Random {
@@ -116,7 +116,7 @@ impl Folder {
     }
 }
 
-/// Run of the program that has not been started.
+/// Run of the program that has not started yet.
 pub(crate) struct Attack {
     command: Command,
     seconds: f64,
@@ -137,31 +137,32 @@ impl Attack {
         self
     }
 
-    /// Gives the run this file as standard input.
+    /// Sets the standard input of the run to `file`.
     pub(crate) fn stdin(mut self, file: impl Into<Stdio>) -> Attack {
         self.command.stdin(file);
         self
     }
 
-    /// Replaces the pipe that collects standard output.
+    /// Sends the standard output of the run to `file` instead of a pipe that is read.
     pub(crate) fn stdout(mut self, file: impl Into<Stdio>) -> Attack {
         self.command.stdout(file);
         self
     }
 
-    /// Replaces the pipe that collects standard error.
+    /// Sends the standard error of the run to `file` instead of a pipe that is read.
     pub(crate) fn stderr(mut self, file: impl Into<Stdio>) -> Attack {
         self.command.stderr(file);
         self
     }
 
-    /// Sets an environment variable.
+    /// Sets an environment variable of the run.
     pub(crate) fn env(mut self, name: &str, value: impl AsRef<OsStr>) -> Attack {
         self.command.env(name, value);
         self
     }
 
-    /// Changes how the program is started, for example as another user or with a limit of the system.
+    /// Applies `change` to the command that starts the program, for example to start it as another user or with a limit
+    /// of the system.
     pub(crate) fn with(mut self, change: impl FnOnce(&mut Command)) -> Attack {
         change(&mut self.command);
         self
@@ -182,7 +183,8 @@ impl Attack {
     }
 }
 
-/// Reads a pipe to its end on a thread of its own, so that the program never waits for its reader.
+/// Reads `pipe` to its end on another thread, so that the program never waits for a reader. The thread returns the
+/// text.
 fn collect(mut pipe: impl Read + Send + 'static) -> thread::JoinHandle<String> {
     thread::spawn(move || {
         let mut bytes = Vec::new();
@@ -191,7 +193,7 @@ fn collect(mut pipe: impl Read + Send + 'static) -> thread::JoinHandle<String> {
     })
 }
 
-/// Run that has been started.
+/// Run of the program that has started.
 pub(crate) struct Running {
     child: Child,
     stdout: Option<thread::JoinHandle<String>>,
@@ -207,13 +209,13 @@ impl Running {
         self.child.id()
     }
 
-    /// Sends a signal, for example `libc::SIGKILL`.
+    /// Sends the signal `signal` to the run, for example `libc::SIGKILL`.
     pub(crate) fn signal(&self, signal: i32) {
         // SAFETY: the child has not been waited for, so its id names no other process.
         unsafe { libc::kill(self.child.id() as i32, signal) };
     }
 
-    /// Waits for the end of the run and kills it at its time limit.
+    /// Waits for the end of the run; kills it at its time limit. Returns its result.
     pub(crate) fn wait(self) -> Outcome {
         let id = self.child.id() as i32;
         let mut is_killed = false;
@@ -258,8 +260,8 @@ pub(crate) struct Outcome {
     pub(crate) is_timed_out: bool,
     pub(crate) stdout: String,
     pub(crate) stderr: String,
-    /// Largest resident memory, mapped pages included. The kernel counts the memory that the test process had when it
-    /// started the run as well, so tests write large inputs piece by piece.
+    /// Largest resident memory of the run in bytes, mapped pages included. The kernel also counts the memory that the
+    /// test process had when it started the run, so tests write large inputs piece by piece.
     pub(crate) peak_bytes: u64,
     pub(crate) seconds: f64,
     /// Arguments of the run, for messages.
@@ -313,7 +315,7 @@ impl Outcome {
     }
 }
 
-/// Opens a device that is always full for writing.
+/// Opens for writing a device that is always full.
 pub(crate) fn full_device() -> File {
     File::options().write(true).open("/dev/full").unwrap()
 }

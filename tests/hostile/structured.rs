@@ -1,4 +1,4 @@
-//! Tests of pickles and JSON texts that cost far more memory to read than they have bytes.
+//! Tests of pickles and JSON texts whose values take far more memory than the texts have bytes.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -9,19 +9,19 @@ use flate2::{Compression, Crc};
 
 use crate::runner::{Folder, MIB, Outcome, SMALL_MEMORY, tiny_model};
 
-/// Maximum number of bytes of a pickle in a checkpoint.
+/// Maximum number of bytes that the program accepts for a pickle in a checkpoint.
 const LARGEST_PICKLE: usize = 8 << 20;
 
-/// Bytes as pieces, each with its number of repetitions. The memory of the test process counts in the runs that it
-/// starts, so large inputs are written piece by piece.
+/// Bytes as a list of pieces, each with the number of its repetitions. Large inputs are written piece by piece, because
+/// the memory of the test process counts in the runs that it starts.
 type Pieces = Vec<(Vec<u8>, usize)>;
 
-/// Returns one piece without repetition.
+/// Returns `bytes` as a single piece without repetition.
 fn once(bytes: &[u8]) -> Pieces {
     vec![(bytes.to_vec(), 1)]
 }
 
-/// Returns `start`, followed by `piece` repeated until the pickle is full.
+/// Returns a pickle of almost [`LARGEST_PICKLE`] bytes: `start`, followed by repetitions of `piece`.
 fn fill(start: &[u8], piece: &[u8]) -> Pieces {
     let block = piece.repeat(4096 / piece.len());
     let count = (LARGEST_PICKLE - start.len() - 4096) / block.len();
@@ -32,7 +32,7 @@ fn fill(start: &[u8], piece: &[u8]) -> Pieces {
 struct Entry {
     name: String,
     pieces: Pieces,
-    /// Size and checksum of the content of a deflated entry.
+    /// Size and checksum of the decompressed content, if the entry is deflated.
     deflated: Option<(u32, u32)>,
 }
 
@@ -41,7 +41,7 @@ impl Entry {
         Entry { name: name.into(), pieces, deflated: None }
     }
 
-    /// Returns an entry with `piece` repeated `count` times, deflated.
+    /// Returns a deflated entry called `name` that contains `piece` `count` times.
     fn deflated(name: &str, piece: &[u8], count: usize) -> Entry {
         let (mut out, mut sum) = (DeflateEncoder::new(Vec::new(), Compression::best()), Crc::new());
         for _ in 0..count {
@@ -53,7 +53,8 @@ impl Entry {
     }
 }
 
-/// Writes a zip archive that declares `announced` entries, or the true number.
+/// Writes a zip archive with the files `entries` to `path`. Its directory declares `announced` entries; `None` stands
+/// for the true number.
 fn write_zip(path: &Path, entries: impl IntoIterator<Item = Entry>, announced: Option<u16>) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     let mut out = BufWriter::new(File::create(path).unwrap());
@@ -89,12 +90,13 @@ fn write_zip(path: &Path, entries: impl IntoIterator<Item = Entry>, announced: O
     out.flush().unwrap();
 }
 
-/// Writes a checkpoint with this pickle.
+/// Writes a checkpoint with the pickle `pickle` to `path`.
 fn write_checkpoint(path: &Path, pickle: Pieces) {
     write_zip(path, [Entry::stored("a/data.pkl", pickle), Entry::stored("a/version", once(b"3\n"))], None);
 }
 
-/// Copies the tiny model with its network replaced by the checkpoint with `pickle`.
+/// Copies the tiny model to `folder`. Its network is replaced by a checkpoint with `pickle`. Returns the name of the
+/// copy.
 fn model_with_network(folder: &Folder, pickle: Entry) -> &'static str {
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     for name in ["cfg_args", cloud] {
@@ -104,12 +106,13 @@ fn model_with_network(folder: &Folder, pickle: Entry) -> &'static str {
     "model"
 }
 
-/// Runs `info` on `input` within 64 MiB.
+/// Runs `info` on `input` with a memory limit of 64 MiB and checks that it keeps the limit.
 fn info(folder: &Folder, input: &str) -> Outcome {
     folder.attack(&format!("info {input} --memory {}", SMALL_MEMORY.0)).run().within(SMALL_MEMORY.1)
 }
 
-/// Checks that a checkpoint filled with `piece` after `start` is refused within the memory limit.
+/// Checks that a checkpoint is refused within the memory limit if its pickle begins with `start` and is filled with
+/// repetitions of `piece`.
 fn assert_flood_is_refused(start: &[u8], piece: &[u8]) {
     let folder = Folder::new();
     write_checkpoint(&folder.path("a.pt"), fill(start, piece));
@@ -262,7 +265,7 @@ fn old_checkpoint_is_refused_with_a_remedy() {
     info(&folder, model).refused(1, &["deformation.pth", "if PyTorch before 1.6 saved it, load it and save it again"]);
 }
 
-/// Writes a file piece by piece.
+/// Creates the file at `path`, lets `write` write to it, and returns the path.
 fn write_pieces(path: &Path, write: impl FnOnce(&mut BufWriter<File>)) -> PathBuf {
     let mut out = BufWriter::new(File::create(path).unwrap());
     write(&mut out);
@@ -270,7 +273,7 @@ fn write_pieces(path: &Path, write: impl FnOnce(&mut BufWriter<File>)) -> PathBu
     path.to_owned()
 }
 
-/// Returns the JSON of an image with a camera of its own.
+/// Returns the JSON of image number `k`, which has a camera of its own.
 fn frame(k: u32) -> String {
     let x = f64::from(k) * 1e-3;
     format!(
@@ -280,7 +283,7 @@ fn frame(k: u32) -> String {
     )
 }
 
-/// Writes `count` images as a `transforms.json`.
+/// Writes a `transforms.json` with `count` images to `folder`.
 fn write_transforms(folder: &Folder, count: u32) {
     write_pieces(&folder.path("transforms.json"), |out| {
         out.write_all(b"{\"camera_angle_x\": 1.0, \"w\": 32, \"h\": 32, \"frames\": [").unwrap();
@@ -292,13 +295,13 @@ fn write_transforms(folder: &Folder, count: u32) {
     });
 }
 
-/// Runs a dry run with the cameras of `transforms.json`.
+/// Runs `compress --dry-run` on the tiny model with the cameras of `transforms.json` and the memory limit `memory`.
 fn dry_run(folder: &Folder, memory: &str) -> Outcome {
     let line = format!("compress {{tiny}} -o out --cameras transforms.json --dry-run --explain --memory {memory}");
     folder.attack(&line).run().ended()
 }
 
-/// Returns the memory that the plan of a run states, in bytes.
+/// Returns the peak memory in bytes that the plan of a run states.
 fn planned_memory(outcome: &Outcome) -> u64 {
     // The first figure is that of the whole run; memory used so far follows.
     let said = outcome.stdout.split("memory: at most ").nth(1).unwrap_or_else(|| panic!("{}", outcome.stdout));

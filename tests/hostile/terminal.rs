@@ -1,5 +1,5 @@
-//! Tests of standard streams that cannot be written, of names and texts that a terminal, a spreadsheet or a browser
-//! would execute, and of outputs that would reveal folder names of the machine.
+//! Tests of three dangers: standard streams that cannot be written; names and texts that a terminal, a spreadsheet or a
+//! browser would execute; outputs that would reveal folder names of the machine.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -25,16 +25,16 @@ fn the_runner_reports_code_message_and_memory() {
     assert!(outcome.stdout.contains('='));
 }
 
-/// Standard stream that takes no more bytes.
+/// Standard stream that accepts no more bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum BrokenStream {
-    /// Device without space.
+    /// Device without free space.
     Full,
-    /// A pipe whose reader has ended.
+    /// Pipe whose reader has ended.
     Unread,
-    /// No stream.
+    /// Descriptor that is closed when the program starts.
     Closed,
-    /// A terminal whose window has been closed.
+    /// Terminal whose window has been closed.
     HungUp,
 }
 
@@ -42,7 +42,8 @@ const BROKEN_STREAMS: [BrokenStream; 4] =
     [BrokenStream::Full, BrokenStream::Unread, BrokenStream::Closed, BrokenStream::HungUp];
 
 impl BrokenStream {
-    /// Replaces the stream `descriptor` (1: standard output, 2: standard error) of a run.
+    /// Replaces a standard stream of a run by this broken stream. `descriptor` is 1 for standard output and 2 for
+    /// standard error.
     fn replace_stream(self, attack: Attack, descriptor: i32) -> Attack {
         let stream: Stdio = match self {
             BrokenStream::Full => full_device().into(),
@@ -66,7 +67,7 @@ impl BrokenStream {
     }
 }
 
-/// Opens a new terminal. Returns the end of the window and the end of the program.
+/// Opens a new pseudo-terminal. Returns its two ends: that of the terminal window, and that of the program.
 fn terminal() -> (OwnedFd, OwnedFd) {
     let (mut window, mut program) = (-1, -1);
     let none = std::ptr::null_mut();
@@ -77,7 +78,7 @@ fn terminal() -> (OwnedFd, OwnedFd) {
     unsafe { (OwnedFd::from_raw_fd(window), OwnedFd::from_raw_fd(program)) }
 }
 
-/// Quick commands that print, with their exit codes.
+/// Quick commands that print something, each with its exit code.
 const QUICK: [(&str, i32); 10] = [
     ("--help", 0),
     ("compress --help", 0),
@@ -91,7 +92,7 @@ const QUICK: [(&str, i32); 10] = [
     ("compress", 2),
 ];
 
-/// Checks that a command with a broken standard error ends with its usual exit code.
+/// Checks that a command with a broken standard error ends with the exit code `code`, as without the defect.
 fn check_broken_stderr(folder: &Folder, arguments: &str, code: i32) {
     for broken in BROKEN_STREAMS {
         let outcome = broken.replace_stream(folder.attack(arguments), 2).run().ended();
@@ -187,10 +188,11 @@ fn slow_every_command_survives_broken_streams() {
     }
 }
 
-/// Characters of a name that may not reach a terminal: escape sequences of both sets, line ends, marks of direction.
+/// Characters of a name that must not reach a terminal: escape sequences of both sets, line ends, marks of text
+/// direction.
 const EVIL: &str = "a\u{1b}[31m\u{9b}2J\u{1b}]0;x\u{7}\r\nsplatsieve: b\u{202e}c\u{61c}\u{7f}";
 
-/// Checks that the output of a run is safe for a terminal and has no line made by a name.
+/// Checks that the output of a run is safe for a terminal, and that no part of a name appears as a line of its own.
 fn check_printable(outcome: &Outcome) {
     let is_evil = |c: char| {
         c != '\n' && (c.is_control() || matches!(c, '\u{61c}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}'))
@@ -201,7 +203,7 @@ fn check_printable(outcome: &Outcome) {
     }
 }
 
-/// Runs the program with words that may contain any characters.
+/// Runs the program with the arguments `words`, which may contain any characters.
 fn run_words(folder: &Folder, words: &[&str]) -> Outcome {
     folder.attack_with(words.iter().map(OsString::from)).run().ended()
 }
@@ -280,7 +282,8 @@ fn copy(from: &Path, to: &Path) {
 /// Folder name that no output may contain.
 const SECRET: &str = "secret_client_name";
 
-/// Folder below one named [`SECRET`], with the tiny model as trained there: its `cfg_args` contains that name too.
+/// Folder below a folder named [`SECRET`], with a copy of the tiny model that looks as if it was trained there: its
+/// `cfg_args` contains the name too.
 struct Secret {
     _top: Folder,
     place: PathBuf,
@@ -300,7 +303,8 @@ impl Secret {
         Secret { _top: top, place }
     }
 
-    /// Runs the program with absolute paths: `{m}` is the model, `{o}` the folder of outputs.
+    /// Runs the program with absolute paths. In `arguments`, `{m}` stands for the model and `{o}` for the folder of
+    /// outputs.
     fn run(&self, arguments: &str) -> Outcome {
         let [model, out] = ["model", "out"].map(|name| self.place.join(name).display().to_string());
         let words = arguments.split(' ').map(|word| word.replace("{m}", &model).replace("{o}", &out));
@@ -308,7 +312,8 @@ impl Secret {
         self._top.attack_with(words).within(300.0).run().succeeded()
     }
 
-    /// Checks that no output, except the user's own `cfg_args`, contains the folder name, also inside compressed data.
+    /// Checks that no output contains the folder name [`SECRET`], not even inside compressed data. With
+    /// `may_hold_config`, copies of the user's own `cfg_args` are excepted.
     fn check(&self, may_hold_config: bool) {
         let mut files = Vec::new();
         list(&self.place.join("out"), &mut files);
@@ -334,7 +339,7 @@ fn list(folder: &Path, files: &mut Vec<PathBuf>) {
     }
 }
 
-/// Returns the contents of every Zstandard frame and zlib stream in `bytes`.
+/// Returns the decompressed contents of every Zstandard frame and zlib stream in `bytes`.
 fn decompressed(bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut found = Vec::new();
     for at in 0..bytes.len().saturating_sub(4) {

@@ -1,6 +1,6 @@
 //! Trained models for tests: frame states at the recorded frames, cameras, and reference renders.
 //!
-//! This loader is independent of the library, which it helps to test.
+//! This loader shares no code with the library, which it helps to test.
 
 #![allow(dead_code, reason = "each test and bench uses its part")]
 
@@ -66,12 +66,12 @@ impl Model {
         }
     }
 
-    /// Returns the frames whose states are recorded.
+    /// Returns the numbers of the frames whose states are recorded.
     pub(crate) fn frames(&self) -> Vec<u64> {
         self.array::<i64>("frames").unwrap().into_iter().map(|frame| frame as u64).collect()
     }
 
-    /// Returns (frame, view) of every reference render.
+    /// Returns the frame and the view of every reference render.
     pub(crate) fn renders(&self) -> Vec<(u64, u64)> {
         let mut renders: Vec<(u64, u64)> = fs::read_dir(self.folder.join("ref_renders"))
             .unwrap()
@@ -84,13 +84,14 @@ impl Model {
         renders
     }
 
-    /// Returns a reference render, shape `[height, width, 3]`.
+    /// Returns the reference render of a frame and a view, shape `[height, width, 3]`.
     pub(crate) fn reference(&self, frame: u64, view: u64) -> Vec<f32> {
         let path = self.folder.join(format!("ref_renders/t{frame:03}_v{view:02}.npy"));
         npyz::NpyFile::new(BufReader::new(File::open(path).unwrap())).unwrap().into_vec().unwrap()
     }
 
-    /// Returns the frame state that the trainer's code gives at a recorded frame, in stored encoding.
+    /// Returns the frame state that the trainer's code gives at a recorded frame, with attributes encoded as in a PLY
+    /// file.
     pub(crate) fn state(&self, frame: u64) -> Gaussians {
         let at = self.frames().iter().position(|&f| f == frame).unwrap();
         let xyz: Vec<f32> = self.array("xyz").unwrap();
@@ -120,8 +121,8 @@ impl Model {
         Some(archive.by_name(name).unwrap()?.into_vec().unwrap())
     }
 
-    /// Returns the SH of the model's PLY, shape `[count, 16, 3]`. Each row of the file has 62 floats; the colors follow
-    /// position and normal, and `f_rest` is ordered by channel.
+    /// Returns the SH coefficients in the model's PLY file, shape `[count, 16, 3]`. Each row of the file has 62 floats;
+    /// the colors follow position and normal, and `f_rest` is ordered by channel.
     fn canonical_sh(&self, count: usize) -> Vec<f32> {
         let iteration = fs::read_dir(self.folder.join("point_cloud")).unwrap().next().unwrap().unwrap().path();
         let bytes = fs::read(iteration.join("point_cloud.ply")).unwrap();

@@ -23,7 +23,7 @@ fn opened(path: &Path, cameras: &Path) -> Scene {
     open_scene(&options).unwrap()
 }
 
-/// Sets the fragment of the page's address to `hash`, which selects what the page shows, and waits until the image is
+/// Sets the fragment of the page's address to `hash`, which selects the image to show, and waits until the image is
 /// drawn.
 fn go(page: &mut Browser, hash: &str) {
     page.value(&format!(
@@ -54,8 +54,8 @@ fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usi
     -10.0 * mean.log10()
 }
 
-/// Returns the faults of the page except for its worker, files of its own folder, and messages of a driver about
-/// reading back pixels, which only tests do.
+/// Returns the faults of the page with three exceptions: its worker, files of its own folder, and messages of a
+/// graphics driver about reading back pixels, which only tests do.
 fn complaints(page: &Browser, folder: Option<&Path>) -> Vec<String> {
     let own = folder.map(|folder| format!("request: file://{}/frames_", fs::canonicalize(folder).unwrap().display()));
     let is_own = |text: &String| {
@@ -66,7 +66,8 @@ fn complaints(page: &Browser, folder: Option<&Path>) -> Vec<String> {
     page.complaints().into_iter().filter(|text| !is_own(text)).collect()
 }
 
-/// Writes the test scene into `d`, and its page.
+/// Writes the test scene into the folder `d`, and the page that plays it. Returns the workplace and the path of the
+/// page.
 fn demo() -> (Workplace, PathBuf) {
     let at = Workplace::new();
     at.done("test-scene -o d --gaussians 1500 --frames 30");
@@ -222,7 +223,7 @@ fn it_plays_seeks_turns_and_jumps_and_names_are_text() {
     assert_eq!(complaints(&page, None), Vec::<String>::new());
 }
 
-/// JavaScript expression for the heights and widths of the visible controls: buttons and selects.
+/// JavaScript expression for height, width and name of each visible control (button or select) of the page.
 const CONTROLS: &str = "[...document.querySelectorAll('#controls button, #controls select')].filter(e => e.offsetHeight)\
                         .map(e => [e.offsetHeight, e.offsetWidth, e.getAttribute('aria-label')])";
 

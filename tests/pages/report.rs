@@ -25,7 +25,7 @@ fn data(at: &Workplace, folder: &str) -> Value {
     serde_json::from_str(&read(&at.path(folder).join("report.json"))).unwrap()
 }
 
-/// Returns data of a sweep: two methods and one varied parameter.
+/// Returns the data of a sweep with two methods and one varied parameter, as in `sweep.json`.
 fn sweep() -> Value {
     let point = |method: &str, count: usize, psnr: f64| {
         json!({
@@ -254,7 +254,7 @@ fn a_report_replaces_only_a_result_and_wrong_inputs_leave_nothing() {
     assert!(at.path("r/left.txt").exists(), "another's file in an earlier report stays");
 }
 
-/// Checks that every element of a page is closed, in order.
+/// Checks that every HTML element of a page is closed, in the right order.
 fn balanced(page: &str) {
     const VOID: [&str; 5] = ["!doctype", "meta", "img", "input", "br"];
     let mut open: Vec<&str> = Vec::new();

@@ -7,7 +7,8 @@ use crate::browser::{self, Browser};
 use crate::scene::Workplace;
 use serde_json::json;
 
-/// JavaScript expression for the border between the left and the right image of the first slider, percent of its width.
+/// JavaScript expression for the position of the border between the two images of the first slider, in percent of its
+/// width.
 const CUT: &str = "(() => {
     const clip = getComputedStyle(document.querySelector('.slider img.right')).clipPath;
     return parseFloat(clip.match(/inset\\(.* ([\\d.]+)%\\)/)[1]);
@@ -192,7 +193,8 @@ fn report_and_player_have_no_serious_accessibility_violation() {
     assert!(violations.iter().any(|rule| rule.starts_with("image-alt")), "{violations:?}");
 }
 
-/// JavaScript expression for the pairs of words of one chart that overlap, and the words that reach beyond their chart.
+/// JavaScript expression for unreadable words in charts: pairs of words of one chart that overlap, and words that reach
+/// beyond their chart.
 const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
     const outer = svg.getBoundingClientRect();
     const words = [...svg.querySelectorAll('text')].map(text => [text.textContent, text.getBoundingClientRect()]);

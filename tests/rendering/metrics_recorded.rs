@@ -1,5 +1,5 @@
-//! Tests that compare PSNR, SSIM and FLIP with independent implementations; `scripts/record_metrics.py` made the
-//! fixtures.
+//! Tests that compare PSNR, SSIM and FLIP with values of independent implementations. `scripts/record_metrics.py`
+//! recorded the values and the images.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::path::Path;
 use splatsieve::metrics::{flip, psnr, ssim};
 use splatsieve::render::Image;
 
-/// Returns the images of one fixture, shape `[images, height, width, 3]`.
+/// Returns the images in the fixture `name`, whose array has the shape `[images, height, width, 3]`.
 fn fixture_images(folder: &Path, name: &str) -> Vec<Image> {
     let file = npyz::NpyFile::new(File::open(folder.join(name)).unwrap()).unwrap();
     let [count, height, width, 3] = file.shape() else { panic!("{name} has the wrong shape") };

@@ -20,8 +20,8 @@ use tempfile::TempDir;
 const FRAMES: usize = 4;
 const SIZE: (usize, usize) = (48, 36);
 
-/// Returns a folder with `scene.gseq`, `smaller.gseq` of fewer Gaussians, and `cameras.json`: test views 0 and 2,
-/// training view 1, and test view 3, which looks away from the scene.
+/// Returns a folder with `scene.gseq`, `smaller.gseq` with fewer Gaussians, and `cameras.json`. Views 0 and 2 are test
+/// views, view 1 is a training view, and view 3 is a test view that looks away from the scene.
 fn scene() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = DemoScene::new(400, FRAMES);
@@ -72,7 +72,8 @@ fn done(folder: &Path, line: &str) -> String {
     String::from_utf8(out.stdout).unwrap()
 }
 
-/// Checks exit code and message of a run that must fail, and that it left no files.
+/// Runs the program and checks that it fails with `code`, that its message contains all of `says`, and that it leaves
+/// no files.
 fn refused(folder: &Path, line: &str, code: i32, says: &[&str]) {
     let before = files(folder);
     let out = run(folder, line);
@@ -105,7 +106,7 @@ fn array(path: &Path) -> Vec<f32> {
     file.into_vec().unwrap()
 }
 
-/// Returns the bytes of an 8-bit RGB PNG.
+/// Returns the RGB bytes of an 8-bit PNG.
 fn bytes(path: &Path) -> Vec<u8> {
     let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
     assert_eq!(reader.output_color_type(), (png::ColorType::Rgb, png::BitDepth::Eight));

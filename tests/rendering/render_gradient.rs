@@ -15,7 +15,8 @@ use splatsieve::source::FrameSource;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// Returns the gradients of a loss whose derivative with respect to the image is `pull`.
+/// Returns the gradients of a loss with respect to the attributes of `gaussians`. `pull` returns the derivative of the
+/// loss with respect to the image.
 fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
     let mut gradients = Gradients::new(gaussians.len(), Attributes::all(), gaussians.sh_degree());
     Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
@@ -28,7 +29,8 @@ fn plain_image(camera: &Camera, value: [f32; 3]) -> Image {
     Image { width: camera.width, height: camera.height, data: value.repeat(pixels) }
 }
 
-/// Returns `x` minus and plus about `step`, and the difference of the two in f64.
+/// Returns two points for a central difference: `x` minus `step` and `x` plus `step` as f32, and their exact difference
+/// in f64.
 fn step_both_ways(x: f32, step: f32) -> ([f32; 2], f64) {
     let both = [x - step, x + step];
     (both, f64::from(both[1]) - f64::from(both[0]))

@@ -1,4 +1,4 @@
-//! Tests that compare the rasterizer with other computations: closed forms, a slow f64 oracle, and invariants.
+//! Tests that compare the rasterizer with closed forms, with a slow f64 oracle, and with invariants.
 
 use std::num::NonZeroU32;
 

@@ -19,7 +19,7 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 use splatsieve::source::FrameSource;
 use tempfile::TempDir;
 
-/// Returns the path of the model in the repository; `scripts/make_fixture.py` made it.
+/// Returns the path of the tiny model, which is in the repository. `scripts/make_fixture.py` made it.
 pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
@@ -61,13 +61,13 @@ pub(crate) fn field_file(model: &Path) -> PathBuf {
     point_cloud(model).with_file_name("deformation.pth")
 }
 
-/// Returns why a run left out the stage `what`, according to its summary; `None` if it ran.
+/// Returns the reason why a run omitted the stage `what`, according to its summary; `None` if the stage ran.
 pub(crate) fn reason_left_out(summary: &Value, what: &str) -> Option<String> {
     let left = summary["left_out"].as_array().unwrap();
     left.iter().find(|left| left["what"] == what).map(|left| left["why"].as_str().unwrap().to_owned())
 }
 
-/// Returns what a program wrote to standard error.
+/// Returns the standard error of a program as text.
 pub(crate) fn stderr_text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
@@ -110,13 +110,13 @@ pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
     gather(source, &ids, frame, Attributes::all()).unwrap()
 }
 
-/// Returns all values of row `i` as bits, attribute by attribute.
+/// Returns the bits of all values of Gaussian `i`, attribute by attribute.
 pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
     let planes = |column: Attributes| (0..state.column(column).width()).map(move |c| (column, c));
     Attributes::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
 }
 
-/// Temporary folder in which tests run the program and write files.
+/// Temporary folder in which a test runs the program and writes files.
 pub(crate) struct Workplace(TempDir);
 
 /// Exit code and outputs of a run.
@@ -144,7 +144,7 @@ impl Workplace {
         }))
     }
 
-    /// Runs the program with these arguments, which may contain spaces.
+    /// Runs the program with the arguments `words`, which may contain spaces.
     pub(crate) fn run_words(&self, words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Run {
         let output = Command::new(program()).current_dir(self.0.path()).args(words).output().unwrap();
         Run {
@@ -154,7 +154,8 @@ impl Workplace {
         }
     }
 
-    /// Returns a command that runs the program with these arguments in this folder.
+    /// Returns a command that runs the program in this folder with arguments separated by spaces; `{tiny}` is replaced
+    /// by the path of the tiny model.
     pub(crate) fn command(&self, arguments: &str) -> process::Command {
         let mut command = process::Command::new(program());
         let tiny = tiny().display().to_string();
@@ -176,7 +177,7 @@ impl Workplace {
         run.stdout
     }
 
-    /// Runs a compression with `--json` and returns its summary.
+    /// Runs `compress --json` with the arguments `arguments` and returns the summary that it prints.
     pub(crate) fn summary(&self, arguments: &str) -> serde_json::Value {
         serde_json::from_str(&self.done(&format!("compress --json {arguments}"))).unwrap()
     }
@@ -195,7 +196,8 @@ impl Workplace {
         assert!(before == after, "{arguments}: left {:?}, found {:?}", after.keys(), before.keys());
     }
 
-    /// Writes a PLY in the format of INRIA.
+    /// Writes the Gaussians `gaussians` to the PLY file `name`, in the format of the original 3DGS code. Returns its
+    /// path.
     pub(crate) fn ply(&self, name: &str, gaussians: &Gaussians) -> PathBuf {
         let path = self.path(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -204,7 +206,7 @@ impl Workplace {
     }
 }
 
-/// Returns `memory`; on Linux, which always reports the memory of a process, panics if it is `None`.
+/// Returns `memory` unchanged. Panics if it is `None` on Linux, which always reports the memory of a process.
 pub(crate) fn said<T>(memory: Option<T>) -> Option<T> {
     assert!(memory.is_some() || !cfg!(target_os = "linux"), "nothing is said of memory");
     memory
@@ -220,7 +222,7 @@ pub(crate) fn taken(stderr: &str) -> Option<f64> {
     })
 }
 
-/// Returns every file below `folder` with its bytes, by relative path; folders have no bytes.
+/// Returns every file below `folder` with its bytes, by path relative to `folder`. Subfolders are listed without bytes.
 pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut pending = vec![folder.to_owned()];
@@ -246,7 +248,7 @@ pub(crate) fn lasting_files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-/// PLY with float properties: their names, and the bytes of every row.
+/// Rows of a PLY file whose properties are all floats: names of the properties, and the bytes of every row.
 pub(crate) struct PlyRows {
     pub(crate) names: Vec<String>,
     pub(crate) rows: Vec<Vec<u8>>,
@@ -275,13 +277,13 @@ impl PlyRows {
     }
 }
 
-/// Reads an index map: the place in the output of every Gaussian of the input, or −1.
+/// Reads an index map: for every Gaussian of the input its index in the output, or −1.
 pub(crate) fn index_map(path: &Path) -> Vec<i64> {
     let bytes = fs::read(path).unwrap();
     npyz::NpyFile::new(&bytes[..]).unwrap().into_vec().unwrap()
 }
 
-/// Reads every array of an `.npz` as f64.
+/// Reads every array of an `.npz` file by name, converted to f64.
 pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let mut archive = npyz::npz::NpzArchive::open(path).unwrap();
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
@@ -307,7 +309,8 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     names.iter().map(|name| (name.clone(), read(name))).collect()
 }
 
-/// Returns a preset that scores by projected coverage and uses no renders, so that formulas alone decide.
+/// Returns a recipe made from `preset` that scores by projected coverage and uses no renders, so that formulas alone
+/// decide.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::model::Attributes;
     use splatsieve::recipe::{AttributeGroups, Coverage, FieldPrecision, Recipe, ShDegreeRule, StaticScoreTerm};

@@ -153,7 +153,7 @@ impl Gaussians {
         }
     }
 
-    /// Returns the Gaussians with the indices `rows`, in the order of `rows`.
+    /// Returns a copy of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> Gaussians {
         Gaussians {
             position: self.position.pick(rows),

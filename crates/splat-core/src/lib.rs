@@ -104,7 +104,7 @@ impl SequenceInfo {
         self.with_frames_at(times)
     }
 
-    /// Returns the same Gaussians with one frame at each of `times`, instead of the T frames so far.
+    /// Replaces the T frames by one frame at each of `times`; the Gaussians stay the same.
     ///
     /// # Errors
     /// Fails if times are not finite or not strictly increasing. The message names the frames.

@@ -91,8 +91,8 @@ impl Rig {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
-    /// Returns the maximum difference between the time of a view and the time of its frame, for a sequence whose frames
-    /// cover the same time span as the views.
+    /// Returns the maximum difference between the time of a view and the time of its frame, in the unit of the times.
+    /// The sequence is assumed to cover the same time span as the views.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }

@@ -21,7 +21,7 @@ pub struct Deltas {
 }
 
 impl Deltas {
-    /// Creates deltas of no Gaussians, of SH degree `sh_degree`, to be filled by
+    /// Creates empty deltas (of 0 Gaussians) of SH degree `sh_degree`, to be filled by
     /// [`Field::deltas`](super::Field::deltas).
     pub fn new(sh_degree: usize) -> Self {
         Deltas {

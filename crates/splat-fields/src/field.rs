@@ -41,7 +41,7 @@ pub struct FieldConfig {
 /// Source of the mask, a factor on all stored attributes of a Gaussian except the rotation.
 #[derive(Debug, Clone)]
 pub(super) enum Mask {
-    /// The field has no mask; stored attributes are used as they are.
+    /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
     None,
     /// The last head of the field computes the mask, which varies with time.
     Head,
@@ -59,8 +59,8 @@ pub(super) struct Head {
     pub(super) output: Linear,
 }
 
-/// Deformation field of a 4DGaussians model. It can be evaluated for any block of Gaussians at any time. The results
-/// for a Gaussian have the same bits in every block.
+/// Deformation field of a 4DGaussians model. It can be evaluated for any block of Gaussians at any time. The result for
+/// a Gaussian has the same bits whichever other Gaussians are in its block.
 #[derive(Debug, Clone)]
 pub struct Field {
     pub(super) config: FieldConfig,

@@ -11,14 +11,14 @@
 //! ```
 //! use std::path::Path;
 //! use splat_core::{Attributes, Gaussians};
-//! use splat_fields::{Deltas, Field, Scratch, synthetic};
+//! use splat_fields::{Deltas, Field, LayerBuffers, synthetic};
 //!
-//! let config = synthetic::plain();
-//! let field = Field::new(&synthetic::tensors(&config, 1), config, 3, Path::new("deformation.pth"))?;
+//! let config = synthetic::plain_config();
+//! let field = Field::new(&synthetic::random_tensors(&config, 1), config, 3, Path::new("deformation.pth"))?;
 //! let canonical = Gaussians::zeros(100, 3);
 //! let prepared = field.prepare(&canonical.position);
 //!
-//! let (mut deltas, mut scratch) = (Deltas::new(3), Scratch::default());
+//! let (mut deltas, mut scratch) = (Deltas::new(3), LayerBuffers::default());
 //! field.deltas(&prepared, 0.25, Attributes::all(), &mut scratch, &mut deltas)?;
 //! let mut state = Gaussians::zeros(0, 3);
 //! deltas.apply(&canonical, Attributes::all(), &mut state);

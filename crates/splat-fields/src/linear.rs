@@ -1,9 +1,10 @@
 //! Fully connected layers, evaluated for [`LANES`] Gaussians side by side.
 //!
 //! Weights are stored in panels of four outputs each; this order is made once, on loading. The sums of a panel take
-//! eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. The remaining operands are one
-//! input for all Gaussians and one weight, so layers with few outputs are not slower per output. A matrix library that
-//! reorders its operands in every call would spend a seventh of its time on that for matrices as small as these.
+//! eight of the sixteen AVX2 registers, enough to hide the latency of the multiply-adds. In the inner loop, one input
+//! value of each Gaussian is multiplied by one weight, so layers with few outputs are not slower per output. A matrix
+//! library that reorders its operands in every call would spend a seventh of its time on this reordering, because these
+//! matrices are small.
 
 use splat_core::error::Result;
 
@@ -116,8 +117,8 @@ impl Linear {
         }
     }
 
-    /// Computes the outputs of the layer without ReLU for `input`. Writes output o of the first `lanes` Gaussians to
-    /// `planes[o·len + start ..]`.
+    /// Computes the outputs of the layer without ReLU for `input`. Writes them for the first `lanes` Gaussians to
+    /// `planes`, which holds `len` values per output: output o begins at index `o·len + start`.
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
@@ -140,7 +141,7 @@ impl Linear {
 
 /// Computes the outputs of one panel ([`PANEL`] outputs) of a layer. Each sum starts with the bias and adds the inputs
 /// in order, so the result for a Gaussian does not depend on the Gaussians beside it. `FMA` selects fused
-/// multiply-adds; on a processor without them each would be a function call.
+/// multiply-adds. On a processor without these instructions, each fused multiply-add would be a function call.
 #[inline(always)]
 fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
     let mut sums = bias.map(|b| CacheLine([b; LANES]));

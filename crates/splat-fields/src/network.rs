@@ -84,11 +84,12 @@ pub struct PredictedMotion {
 /// Inputs and outputs of layers for one group of Gaussians.
 #[derive(Default)]
 struct NetworkScratch {
-    /// Encodings of position and time. If the layer has a skip connection, the output of the previous layer follows.
+    /// Encodings of position and time, the input of the first layer. For a layer with a skip connection the output of
+    /// the layer before it follows.
     input: Vec<CacheLine>,
-    /// Output of the current layer.
+    /// Output of the layer that is evaluated now.
     last: Vec<CacheLine>,
-    /// Output of the previous layer.
+    /// Output of the layer before the one that is evaluated now.
     spare: Vec<CacheLine>,
 }
 
@@ -215,9 +216,9 @@ impl Network {
 
     /// Computes the encoding of the stored positions `position` (`[3, N]`).
     ///
-    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for k = 0; the
-    /// double-angle formulas then give those for k + 1 from those for k. Each doubling doubles the error, from 1e-16 at
-    /// first to 1e-13 at the last octave.
+    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. The values for k = 0 are computed in f64. The
+    /// values for k + 1 follow from those for k by the double-angle formulas. Each doubling doubles the error, from
+    /// 1e-16 at first to 1e-13 at the last octave.
     pub fn encode(&self, position: &AttributeValues) -> EncodedPositions {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
@@ -263,7 +264,7 @@ impl Network {
     }
 
     /// Computes the derivatives of [`PredictedMotion::warp`] at `time` with respect to the stored positions `position`
-    /// (`[3, N]`). Plane 3·o + a of the result is ∂ output o / ∂ axis a.
+    /// (`[3, N]`). Plane 3·o + a of the result is ∂ output o / ∂ position component a.
     ///
     /// # Errors
     /// Fails if `time` is not finite.

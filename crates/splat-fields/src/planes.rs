@@ -95,9 +95,10 @@ pub struct Tap {
 /// The part of the HexPlane features of a block of Gaussians that does not depend on time.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
-    /// Products of the samples of the three planes without time, `[rows, width]`.
+    /// Products of the samples of the three planes without time, `[rows, width]` with one row per Gaussian.
     product: Vec<f32>,
-    /// Positions for interpolation on the lines of the three planes with time, `[rows, levels, 3]` for x, y, z.
+    /// Positions for interpolation on the lines of the three planes with time, `[rows, levels, 3]` with one row per
+    /// Gaussian and the axes x, y, z.
     taps: Vec<Tap>,
 }
 
@@ -141,9 +142,9 @@ impl FeaturePlane {
     }
 }
 
-/// Returns between which of `size` texels the normalized coordinate `u` lies. The first and last texel lie at −1 and 1
-/// (`align_corners`), and coordinates beyond them are clamped. A NaN coordinate gives a NaN fraction, hence NaN
-/// features.
+/// Returns the two of `size` texels between which the normalized coordinate `u` lies, and the weight of the second one.
+/// The first and last texel lie at −1 and 1 (`align_corners`), and coordinates beyond them are clamped. A NaN
+/// coordinate gives a NaN fraction, hence NaN features.
 pub fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);

@@ -36,7 +36,7 @@ struct BilinearPatch<'a> {
     /// Channels of the texels (low a, low b), (high a, low b), (low a, high b), (high a, high b), where a and b are the
     /// axes of the plane.
     corners: [&'a [f32]; 4],
-    /// Weights of the high texels along the axes a and b.
+    /// Weights of the texels with the higher index along the axes a and b.
     fractions: [f32; 2],
     /// Texels per unit of normalized coordinate along the axes a and b; 0 where coordinates are clamped.
     per_unit: [f32; 2],
@@ -56,8 +56,8 @@ impl<'a> BilinearPatch<'a> {
         }
     }
 
-    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the bilinear sample and its derivatives with respect to
-    /// the normalized coordinates along a and b.
+    /// Returns the bilinearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
+    /// with respect to the normalized coordinate along a, then those along b.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 3] {
         let [ll, hl] = [channel_chunk(self.corners[0], first), channel_chunk(self.corners[1], first)];
@@ -83,8 +83,8 @@ struct TimeLineSegment<'a> {
 }
 
 impl TimeLineSegment<'_> {
-    /// Returns, for [`CHANNEL_CHUNK`] channels from `first` on, the interpolated sample and its derivative with respect
-    /// to the normalized coordinate.
+    /// Returns the linearly interpolated values of [`CHANNEL_CHUNK`] channels from `first` on, then their derivatives
+    /// with respect to the normalized coordinate.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 2] {
         let [low, high] = [channel_chunk(self.ends[0], first), channel_chunk(self.ends[1], first)];

@@ -15,8 +15,8 @@ fn random_gaussians(len: usize) -> Gaussians {
     gaussians
 }
 
-/// Returns the attributes of the Gaussians `raw` at `time`, and the deltas that lead to them, for the attributes
-/// `want`.
+/// Returns the attributes of the Gaussians `raw` at `time`, and the deltas by which they differ from `raw`, for the
+/// attributes `want`.
 fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
     field.deltas(&field.prepare(&raw.position), time, want, &mut LayerBuffers::default(), &mut deltas).unwrap();

@@ -136,7 +136,7 @@ pub enum FileKind {
 }
 
 impl FileKind {
-    /// Converts a file type of the standard library.
+    /// Returns the kind of entry that the file type `found` of the standard library stands for.
     pub fn from_type(found: FileType) -> FileKind {
         match found {
             found if found.is_file() => FileKind::File,
@@ -194,7 +194,7 @@ pub const UNLIMITED_BYTES: u64 = 1 << 62;
 pub struct TruncatedMapMessage {
     /// Text before the path of the file.
     pub before: &'static str,
-    /// Text instead of the path if the path is unknown.
+    /// Text that replaces the path of the file if the path is unknown.
     pub unknown_path: &'static str,
     /// Text after the path of the file. Must end with a line break.
     pub after: &'static str,

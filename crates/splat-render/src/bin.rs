@@ -8,7 +8,8 @@ use std::ops::Range;
 
 use super::project::{Splats, TileRect};
 
-/// Maximum number of (splat, tile) pairs in a strip of tiles, unless a single tile has more.
+/// Maximum number of (splat, tile) pairs in a strip of tiles (the tiles processed together). A single tile with more
+/// pairs is a strip by itself.
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
 
 /// Number of splats whose tile rectangles are read together, so that the reads wait for memory at the same time.
@@ -17,10 +18,10 @@ const PREFETCHED: usize = 64;
 /// Lists of the splats of each tile, nearest splat first.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Bins {
-    /// Sorted sort keys of all splats. The upper half of a key is the depth as ordered bits, the lower half the index
-    /// of the splat.
+    /// Sort keys of all splats, sorted. The upper half of a key holds the depth, as bits that sort like the number. The
+    /// lower half holds the index of the splat.
     keys: Vec<u64>,
-    /// Buffer for sorting.
+    /// Buffer that the sort reuses; its content has no meaning.
     spare: Vec<u64>,
     /// Number of tiles per row.
     tiles_across: usize,
@@ -120,8 +121,9 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Returns the first tiles of the non-empty range `tiles` that have at most `max_pairs` (splat, tile) pairs: whole
-    /// rows of tiles if possible, else a part of a row, and at least one tile.
+    /// Returns the first tiles of the non-empty range `tiles`: as many as have at most `max_pairs` (splat, tile) pairs
+    /// in total and end with a row of tiles or with `tiles`. If even the first row has more pairs, the result ends
+    /// within this row. At least one tile is returned.
     fn first_part(&self, tiles: Range<usize>, max_pairs: usize) -> Range<usize> {
         let Range { start: first, end: last } = tiles;
         let before = self.start(first);

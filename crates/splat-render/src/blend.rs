@@ -30,21 +30,22 @@ pub(super) struct SampledPixels {
     x0: f64,
     /// Row in the image of the first pixel of the tile.
     y0: f64,
-    /// Offset of each column from the first one, pixels of the image.
+    /// Offset of each column of the tile from its first column, in pixels of the image.
     xs: TileLine,
-    /// Offset of each row from the first one, pixels of the image.
+    /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
-    /// First and last offset in each half (eight columns) of `xs`.
+    /// First and last value of `xs` (offset of a column, pixels of the image) in the left and in the right half of the
+    /// tile, which have up to eight columns each.
     spans: [[f32; 2]; SIDE / LANES],
-    /// Number of columns.
+    /// Number of columns of the tile that belong to the render.
     across: usize,
-    /// Number of rows.
+    /// Number of rows of the tile that belong to the render.
     down: usize,
 }
 
 impl SampledPixels {
-    /// Computes the pixels of the tile in column `tile[0]` and row `tile[1]` of a render of the pixels `grid` with `size` =
-    /// (columns, rows) of the grid.
+    /// Determines the pixels of the tile in column `tile[0]` and row `tile[1]` of a render of the pixels `grid`. `size`
+    /// is the number of columns and of rows of the whole grid.
     pub(super) fn new(tile: [u32; 2], size: [u32; 2], grid: PixelGrid) -> Self {
         let line = |axis: usize| {
             let first = tile[axis] * TILE;
@@ -71,8 +72,8 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means ended)
-    /// for others.
+    /// Returns the transmittance of each pixel before any splat: 1 for pixels of the render, negative (which means
+    /// ended) for others.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -101,21 +102,21 @@ pub(super) struct Fragment<V: Lanes> {
 pub(super) trait BlendSink {
     /// Values that are accumulated for one splat while it is blended.
     type Accumulator<V: Lanes>: Copy;
-    /// Returns the initial accumulator for the next splat.
+    /// Returns the accumulator with which the blending of `splat` begins.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a group
-    /// covers the groups after it as well.
+    /// Blends the splat into the accumulator at the [`LANES`] pixels of group `group`. A vector that is wider than a
+    /// group covers the groups after it as well.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether a splat is blended first in all groups with even index and then in those with odd index.
+    /// Whether a splat is blended first in all groups of pixels with even index and then in the groups with odd index.
     /// [`BlendSink::swap_even_odd`] is called after each half.
     const SPLITS_EVEN_ODD: bool = false;
     /// Swaps the sums over even and over odd groups in the accumulator. Called after the even groups and after the odd
-    /// groups if vectors have one group.
+    /// groups if a vector holds only one group of eight pixels.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -124,7 +125,7 @@ pub(super) trait BlendSink {
     fn end<V: Lanes>(&mut self, accumulator: Self::Accumulator<V>, pair: usize);
 }
 
-/// Accumulates the colors of the pixels of a tile, one plane per channel.
+/// Receiver of weights that accumulates the colors of the pixels of a tile, one plane per color channel.
 pub(super) struct ColorSink {
     pub(super) planes: [TilePlane; 3],
 }
@@ -151,11 +152,12 @@ impl BlendSink for ColorSink {
 pub(super) struct Weight {
     /// Sum of the weights over the sampled pixels: at most 256 terms, added in f32 in a fixed order.
     pub(super) sum: f32,
-    /// Largest weight in any sampled pixel.
+    /// Largest weight alpha · transmittance of the splat in any sampled pixel.
     pub(super) max: f32,
 }
 
-/// Stores the weights of each splat of the tile in `pairs`, whose entries must all be zero at the start.
+/// Receiver of weights that stores, in `pairs`, the sum and the largest value of the weights of each splat of the tile.
+/// Every entry of `pairs` must be zero at the start.
 pub(super) struct WeightSink<'a> {
     pub(super) pairs: &'a mut [Weight],
 }
@@ -221,7 +223,8 @@ impl BlendKernel {
     }
 
     /// Blends the splats with the indices `pairs`, which are ordered from front to back, over the sampled pixels of a
-    /// tile. Returns the remaining transmittance of each pixel, with the sign bit set if the pixel ended early.
+    /// tile. Returns the remaining transmittance of each pixel, with the sign bit set if the pixel ended, that is, if a
+    /// further splat would have lowered its transmittance below [`MIN_TRANSMITTANCE`].
     pub(super) fn tile(
         self,
         splats: &[Splat],
@@ -265,8 +268,9 @@ impl BlendKernel {
 
 /// Number of splats whose footprints in the tile are computed together, before any of them is blended.
 ///
-/// The groups of pixels that a splat touches follow from its footprint. If it were computed directly before blending,
-/// every mispredicted end of the loop over groups would wait for it and for the memory it reads.
+/// The footprint of a splat tells which groups of pixels the splat touches. If a footprint were computed directly
+/// before its splat is blended, every mispredicted end of the loop over groups would wait for this computation and for
+/// the memory that it reads.
 const LOOKAHEAD: usize = 16;
 
 /// Footprint of one splat in the rows of a tile. In each row, alpha is the opacity times 2 to the power of `level −
@@ -283,7 +287,8 @@ struct TileFootprint {
     middles: TileLine,
     /// Exponent (of 2) of the largest alpha in each row.
     levels: TileLine,
-    /// First and last offset of the columns in which the splat is drawn, if some columns of the tile are excluded.
+    /// First and last column in which the splat is drawn, as offsets from the left edge of the tile in pixels; `None`
+    /// if no column of the tile is excluded.
     drawn_columns: Option<[f32; 2]>,
 }
 
@@ -317,7 +322,8 @@ impl TileFootprint {
         footprint
     }
 
-    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is drawn.
+    /// Excludes the pixels that lie outside [`Splat::drawn_tiles`], the tiles of the full image in which `splat` is
+    /// drawn.
     #[cold]
     fn exclude_tiles(&mut self, splat: &Splat, sampled: &SampledPixels) {
         let [x0, x1, y0, y1] = splat.drawn_tiles.map(|tile| f64::from(tile) * f64::from(TILE));
@@ -343,7 +349,7 @@ impl TileFootprint {
 /// Exponent (of 2) of the alpha in a row in which a splat is not drawn: it makes alpha 0.
 const EXCLUDED_LEVEL: f32 = -1e9;
 
-/// Does the work of [`BlendKernel::tile`] with vectors of type `V`.
+/// Blends splats over a tile like [`BlendKernel::tile`], with vectors of type `V`.
 #[inline(always)]
 fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &SampledPixels, sink: &mut I) -> TilePlane {
     let xs = sampled.xs.each_ref().map(V::repeat);

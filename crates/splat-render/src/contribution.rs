@@ -2,8 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Visible contribution of N Gaussians, summed over any number of views (docs/method.md, section 1: C `visible`, and W).
-/// The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it.
+/// Visible contribution of N Gaussians, summed over any number of views (docs/method.md, section 1: the sum is C with
+/// the option `visible`, the largest weight is W). The weight of a Gaussian in a pixel is its alpha times the
+/// transmittance in front of it.
 ///
 /// The values do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

@@ -15,7 +15,7 @@ use splat_core::{AttributeValues, Camera, Gaussians, sh_from_color};
 /// range of values of a feature. A value that is not finite counts as the smallest finite value of its feature.
 ///
 /// # Panics
-/// Panics if `features` is not of as many Gaussians as `gaussians`.
+/// Panics if `features` and `gaussians` have different numbers of Gaussians.
 pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera: &Camera) -> Vec<f32> {
     let (planes, pixels) = (features.width(), camera.width as usize * camera.height as usize);
     assert_eq!(features.len(), gaussians.len(), "expected as many features as Gaussians");

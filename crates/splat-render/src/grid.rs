@@ -41,7 +41,8 @@ impl PixelGrid {
         [0, 1].map(|axis| size[axis].saturating_sub(self.phase[axis]).div_ceil(self.stride))
     }
 
-    /// Returns the column in the image of column `index` of the grid (`axis` 0), or the row of its row (`axis` 1).
+    /// Returns the column of the image at which column `index` of the grid lies (`axis` 0), or the row of the image at
+    /// which row `index` of the grid lies (`axis` 1).
     pub fn pixel(self, axis: usize, index: u32) -> u32 {
         self.phase[axis] + self.stride * index
     }
@@ -51,9 +52,10 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Returns the tiles of the grid (16×16 pixels of the grid each) that contain pixels of the tiles `rect` of the image
-    /// within `half` pixels of `at`, horizontally and vertically. `size` is the size of the image in pixels. The result
-    /// may be empty.
+    /// Converts the rectangle `rect` of tiles of the image to tiles of the grid, which have 16×16 pixels of the grid
+    /// each. Returns the tiles that contain a pixel of the grid that lies in `rect`, at most `half[0]` pixels from `at`
+    /// horizontally and at most `half[1]` vertically. `size` is the size of the image in pixels. The result may be
+    /// empty.
     pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
         if self.stride == 1 {
             return rect;
@@ -79,7 +81,7 @@ impl PixelGrid {
     }
 }
 
-/// View of a camera, of which the pixels of a grid are rendered.
+/// View of a camera in which only the pixels of a grid are rendered.
 #[derive(Debug, Clone, Copy)]
 pub struct SampledView<'a> {
     /// Camera with the size of the full image.

@@ -17,7 +17,7 @@
 //! drawn.
 //!
 //! ```
-//! use splat_core::{Camera, Gaussians, harmonic};
+//! use splat_core::{Camera, Gaussians, sh_from_color};
 //! use splat_render::{metrics::psnr, render};
 //!
 //! let mut gaussians = Gaussians::zeros(1, 0);
@@ -25,7 +25,7 @@
 //! gaussians.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
 //! gaussians.log_scale.set_row(0, [-2.0; 3]);
 //! gaussians.opacity_logit.set_row(0, [4.0]);
-//! gaussians.sh.set_row(0, [harmonic(1.0), harmonic(0.0), harmonic(0.0)]);
+//! gaussians.sh.set_row(0, [sh_from_color(1.0), sh_from_color(0.0), sh_from_color(0.0)]);
 //! let camera = Camera {
 //!     width: 64,
 //!     height: 48,

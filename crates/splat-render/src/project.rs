@@ -25,8 +25,8 @@ const FOV_MARGIN: f64 = 1.3;
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
 /// Opacity logit below which the opacity is below 0.0025, hence less than [`MIN_ALPHA`].
 const MIN_LOGIT: f32 = -6.0;
-/// Margin of the test alpha ≥ 1/255 in powers of two, so that rounding never removes a visible pixel: thousands of
-/// times the rounding error of the exponent of alpha.
+/// Amount by which the test alpha ≥ 1/255 is relaxed, as a difference of log₂ alpha. It is thousands of times the
+/// rounding error of the exponent of alpha, so rounding never removes a visible pixel.
 const CUTOFF_SLACK: f64 = 1e-3;
 
 /// Camera parameters in the form that the projection needs.
@@ -95,17 +95,20 @@ impl CameraTerms {
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Splat {
-    /// Center along x in pixels; pixel centers lie at integers.
+    /// Position of the center of the splat along x in the image, in pixels; pixel centers lie at integers.
     pub(super) u: f64,
-    /// Center along y in pixels; pixel centers lie at integers.
+    /// Position of the center of the splat along y in the image, in pixels; pixel centers lie at integers.
     pub(super) v: f64,
-    /// Coefficient of (dx − shear·dy)² in the exponent of alpha, 1/pixels².
+    /// Coefficient of (dx − shear·dy)² in the exponent of alpha, 1/pixels², where (dx, dy) is the offset of a pixel
+    /// from the center.
     pub(super) falloff_x: f32,
-    /// Slant of the splat: in the pixel row at offset dy, alpha is largest at dx = shear·dy. Pixels along x per row.
+    /// Slant of the splat, in pixels along x per row: in the pixel row at the offset dy from the center, alpha is
+    /// largest at the offset dx = shear·dy.
     pub(super) shear: f32,
-    /// Coefficient of dy² in the exponent of alpha, 1/pixels².
+    /// Coefficient of dy² in the exponent of alpha, 1/pixels², where dy is the offset of a pixel row from the center.
     pub(super) falloff_y: f32,
-    /// Pixels at which the exponent of alpha is below `−cutoff` are skipped, because alpha is below 1/255 there.
+    /// Limit of the exponent (of 2) in the formula of alpha: pixels at which the exponent is below `−cutoff` are
+    /// skipped, because alpha is below 1/255 there.
     pub(super) cutoff: f32,
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
@@ -117,9 +120,10 @@ pub(super) struct Splat {
     pub(super) color: [f32; 3],
     /// Index of the Gaussian in the frame.
     pub(super) id: u32,
-    /// Range of columns, then of rows, of tiles of the full image outside which the splat is not drawn, although its
-    /// alpha may exceed 1/255 there. [`Splat::UNBOUNDED`] if there are no such pixels. Used only in renders of a grid of
-    /// pixels, whose tiles are larger than those of the image.
+    /// Tiles of the full image in which the splat is drawn: first and end column, then first and end row (both ends
+    /// exclusive). The splat is not drawn outside of them, although its alpha may exceed 1/255 there.
+    /// [`Splat::UNBOUNDED`] if no pixel is excluded this way. Used only in renders of a grid of pixels, whose tiles are
+    /// larger than those of the image.
     pub(super) drawn_tiles: [u16; 4],
 }
 
@@ -138,7 +142,8 @@ pub(super) struct TileRect {
 }
 
 impl TileRect {
-    /// Returns the range of columns and then that of rows as 16-bit integers. An end beyond them becomes their maximum.
+    /// Returns the range of columns and the range of rows of tiles, `[x0, x1, y0, y1]`, as 16-bit integers. Larger
+    /// values become 65,535.
     fn narrow(self) -> [u16; 4] {
         [self.x0, self.x1, self.y0, self.y1].map(|tile| tile.try_into().unwrap_or(u16::MAX))
     }
@@ -159,7 +164,7 @@ impl Splats {
         self.rects.clear();
     }
 
-    /// Appends the splats in `next`, whose Gaussians have higher indices.
+    /// Appends the splats of `next`. Their Gaussians must have higher indices than those of the splats here.
     pub(super) fn append(&mut self, mut next: Splats) {
         self.splats.append(&mut next.splats);
         self.rects.append(&mut next.rects);
@@ -186,7 +191,7 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTer
     project_blocks(gaussians, ids, view, colored, out);
 }
 
-/// Does the work of [`project`], in blocks of [`BLOCK`] Gaussians.
+/// Projects Gaussians like [`project`], in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
     // Reserves the maximum at once, because growing would copy. Reserved memory that is never written takes no physical
@@ -225,7 +230,7 @@ struct ProjectedSplats {
     sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Coefficients of the exponent of alpha, see the fields of [`Splat`].
+    /// Coefficients of the exponent of alpha: the fields of these names in [`Splat`].
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
@@ -353,7 +358,8 @@ pub(super) struct ProjectedShape {
     pub(super) axes: [[f64; 3]; 3],
     /// Scales (standard deviations along the axes), scene units.
     pub(super) scale: [f64; 3],
-    /// Extents of the three axes along u and along v in pixels, as standard deviations: `to_pixels` · axes · scale.
+    /// Axes of the Gaussian, each as long as one standard deviation, projected to the image: their extents along u,
+    /// then along v, in pixels. Equal to `to_pixels` · axes · scale.
     pub(super) spread: [[f64; 3]; 2],
 }
 
@@ -366,7 +372,8 @@ pub(super) struct Covariance {
 }
 
 impl ProjectedShape {
-    /// Projects a Gaussian at the world position `p` with the quaternion `q` (w, x, y, z).
+    /// Projects a Gaussian with the world position `p`, the quaternion `q` (w, x, y, z) and the logarithms of its
+    /// scales `log_scale` to the image of the camera `view`.
     #[inline(always)]
     pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &CameraTerms) -> Self {
         let [r0, r1, r2] = view.rotation;

@@ -13,15 +13,17 @@ use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
 /// Removal error of N Gaussians, summed over any number of views: Σ over pixels of w²·(‖c − b‖² + floor²), where w is
-/// the weight of the Gaussian in the pixel, c its color, and b the color behind it.
+/// the weight of the Gaussian in the pixel, c its color, and b the color behind it. The floor
+/// ([`RemovalError::contrast_floor`]) is a minimum color difference, so that removing a Gaussian in front of its own
+/// color counts as an error too.
 ///
 /// With a floor of 0 this is the squared error of renders without that Gaussian, except for alphas clamped at 0.99 and
 /// pixels that end early. Errors do not depend on the order of views or the number of threads. Memory: 8 bytes per
 /// Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
-    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed per
-    /// 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
+    /// Removal error of each Gaussian in units of 2⁻³⁶ ([`RemovalError::SUM_UNIT`]). Within a view, errors are summed
+    /// per 16×16 tile in f32, in a fixed order. A sum stops growing at 2⁶⁴ units.
     pub sum: Vec<u64>,
     /// Floor: color difference (norm over red, green, blue) whose square is added to the squared difference between a
     /// Gaussian and what is behind it.
@@ -33,8 +35,8 @@ impl RemovalError {
     /// 320×256 pixels.
     pub const SUM_UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. `contrast_floor` is the field of
-    /// this name.
+    /// Creates removal errors of 0 for `len` Gaussians, to which views are then added. For `contrast_floor` see
+    /// [`RemovalError::contrast_floor`].
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
@@ -69,7 +71,8 @@ impl RemovalError {
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds the removal errors in `other`. Gaussian k of `other` is Gaussian `rows[k]` of `self`.
+    /// Adds the removal errors of `other`, which holds only some of the Gaussians: Gaussian k of `other` is Gaussian
+    /// `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -84,7 +87,7 @@ impl RemovalError {
     }
 }
 
-/// Computes the removal error of every splat of a tile while the tile is blended.
+/// Receiver of weights that computes the removal error of every splat of a tile while the tile is blended.
 pub(super) struct RemovalSink<'a> {
     /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
     /// them times the transmittance.
@@ -96,7 +99,8 @@ pub(super) struct RemovalSink<'a> {
 }
 
 impl BlendSink for RemovalSink<'_> {
-    /// Color of a splat, and the sum of squared pixel changes so far.
+    /// Color of a splat, and the sum so far of the squared changes of pixels that the removal of this splat would
+    /// cause.
     type Accumulator<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {

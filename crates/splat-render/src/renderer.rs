@@ -340,7 +340,7 @@ mod tests {
         (scene, camera)
     }
 
-    /// Returns everything that `renderer` can compute for the test scene.
+    /// Returns the image, contributions, removal errors and gradients that `renderer` computes for the test scene.
     fn all_results(mut renderer: Renderer) -> (Image, Contribution, RemovalError, Gradients) {
         let (scene, camera) = scene();
         let mut seen = Contribution::new(scene.len());

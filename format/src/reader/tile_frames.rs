@@ -22,16 +22,16 @@ pub struct TileFrames {
     decoder: TileDecoder,
     /// Whether a raw tile is read in place, from the memory map.
     in_place: bool,
-    /// How much of a raw tile has been counted in [`Reader::tiles_read`].
+    /// Part of a raw tile (plain f32) that has been counted in [`Reader::tiles_read`].
     counted: Counted,
 }
 
-/// How much of a raw tile (plain f32) has been counted as read.
+/// Part of a raw tile (plain f32) that has been counted as read.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
 enum Counted {
     #[default]
     Nothing,
-    /// The frame that was read last has been counted.
+    /// The frame that was read last has been counted. Contains the number of the frame.
     Frame(usize),
     /// The whole tile has been counted, when its checksum was checked.
     Tile,

@@ -92,7 +92,7 @@ pub(in crate::cli) struct Earlier {
 }
 
 impl Earlier {
-    /// Returns whether existing output files may be replaced, as the library's type [`Replace`].
+    /// Returns whether existing output files may be replaced (`--overwrite`), as the library's type [`Replace`].
     pub(in crate::cli) fn replace(&self) -> Replace {
         if self.overwrite { Replace::Existing } else { Replace::Never }
     }

@@ -5,7 +5,7 @@ use splatsieve::files::cameras::TimesSource;
 
 use crate::cli::recipe_flags::numbers;
 
-/// Parses a length of time, or start and end of a time span, and returns the length.
+/// Parses a length of time, such as `10`, or the start and the end of a time span, such as `0,10`. Returns the length.
 pub(super) fn parse_duration(text: &str) -> Result<f64, String> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse::<f64>()).collect();
     let length = match numbers.as_deref() {

@@ -41,12 +41,12 @@ const HELD_OUT: u32 = 2;
 /// sampled more finely. A Gaussian's values depend on the scene's count.
 ///
 /// ```
-/// use splatsieve::diagnostics::demo_scene::{DemoBody, Scene};
+/// use splatsieve::diagnostics::demo_scene::{DemoBody, DemoScene};
 /// use splatsieve::source::FrameSource;
 ///
-/// let scene = Scene::new(Scene::COUNT, Scene::FRAMES);
+/// let scene = DemoScene::new(DemoScene::COUNT, DemoScene::FRAMES);
 /// assert_eq!(scene.info().times.len(), 48);
-/// assert!(scene.members(DemoBody::Cloth).len() > 400);
+/// assert!(scene.body_ids(DemoBody::Cloth).len() > 400);
 /// ```
 #[derive(Debug, Clone)]
 pub struct DemoScene {

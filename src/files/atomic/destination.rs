@@ -121,7 +121,8 @@ pub(super) fn check_replace(target: &Path, kind: TargetKind, replace: Replace) -
     }
 }
 
-/// Checks that the folder at `target` is an earlier result of this program whose summary lists its files.
+/// Checks that the folder at `target` is an earlier result of this program whose summary lists its files. Fails with
+/// [`Error::Usage`] if it is not.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
     match Owner::read(&target.join(SUMMARY_FILE)) {

@@ -136,11 +136,11 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
     }
 }
 
-/// Takes over the unfinished workspace `name` in `parent`; returns `None` if that is not possible.
+/// Locks the unfinished workspace (hidden folder) `name` in the folder `parent` and returns it; returns `None` if that
+/// is not possible. The caller holds the [`PublishLock`].
 ///
-/// While this run holds the [`PublishLock`], another run that is still alive has an unfinished workspace only after a
-/// failure, just before it ends. Otherwise a locked workspace is being inspected by another run for a moment. So this
-/// function waits for up to 5 s ([`MAX_INSPECTION_WAIT`]).
+/// If another run holds the lock of this workspace, then either that run created it, has failed and is about to end, or
+/// it inspects the workspace for a moment. So this function waits for up to 5 s ([`MAX_INSPECTION_WAIT`]).
 fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {

@@ -321,7 +321,7 @@ fn overwriting_a_file_replaces_it_with_its_companions() {
     assert_eq!(fs::read_to_string(base.path().join("x.ply.notes")).unwrap(), "precious");
 }
 
-/// Creates in `base` the state that a run leaves if it is killed after giving `published` of its files their final
+/// Creates in `base` the state that a killed run leaves when only `published` of its files already have their final
 /// names.
 fn leave_half_published(base: &Path, published: usize, replace: Replace) {
     let left = base.join(".x.ply.dead.splatsieve-tmp");

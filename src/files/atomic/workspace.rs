@@ -6,9 +6,9 @@
 //! whatever its name is.
 //!
 //! The system releases a lock when the process that holds it ends for any reason, so a workspace whose lock can be
-//! taken is a leftover. Locks work between containers and, if the file system supports it, between machines. Process
-//! ids are not used, because they have another meaning in every container. On a file system without locks no workspace
-//! is recognized as a leftover; the user has to remove it.
+//! taken is a leftover. Locks work between operating-system containers and, if the file system supports it, between
+//! machines. Process ids are not used, because they have another meaning in every such container. On a file system
+//! without locks no workspace is recognized as a leftover; the user has to remove it.
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
@@ -23,7 +23,8 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Name that stands for the target in the workspaces (hidden folders) of scratch files, which have no target.
+/// Name used in place of an output's name in the names of workspaces (hidden folders) of scratch files, which have no
+/// output path.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
@@ -36,7 +37,7 @@ pub(super) const CONTENT: &str = "content";
 /// Name, in the workspace, of an earlier output folder that is being replaced. Files in it that its summary does not
 /// list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name, in the workspace, of files and folders that only have to be deleted.
+/// Name, in the workspace, that a file or folder gets when it only has to be deleted.
 pub(super) const DISCARDED: &str = "discarded";
 /// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
@@ -48,7 +49,8 @@ const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 /// moves a result to its final name holds the guard, so that a signal is handled either before or after the move.
 static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
-/// Locks and returns the table of the workspaces of this process.
+/// Locks the table of the hidden output folders (workspaces) of this process and returns it: the identity of each
+/// folder by its path.
 pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
     // The table is consistent even if a thread panicked while holding the lock.
     LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)
@@ -120,7 +122,7 @@ impl Workspace {
         UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
     }
 
-    /// Syncs the lock file and the entries of the workspace folder to disk.
+    /// Syncs the lock file and the list of entries of the workspace folder to disk, but not the output in it.
     pub(super) fn sync(&self) -> io::Result<()> {
         if let Some(lock) = &self.lock {
             lock.sync_all()?;
@@ -169,7 +171,7 @@ pub(super) fn target_name(entry: &OsStr) -> Option<&str> {
     hidden_name(entry, ENDING)
 }
 
-/// Returns the part `name` of an entry called `.name.random` with `ending` appended; `None` for other entries.
+/// Returns NAME if `entry` has the form `.NAME.RANDOM` followed by `ending`; `None` for other entries.
 fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
     let name = entry.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
     Some(name.rsplit_once('.')?.0)
@@ -203,7 +205,8 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// Guard that keeps this process from giving outputs their final names and from removing outputs; see [`remove_unfinished`].
+/// Guard that keeps this process from giving outputs their final names and from removing outputs; see
+/// [`remove_unfinished`].
 #[must_use = "runs go on as soon as this is dropped"]
 pub struct ExitGuard(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
@@ -278,7 +281,8 @@ pub(super) enum Refusal {
 }
 
 impl Leftover {
-    /// Takes over the workspace `name` in `parent` if this program created it for this user and its run has ended.
+    /// Locks and returns the workspace `name` in `parent` if this program created it for this user and its run has
+    /// ended; otherwise returns the reason for refusing it.
     pub(super) fn take(parent: &FolderHandle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;
@@ -321,7 +325,7 @@ impl Leftover {
     }
 }
 
-/// Removes the workspace at `folder` if it is still the folder with this identity.
+/// Removes the workspace at `folder` if the folder there still has the identity `identity`. `lock` is its lock file.
 fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };

@@ -44,14 +44,14 @@ pub(super) struct ListedImage {
 pub(super) struct Assembly {
     rig: Rig,
     memory_counter: MemoryCounter,
-    /// Indices in `rig.cameras`, hashed by the values of the camera.
+    /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, under its values.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
     /// (Camera index, split) pairs for which an image without a time has been added.
     untimed: HashSet<(u32, Split)>,
     /// Path of every camera file, and the index in `rig.shots` of its first image.
     files: Vec<(PathBuf, usize)>,
-    /// Number of images added so far from the file begun last.
+    /// Number of images added so far from the camera file that is being read (the last of `files`).
     taken: usize,
     /// Whether every image so far has a stated view number.
     are_views_stated: bool,
@@ -157,7 +157,7 @@ impl Assembly {
         Ok(())
     }
 
-    /// Returns the largest time stamp so far, or `least` if that is larger.
+    /// Returns the largest time stamp of the images added so far, or `least` if that is larger.
     pub(super) fn latest(&self, least: f64) -> f64 {
         self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
     }
@@ -216,7 +216,8 @@ pub(super) struct MemoryCounter {
 }
 
 impl MemoryCounter {
-    /// Counts `bytes` of memory that will be used for `what`, read from `place` in the file at `path`.
+    /// Adds `bytes`, a number of bytes that will be allocated, to the counted memory. Messages name the file `path`,
+    /// the `place` in it, and `what` the memory is for.
     ///
     /// # Errors
     /// Fails if the memory limit for reading would be exceeded.
@@ -233,7 +234,8 @@ impl MemoryCounter {
     }
 }
 
-/// Returns the error text for an image without a time although the first image has one (`timed`), or the reverse.
+/// Returns the error text for an image that has a time although the first image has none, or the reverse. `timed` says
+/// whether the first image has a time.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }

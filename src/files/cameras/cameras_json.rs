@@ -37,7 +37,8 @@ const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "
 /// Keys of a camera entry in the 3DGS format.
 const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
-/// Reads a file in this project's own format. `outline` holds the keys outside the list of images.
+/// Reads the cameras of `file`, a `cameras.json` in this project's own format. `outline` is the document without the
+/// list of images.
 pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimit) -> Result<Rig> {
     let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;

@@ -143,7 +143,8 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     assembly.finish(None, origin)
 }
 
-/// Returns the folder that holds the COLMAP files: the folder `found` or that of the file `found`, or `0` inside it.
+/// Returns the folder that holds the COLMAP files. `found` is a folder or a file in a folder; the result is this folder
+/// or its subfolder `0`. Fails if neither holds a reconstruction.
 fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
     let holds = |folder: &Path| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file());
     let folder = if found.is_dir() { found } else { found.parent().unwrap_or(Path::new("")) };
@@ -152,7 +153,8 @@ fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
     })
 }
 
-/// Returns the folder of the images: `images` beside `sparse`, or the folder of the data set if there is none.
+/// Returns the folder of the images that belong to the reconstruction in `folder`: the folder `images` beside `sparse`,
+/// or the folder of the data set if there is no such folder.
 fn find_images_folder(folder: &Path) -> PathBuf {
     let below = if folder.ends_with("sparse/0") { 2 } else { usize::from(folder.ends_with("sparse")) };
     let root = folder.ancestors().nth(below).unwrap_or(folder);
@@ -185,7 +187,8 @@ fn scale_intrinsics(
     (requested, [fx * x, fy * y, cx * x, cy * y])
 }
 
-/// Builds a camera from the name, image size and parameters of its COLMAP model.
+/// Builds a camera from the `name` of its COLMAP camera model, the image size in pixels and the parameters `values` of
+/// the model. `wrong` builds an error from the expected and the found value.
 ///
 /// # Errors
 /// Fails if the model is unknown, has distortion, or has another number of parameters than given, or if the image size
@@ -221,7 +224,7 @@ fn lens(
     Ok(Lens { size: (w, h), intrinsics })
 }
 
-/// Reads `cameras.txt`. Returns the cameras by their COLMAP numbers.
+/// Reads the file `cameras.txt` at `path`. Returns the cameras by their COLMAP numbers. `counter` limits the memory.
 fn parse_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
     let mut lines = TextLines::open(path)?;
@@ -245,7 +248,7 @@ fn parse_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32
     Ok(lenses)
 }
 
-/// Reads `images.txt`. Returns its images in file order.
+/// Reads the file `images.txt` at `path`. Returns its images in file order. `counter` limits the memory.
 fn parse_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
     let mut lines = TextLines::open(path)?;
@@ -295,7 +298,8 @@ impl<'a> Binary<'a> {
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }
 
-    /// Returns an error about the bytes at the present position of the file.
+    /// Returns an error that says which content was `expected` at the present position of the file, and which was
+    /// `found`.
     fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("byte {}", self.at), expected, found)
     }
@@ -336,7 +340,7 @@ impl<'a> Binary<'a> {
         Ok(values)
     }
 
-    /// Reads a text that is terminated with a zero byte.
+    /// Reads a text that is terminated with a zero byte. `what` names it in errors.
     fn text(&mut self, what: &str) -> Result<String> {
         let mut bytes = Vec::new();
         let most = MAX_NAME_BYTES.min(self.len - self.at);
@@ -348,7 +352,8 @@ impl<'a> Binary<'a> {
         String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is not UTF-8"))
     }
 
-    /// Skips `bytes` bytes. `None` stands for a length that overflowed and is an error.
+    /// Skips the next `bytes` bytes; `what` names them in errors. `None` stands for a length that overflowed and is an
+    /// error.
     fn skip(&mut self, bytes: Option<u64>, what: &str) -> Result<()> {
         let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.truncated(what)) };
         // The cast cannot overflow, because file sizes fit into i64.
@@ -358,7 +363,7 @@ impl<'a> Binary<'a> {
     }
 }
 
-/// Reads `cameras.bin`. Returns the cameras by their COLMAP numbers.
+/// Reads the file `cameras.bin` at `path`. Returns the cameras by their COLMAP numbers. `counter` limits the memory.
 fn read_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut file = Binary::open(path)?;
     let mut lenses = HashMap::new();
@@ -378,7 +383,7 @@ fn read_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32,
     Ok(lenses)
 }
 
-/// Reads `images.bin`. Returns its images in file order.
+/// Reads the file `images.bin` at `path`. Returns its images in file order. `counter` limits the memory.
 fn read_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut file = Binary::open(path)?;
     let mut images = Vec::new();

@@ -32,7 +32,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Returns an error that the value of `key` is not as `expected`.
+    /// Returns the error for a value under `key` that is not as `expected` describes.
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
         let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), SmallValue::describe);
         let place = match self.frame {
@@ -147,7 +147,7 @@ impl<'a> CameraFields<'a> {
     }
 }
 
-/// Returns how error messages name image `frame`: "frame 12", or an empty text for `None`.
+/// Returns the text that names the image with index `frame` in error messages: "frame 12", or an empty text for `None`.
 pub(super) fn place(frame: Option<usize>) -> String {
     frame.map_or_else(String::new, |frame| format!("frame {frame}"))
 }

@@ -1,8 +1,9 @@
 //! Data sets with one COLMAP folder `colmap_K` for each frame, as SpacetimeGaussians prepares them.
 //!
 //! The cameras do not move: every frame has the cameras of `sparse/0` in the first folder, as in the loader of
-//! SpacetimeGaussians. Frame j of n is at time j/n; its images are in folder K + j. A single frame has no time. Source:
-//! `readColmapSceneInfo` of the SpacetimeGaussians repository.
+//! SpacetimeGaussians. Frame j of n is at time j/n; its images are in the folder with the number K + j, where K is the
+//! number of the first folder. A single frame has no time. Source: `readColmapSceneInfo` of the SpacetimeGaussians
+//! repository.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,19 +14,21 @@ use crate::model::Split;
 /// Beginning of the names of the folders `colmap_K`, each of which holds the COLMAP data of one frame.
 const PREFIX: &str = "colmap_";
 
-/// Returns the folder of the COLMAP reconstruction (`sparse/0`) in the first of the folders `colmap_K` in `path`.
+/// Returns the folder of the COLMAP reconstruction (`sparse/0`) in the folder `colmap_K` with the smallest K in `path`;
+/// `None` if there is no such folder.
 pub(super) fn first_in(path: &Path) -> Option<PathBuf> {
     let entries = fs::read_dir(path).ok()?.flatten();
     let first = entries.filter_map(|entry| number(&entry.path())).min()?;
     Some(path.join(format!("{PREFIX}{first}")).join("sparse/0")).filter(|found| found.is_dir())
 }
 
-/// Returns the number K of a folder called `colmap_K`.
+/// Returns the number K of a folder called `colmap_K`; `None` for other names.
 fn number(folder: &Path) -> Option<u32> {
     folder.file_name()?.to_str()?.strip_prefix(PREFIX)?.parse().ok()
 }
 
-/// Returns the folder `colmap_K` that contains the COLMAP reconstruction `sparse`, and the number K.
+/// Returns the folder `colmap_K` and its number K if `sparse` is the COLMAP reconstruction `colmap_K/sparse/0`; `None`
+/// for other paths.
 pub(super) fn find(sparse: &Path) -> Option<(PathBuf, u32)> {
     // Make the path absolute: a path relative to the working folder need not contain the name `colmap_K`.
     let sparse = std::path::absolute(sparse).ok()?;
@@ -33,13 +36,15 @@ pub(super) fn find(sparse: &Path) -> Option<(PathBuf, u32)> {
     number(root).map(|number| (root.to_owned(), number))
 }
 
-/// Returns the number of folders `colmap_K` beside `root` with consecutive K, beginning with K = `first`.
+/// Returns the number of folders `colmap_K` with consecutive numbers K, from K = `first` on, in the folder that
+/// contains `root`.
 pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Repeats `images`, which are the images of frame `first` in the folder `root`, at each of `frames` frames. The first
-/// image of each frame is a test image.
+/// Returns `images` once for each of `frames` frames. `images` are those of the first frame, whose folder is `root` =
+/// `colmap_K` with K = `first`; the images of the next frames lie in the folders with the next numbers. The first image
+/// of each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
     images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),

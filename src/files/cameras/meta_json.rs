@@ -22,7 +22,7 @@ use crate::model::{Camera, Rig, Split};
 /// Names of the files of a data set, and the split that each file lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
-/// Keys whose values are lists by frame and camera.
+/// Keys whose values are lists of lists: one list per frame, with one value per camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
 /// Returns whether the document with the keys `outline` is in this format.
@@ -69,7 +69,7 @@ impl<T> KeyedValues<T> {
     /// size of a value may be in use.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
-    /// Returns the index in `values` of the first value of `frame`.
+    /// Returns the index in `values` of the first value of frame `frame`.
     fn start(&self, frame: usize) -> usize {
         frame.checked_sub(1).map_or(0, |before| self.ends[before])
     }
@@ -96,7 +96,7 @@ struct Tables {
 }
 
 impl Tables {
-    /// Adds the value of key `KEYS[key]`, read from `own`, to the current frame.
+    /// Adds one value of the key `KEYS[key]` to the current frame. The value is read from the JSON object `own`.
     fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
@@ -110,7 +110,8 @@ impl Tables {
         Ok(())
     }
 
-    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the next frame.
+    /// Records that the list of the current frame under the key `KEYS[key]` is complete: later values belong to the
+    /// next frame.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),
@@ -121,7 +122,7 @@ impl Tables {
     }
 }
 
-/// Adds the images of `file` to `assembly`. Returns the number of frames of the file.
+/// Adds the images that `file` lists to `assembly`, as images of `split`. Returns the number of frames of the file.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;

@@ -62,8 +62,8 @@ const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
 /// Bytes of memory per image name in addition to its text: its entries in a list and in two tables.
 const NAME_BYTES: u64 = 200;
 
-/// Reads the three lists of image names in `file`: all, test, training. `train_ids` may be missing if `val_ids` is
-/// empty.
+/// Reads the three lists of image names in `file` and returns them in this order: all images, test images, training
+/// images. `train_ids` may be missing if `val_ids` is empty.
 fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
     let outline = read_keys(file, &LIST_KEYS)?;
     let fields = CameraFields::new(file, None, &outline)?;
@@ -119,7 +119,8 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// Returns for every image the splits to which it belongs: mostly one, for some images none.
+/// Returns, for every image of `ids`, the splits to which the image belongs: usually one, and an empty list for an
+/// image that is not used. `val` lists the test images and `train` the training images.
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);

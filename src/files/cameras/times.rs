@@ -107,7 +107,7 @@ pub(super) fn resolve(
     }
 }
 
-/// Returns the number in the image name `name` that determines the time of the image.
+/// Returns the number in the image name `name` that determines the time of the image; `None` if there is no number.
 fn number(name: &str) -> Option<u64> {
     let file = name.rsplit(['/', '\\']).next()?;
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);

@@ -8,7 +8,8 @@
 //!
 //! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
 //! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
-//! that reach 1 give the same times. For models whose time has another unit, times are used as they are ([`TimeConvention`]).
+//! that reach 1 give the same times. For models whose time has another unit, times are used as they are
+//! ([`TimeConvention`]).
 
 use std::path::{Path, PathBuf};
 
@@ -66,8 +67,8 @@ fn split_of(file: &Path) -> Split {
     }
 }
 
-/// Returns those files of the other splits (train, val, test) that exist beside `file`; empty if `file` itself is none
-/// of the three.
+/// Returns the existing files of the other splits (train, val, test) beside `file`; none if `file` is not named like a
+/// file of these splits.
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
@@ -78,7 +79,8 @@ fn others(file: &Path) -> Vec<PathBuf> {
     others.filter(|other| other.is_file()).collect()
 }
 
-/// Returns the largest time stamp in a file. Other defects of the file are not reported here.
+/// Returns the largest time stamp of the images that `file` lists, at least 0. Values that are not finite numbers are
+/// ignored without an error.
 fn latest_in(file: &Path) -> Result<f64> {
     let mut latest = 0.0;
     each_image(file, Some("frames"), &["time"], |_, frame| {
@@ -167,8 +169,9 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }
 
-/// Returns the path of the image that `file` calls `name`. The name is relative to the folder of `file`. Image names of
-/// D-NeRF have no extension.
+/// Returns the path of the image that `file` calls `name`, which is relative to the folder of `file`. If `name` has no
+/// image extension, as in D-NeRF, returns the first of `name`, `name.png`, `name.jpg` and `name.jpeg` that exists, or
+/// `name.png` if none exists.
 fn resolve(file: &Path, name: &str) -> PathBuf {
     let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
     let with = |extension: &str| {

@@ -5,12 +5,12 @@ use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Number of cameras around a moving scene: as many views as are used to score the static models of docs/benchmarks.md.
+/// Number of cameras around a moving scene: the number of views that score the static models in docs/benchmarks.md.
 const CAMERAS: u32 = 12;
 /// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
 /// image then spans 2.3 extents, so that a scene with equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
-/// Horizontal field of view of the cameras around a moving scene.
+/// Horizontal field of view in degrees of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
 /// Distance of the near plane as a multiple of the extent of the scene, so that visibility does not depend on the unit
 /// of length.

@@ -21,7 +21,7 @@ pub(crate) enum Made {
     Parameter(PickledTensor),
 }
 
-/// Tensor to be pickled: f32 values, or values of another storage class with the given bytes.
+/// Tensor to be pickled: the storage class (type of the values), the bytes of the storage, and the view of the storage.
 #[derive(Debug, Clone)]
 pub(crate) struct PickledTensor {
     pub(crate) class: &'static str,
@@ -49,7 +49,7 @@ pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> Pickled
     }
 }
 
-/// Converts dict items with text keys to items whose keys are pickled values.
+/// Converts dict items whose keys are texts to items whose keys are [`Made`] values.
 pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
     items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
 }

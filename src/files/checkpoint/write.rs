@@ -122,8 +122,8 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 }
 
 impl<'a> StoragePart<'a> {
-    /// Returns the part for `tensor` with `kept` rows (all rows if `rows` is `None`), placed `offset` elements into the
-    /// new storage. Computes the new shape and strides.
+    /// Returns the part of a new storage that holds `tensor`; it begins with element `offset` of the storage. The part
+    /// has `kept` rows, or all rows of the tensor if `rows` is `None`. Computes its shape and strides.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
@@ -160,7 +160,8 @@ impl<'a> StoragePart<'a> {
         StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
-    /// Appends the bytes of this part to `out`. `stored` holds the bytes of the old storage.
+    /// Appends the bytes of this part to `out`. `stored` holds the bytes of the old storage, and `kept` the indices of
+    /// the rows that are kept.
     fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
@@ -208,8 +209,9 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Checks that every tensor in the pickle `written` has the expected shape, strides and offset. This fails if two
-/// tensors share one shape object and only one of them changes.
+/// Checks that every tensor of `all` has the right shape, strides and offset in the new pickle `written`. For tensors
+/// in `expected` the listed ones are right, for others the old ones. Both cannot hold if two tensors share one object
+/// for their shape and only one of them changes; then the check fails.
 fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],

@@ -22,7 +22,7 @@ const LOCKS: usize = 256;
 /// never wait.
 pub(super) struct HeldTiles {
     slots: Vec<TileSlot>,
-    /// The thread that decodes the tile of a slot holds lock `slot % LOCKS`.
+    /// Locks for decoding: the thread that decodes the tile of slot `s` holds lock `s % LOCKS`.
     locks: Vec<Mutex<()>>,
     /// Maximum number of bytes of tile values kept.
     capacity: AtomicU64,
@@ -43,7 +43,7 @@ impl HeldTiles {
         HeldTiles { slots, locks, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
     }
 
-    /// Raises the maximum number of bytes of tile values to `bytes`. Has no effect if `bytes` is below the present
+    /// Raises the maximum memory for tile values to `bytes` bytes. Has no effect if `bytes` is below the present
     /// maximum.
     pub(super) fn allow(&self, bytes: u64) {
         let before = self.capacity.fetch_max(bytes, Ordering::Relaxed);

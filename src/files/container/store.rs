@@ -44,8 +44,8 @@ pub(super) struct ScratchGuard<'a> {
 }
 
 impl Container {
-    /// Opens the container and checks that it holds Gaussians: columns position, rotation, log_scale, opacity_logit and
-    /// sh, each of the right width.
+    /// Opens the container at `path` and checks that it holds Gaussians: columns position, rotation, log_scale,
+    /// opacity_logit and sh, each of the right width.
     ///
     /// # Errors
     /// Fails like [`Reader::open`], and if a column is missing or has another width.
@@ -145,17 +145,17 @@ impl Container {
         4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
     }
 
-    /// Returns the number of distinct tiles. A column that does not vary over time has only the tiles of one frame
-    /// block.
+    /// Returns the number of slots for decoded tiles, one for each tile of the file. A column (attribute) that does not
+    /// vary over time has tiles in only one frame block.
     pub(super) fn slots(&self) -> usize {
         self.slot(self.places.len(), 0, 0)
     }
 
-    /// Returns the index of a tile among all distinct tiles, which are counted by attribute, then by frame block, then
-    /// by Gaussian block. `index` is the index of the tile's attribute in [`Container::places`]. An attribute that does
-    /// not vary over time has only the tiles of one frame block, so `frame_block` is ignored for it.
+    /// Returns the index of a tile in the list of all tiles of the file, which are ordered by attribute, then by frame
+    /// block, then by Gaussian block. `index` is the index of the tile's attribute in [`Container::places`]. An
+    /// attribute that does not vary over time has tiles in only one frame block, so `frame_block` is ignored for it.
     ///
-    /// If `index` is the number of attributes and both blocks are 0, the result is the number of distinct tiles.
+    /// If `index` is the number of attributes and both blocks are 0, the result is the number of tiles of the file.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };
@@ -164,8 +164,10 @@ impl Container {
         (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
     }
 
-    /// Returns the decoded values `[frames, width, len]` of a tile of column `index` of `places` if they are in memory
-    /// or fit into the memory allowed for kept tiles, else `None`. A constant tile has one frame.
+    /// Returns the decoded values of the tile `at`, `[frames, width, len]`: the frames of the tile, the components of
+    /// its attribute, the Gaussians of the tile. A tile whose values are constant over time has one frame. `index` is
+    /// the index of the attribute in [`Container::places`]. Returns `None` if the values are not in memory and do not
+    /// fit into the memory allowed for kept tiles.
     ///
     /// # Errors
     /// Fails if the tile cannot be read or decoded.
@@ -191,13 +193,14 @@ impl Container {
         )
     }
 
-    /// Returns whether a decoded tile of column `index` of `places` is in memory.
+    /// Returns whether the decoded tile of the given Gaussian block and frame block is in memory. `index` is the index
+    /// of its attribute in [`Container::places`].
     pub(super) fn is_held(&self, index: usize, gaussian_block: u32, frame_block: u32) -> bool {
         self.held.get().is_some_and(|held| held.has(self.slot(index, gaussian_block, frame_block)))
     }
 
-    /// Returns the tiles of `columns` in the given Gaussian block and frame block that are not in memory and have to be
-    /// read from the file.
+    /// Returns the tiles of the attributes `columns`, in the given Gaussian block and frame block, that are not in
+    /// memory and have to be read from the file.
     pub(super) fn unheld(
         &self,
         columns: Attributes,

@@ -14,8 +14,8 @@ use crate::source::{BlockReader, Ids, ReadPlan};
 /// longer needs.
 const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
-/// `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. The first has index `from` in
-/// the tile and index `to` in the list.
+/// `len` Gaussians that are adjacent both in a tile and in the reader's list of Gaussians. The first has index `from`
+/// in the tile and index `to` in the list.
 struct TileRun {
     gaussian_block: u32,
     from: usize,
@@ -26,8 +26,8 @@ struct TileRun {
 /// Values of one column (attribute) that a reader keeps in memory.
 pub(super) enum KeptColumn {
     Nothing,
-    /// Index of the frame block, and the tile, which holds exactly the reader's Gaussians. The tile is decompressed, or
-    /// raw (uncompressed) in the file.
+    /// Index of a frame block, and the tile of this block, which holds exactly the reader's Gaussians. The tile is
+    /// decompressed, or raw (uncompressed) in the file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
@@ -45,7 +45,7 @@ pub(super) struct FrameValues {
 }
 
 impl FrameValues {
-    /// Returns the index, along the first axis of `values`, of the values for `frame`.
+    /// Returns the index, along the first axis of `values`, of the values for `frame`; `None` if they are not stored.
     fn place(&self, frame: usize) -> Option<usize> {
         match self.frames[..] {
             [] if self.block.contains(&frame) => Some(0),
@@ -56,11 +56,11 @@ impl FrameValues {
 
 /// Reader of some Gaussians of a container.
 ///
-/// Memory in bytes per Gaussian, for each column that varies over time: 4 × width × frames kept. The frames kept are
-/// those of a frame block that will be read, but at most the number given by [`ReadPlan::keeping_at_most`]. If this is a whole
-/// frame block, add 8 × width. Raw (uncompressed) tiles that are read whole take the same amount of mapped memory if a
-/// whole frame block may be kept, else none. No memory is used if only one frame is kept, for columns that do not vary,
-/// and for tiles that the container keeps in memory.
+/// Memory in bytes per Gaussian, for each column (attribute) that varies over time: 4 × width (number of components) ×
+/// frames kept. The frames kept are those of a frame block that will be read, but at most the number given by
+/// [`ReadPlan::keeping_at_most`]. If this is a whole frame block, add 8 × width. Raw (uncompressed) tiles that are read
+/// whole take the same amount of mapped memory if a whole frame block may be kept, else none. No memory is used if only
+/// one frame is kept, for columns that do not vary, and for tiles that the container keeps in memory.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
@@ -71,9 +71,9 @@ pub(super) struct TileReader<'a> {
     plan: ReadPlan,
     /// Last frame block for which the operating system was told which tiles will be read next.
     announced_block: Option<u32>,
-    /// Values kept of each column, in the order of [`Container::places`].
+    /// For each column (attribute), the values that this reader keeps in memory, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
-    /// Index of the frame block of the raw tiles in `raw_in_use`.
+    /// Index of the frame block that was read last; the pages in `raw_in_use` belong to its tiles.
     entered: u32,
     /// Mapped pages of raw (uncompressed) tiles in use, to be released when another frame block is entered.
     raw_in_use: TouchedPages,
@@ -121,7 +121,8 @@ impl<'a> TileReader<'a> {
         (frame / self.source.reader.layout().frame_block as usize) as u32
     }
 
-    /// Writes the values of column `index` at `frame` to `out`, `[width, len]`.
+    /// Writes the values of an attribute at frame `frame` to `out`, `[width, len]`: the components of the attribute,
+    /// the reader's Gaussians. `index` is the index of the attribute in [`Container::places`].
     fn read_column(&mut self, index: usize, frame: usize, out: &mut [f32]) -> Result<()> {
         if !self.try_keep(index, frame)? {
             return self.decode(index, &[frame], out);
@@ -140,9 +141,10 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Reads column `index` into the reader's memory for `frame` and later frames of its frame block, if that is worth
-    /// the memory. Returns false if it is not, or if the container keeps the tiles; the caller then uses
-    /// [`TileReader::decode`], which writes the values to their destination.
+    /// Decodes the attribute with index `index` for `frame` and later frames of its frame block into the memory of this
+    /// reader, if it is worth the memory. Returns whether this reader then has the values of `frame` in memory. If not,
+    /// for example because the container itself keeps the tiles or only one frame is needed, the caller uses
+    /// [`TileReader::decode`], which writes the values directly to their destination.
     fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
         if self.try_hold(index, frame_block)? {
@@ -208,8 +210,8 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Makes the container keep all tiles of column `index` that the reader needs in a frame block. Returns whether
-    /// they are all in memory.
+    /// Makes the container keep the tiles of the attribute with index `index`, in frame block `frame_block`, that this
+    /// reader needs. Returns whether all of them are in memory.
     fn try_hold(&self, index: usize, frame_block: u32) -> Result<bool> {
         if self.source.held.get().is_none() {
             return Ok(false);
@@ -224,8 +226,8 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Returns whether the values of `column`, for all Gaussians that the reader needs, are constant within the frame
-    /// block.
+    /// Returns whether the values of column `column` of the container do not change within the frame block
+    /// `frame_block`, for all Gaussians that the reader needs.
     fn is_constant(&self, column: u32, frame_block: u32) -> Result<bool> {
         for run in &self.runs {
             let at = TileId { column, gaussian_block: run.gaussian_block, frame_block };
@@ -236,8 +238,9 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Decodes the values of column `index` at `frames` into `out`, `[frames, width, len]`. `frames` are increasing and
-    /// lie in one frame block.
+    /// Decodes the values of the attribute with index `index` at `frames` into `out`, `[frames, width, len]`: the
+    /// frames, the components of the attribute, the reader's Gaussians. `frames` are increasing and lie in one frame
+    /// block.
     fn decode(&mut self, index: usize, frames: &[usize], out: &mut [f32]) -> Result<()> {
         let (source, reader) = (self.source, &self.source.reader);
         let layout = reader.layout();
@@ -296,9 +299,9 @@ impl<'a> TileReader<'a> {
         }
     }
 
-    /// Tells the operating system, once per frame block, which tiles of the columns `want` come next. Does nothing if
-    /// the reader may keep less than a frame block in memory: it then decodes each block several times, and read-ahead
-    /// would evict pages that it still needs.
+    /// Tells the operating system, once per frame block, which tiles of the attributes `want` will be read next. Does
+    /// nothing if the reader may keep less than a frame block in memory: it then decodes each block several times, and
+    /// read-ahead would evict pages that it still needs.
     fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);

@@ -80,7 +80,8 @@ impl<R: Read> FrameStream<R> {
         &self.constant
     }
 
-    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant_attributes`] is empty.
+    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant_attributes`] is
+    /// empty.
     pub fn take_constant_attributes(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }

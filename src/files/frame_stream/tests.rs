@@ -126,8 +126,8 @@ fn truncated_streams_name_the_number_of_complete_frames() {
     }
 }
 
-/// Returns the bytes of the test stream in which `field` replaces the bytes from `offset` on in the mark (header) of
-/// frame `frame`.
+/// Returns the bytes of the test stream in which `field` replaces the bytes from offset `offset` on in the mark that
+/// precedes frame `frame`.
 fn with_mark_bytes(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
     let (_, mut bytes, starts) = written();
     bytes[starts[frame] + offset..][..field.len()].copy_from_slice(field);

@@ -14,7 +14,8 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, logit, sh_coefficients};
 
 /// Maximum length in bytes of the JSON text; the text of our own files takes 5 kB.
 const MAX_TEXT_BYTES: usize = 1 << 20;
-/// Smallest opacity and smallest standard deviation, so that their logarithms are finite.
+/// Minimum opacity, and (`MIN_SCALE`) minimum standard deviation in scene units, of a Gaussian after reading. Smaller
+/// values of the file are raised to the minimum, so that their logarithms are finite.
 const MIN_OPACITY: f64 = 1e-6;
 const MIN_SCALE: f64 = 1e-7;
 
@@ -22,14 +23,15 @@ const MIN_SCALE: f64 = 1e-7;
 struct Accessor<'a> {
     bytes: &'a [u8],
     stride: usize,
-    /// Type of the components, as a number of glTF.
+    /// Number by which glTF denotes the type of the components, such as 5126 for f32.
     component: u64,
     is_normalized: bool,
     count: usize,
 }
 
 impl Accessor<'_> {
-    /// Returns component `c` of the value of Gaussian `row`.
+    /// Returns component `c` of the value of Gaussian `row`. Integers of a normalized attribute are scaled to a largest
+    /// value of 1.
     fn value(&self, row: usize, c: usize) -> f64 {
         let at = row * self.stride + c * component_bytes(self.component).unwrap_or(1);
         let bytes = &self.bytes[at..];
@@ -44,7 +46,8 @@ impl Accessor<'_> {
     }
 }
 
-/// Returns the number of bytes of a component type; `None` for types that no attribute has.
+/// Returns the number of bytes of a component type, given by its number in glTF; `None` for types that no attribute
+/// has.
 fn component_bytes(component: u64) -> Option<usize> {
     match component {
         5120 | 5121 => Some(1),
@@ -138,7 +141,8 @@ pub fn read_glb(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// Returns the JSON text and the binary chunk of a file.
+/// Returns the JSON text and the binary chunk of a `.glb` file with the bytes `map`. Fails if one of the two is missing
+/// or cut short, or if the text is too long.
 fn chunks<'a>(map: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     let word = |at: usize| map.get(at..at + 4).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let cut = |expected: String| {
@@ -174,7 +178,8 @@ fn chunks<'a>(map: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     Ok((text, binary.ok_or_else(|| cut(format!("{bytes} bytes in the binary chunk")))?))
 }
 
-/// Returns the only primitive with the extension, and the index of its mesh.
+/// Returns the index of the mesh that holds the only primitive with the extension, and this primitive. Fails if there
+/// is no such primitive or more than one.
 fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Value)> {
     let list = |value: &'a Value| value.as_array().map_or(&[][..], Vec::as_slice);
     let meshes = list(&document["meshes"]).iter().enumerate();
@@ -190,8 +195,8 @@ fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Va
     }
 }
 
-/// Returns the sign of the x and y axes of the file relative to those of a PLY: −1 if the node of the mesh has no
-/// transform, 1 if it turns the mesh by 180° about z.
+/// Returns the factor by which x and y coordinates of the file are multiplied to get the axes of a PLY: −1 if the node
+/// of the mesh with index `mesh` has no transform, 1 if it turns the mesh by 180° about z. Fails for other transforms.
 fn axes_of(document: &Value, mesh: usize, path: &Path) -> Result<f64> {
     let nodes = document["nodes"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(node) = nodes.iter().find(|node| node["mesh"] == mesh) else { return Ok(-1.0) };
@@ -222,7 +227,9 @@ fn has_transform(node: &Value) -> bool {
     ["matrix", "translation", "rotation", "scale"].iter().any(|key| !node[*key].is_null())
 }
 
-/// Returns the accessor with the index `index`, for the attribute `name` of the type `kind`.
+/// Returns the values of the attribute `name`, which must have the glTF type `kind`, such as `VEC3`. `index` is the
+/// index of their accessor in the JSON text `document`; the values lie in the chunk `binary`. Fails if the accessor
+/// does not exist, has another type, or leaves the chunk.
 fn accessor<'a>(
     document: &Value,
     binary: &'a [u8],

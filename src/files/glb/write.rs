@@ -12,14 +12,14 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::check_positions;
 use crate::model::{Gaussians, color_from_sh, opacity};
 
-/// Component types of glTF accessors.
+/// Numbers by which glTF denotes the component types f32 and (`U8`) u8.
 const F32: u32 = 5126;
 const U8: u32 = 5121;
 
-/// Function that appends the value of one attribute of a Gaussian to a list of bytes.
+/// Function that appends the value of one attribute, for the Gaussian with a given index, to a list of bytes.
 type WriteValue<'a> = Box<dyn Fn(usize, &mut Vec<u8>) + 'a>;
 
-/// Attribute of the primitive.
+/// Attribute of the glTF primitive that is written.
 struct Attribute<'a> {
     name: String,
     /// Type of the values in glTF's terms, such as `VEC3`.
@@ -160,7 +160,7 @@ fn attributes(state: &Gaussians) -> Vec<Attribute<'_>> {
     all
 }
 
-/// Checks that scales and SH coefficients are finite. Positions are checked before.
+/// Checks that scales and SH coefficients are finite. The caller has already checked the positions.
 fn check_finite(state: &Gaussians, path: &Path) -> Result<()> {
     let scale = state.log_scale.planes().iter().position(|log| !(f64::from(*log).exp() as f32).is_finite());
     let sh = state.sh.planes().iter().position(|x| !x.is_finite());
@@ -173,12 +173,13 @@ fn check_finite(state: &Gaussians, path: &Path) -> Result<()> {
     Err(Error::usage(format!("{}: {what} of Gaussian {id} is not finite, which a .glb cannot store", path.shown())))
 }
 
-/// Returns the position in the axes of glTF.
+/// Returns a position of a PLY in the axes of glTF: x and y change their signs.
 fn reversed([x, y, z]: [f32; 3]) -> [f32; 3] {
     [-x, -y, z]
 }
 
-/// Returns the smallest and the largest coordinates in the axes of glTF; zeros without Gaussians.
+/// Returns the smallest and the largest coordinates of all positions, in the axes of glTF; zeros if there are no
+/// Gaussians.
 fn bounds(state: &Gaussians) -> [[f32; 3]; 2] {
     let (mut mins, mut maxs) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
     for row in 0..state.len() {
@@ -195,7 +196,7 @@ fn linear(value: f64) -> f64 {
     if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Returns the byte of a value in [0, 1].
+/// Converts a value in [0, 1] to a byte: 255 times the value, rounded.
 fn byte(value: f64) -> u8 {
     (255.0 * value).round() as u8
 }

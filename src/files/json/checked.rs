@@ -33,7 +33,7 @@ pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Number of bytes of the buffer that the parser has taken, and (`checked`) that have been checked.
+    /// Number of bytes of the buffer that the parser has taken, and (`checked`) number of bytes that have been checked.
     taken: usize,
     checked: usize,
     /// Number of bytes of the buffer that have been read from the file. Up to 3 bytes of an incomplete character may
@@ -79,8 +79,8 @@ impl<R: Read> CheckedReader<R> {
         self.is_blank
     }
 
-    /// Returns bytes around the position of the parser: the last two that it has taken, and at least 14 that follow
-    /// unless the file ends before.
+    /// Returns bytes of the file around the position of the parser, for error messages: the last two that the parser
+    /// has taken, and at least 14 that follow unless the file ends before.
     pub(super) fn around(&mut self) -> Vec<u8> {
         let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
         if around.len() < 16 && self.fill().is_ok() {
@@ -165,7 +165,8 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Updates the state by one byte. Returns a description of the limit that the byte exceeds, if there is one.
+    /// Updates the kind of token, its length and the nesting depth by the next byte of the file. Returns a description
+    /// of the limit that this byte exceeds, if there is one.
     fn step(&mut self, byte: u8) -> Option<String> {
         if self.is_blank && !byte.is_ascii_whitespace() {
             self.is_blank = false;

@@ -186,8 +186,8 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// Visitor of a list element that should be a list itself. Passes each element of this inner list on and returns an
-/// empty list.
+/// Visitor of a list element that should be a list itself. Passes each element of this inner list to the callback and
+/// returns an empty list.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,

@@ -14,7 +14,8 @@ const MAX_KEY: usize = 64;
 const MAX_KEYS: usize = 8;
 /// Maximum number of elements that are kept of a list, unless the caller asks for fewer.
 pub(crate) const MAX_ELEMENTS: usize = 16;
-/// Maximum number of values that are kept of one entry; a 4 × 4 matrix takes 21.
+/// Maximum number of values, nested ones included, that are kept of one entry of the outermost object; a 4 × 4 matrix
+/// takes 21.
 const MAX_VALUES: usize = 64;
 
 /// JSON value of which only a part of limited size is kept.
@@ -44,7 +45,7 @@ impl Object {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
 
-    /// Sets the value under `key`.
+    /// Sets the value under `key`, replacing an earlier value.
     fn set(&mut self, key: &str, value: SmallValue) {
         match self.entries.iter_mut().find(|(name, _)| **name == *key) {
             Some(entry) => entry.1 = value,
@@ -59,7 +60,7 @@ impl SmallValue {
         SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
-    /// Returns the elements if this is a list whose elements were all kept.
+    /// Returns the elements if this is a list whose elements were all kept; `None` for other values.
     pub(crate) fn elements(&self) -> Option<&[SmallValue]> {
         match self {
             SmallValue::List(kept, total) if kept.len() == *total => Some(kept),
@@ -148,10 +149,10 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
     }
 }
 
-/// Seed (builder) and visitor of a value inside an entry.
+/// Seed (builder) and visitor of a JSON value at any nesting depth.
 struct NestedValue<'a> {
     keep: &'a Keep<'a>,
-    /// Number of values of the entry that may still be kept.
+    /// Number of values, nested ones included, that may still be kept of the current entry of the outermost object.
     remaining: &'a mut usize,
     depth: usize,
 }

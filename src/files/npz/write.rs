@@ -18,14 +18,14 @@ use crate::files::zip_output::ZipOutput;
 /// Size in bytes from which a file in a zip archive needs 64-bit lengths.
 const ZIP64_BYTES: usize = 1 << 32;
 
-/// Axis along which an array counts Gaussians.
+/// Axis of an array whose index is the Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum GaussianAxis {
-    /// No axis counts Gaussians: the array is copied unchanged.
+    /// No axis: the array has no values per Gaussian and is copied unchanged.
     None,
-    /// Axis 0 counts Gaussians.
+    /// Axis 0.
     First,
-    /// Axis 1 counts Gaussians, axis 0 counts frames.
+    /// Axis 1; the index of axis 0 is the frame.
     Second,
 }
 

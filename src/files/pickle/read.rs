@@ -250,7 +250,7 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
-    /// Pushes an integer, with the byte range of its instruction, which began at `start`.
+    /// Pushes an integer onto the stack, with the byte range of its instruction, which began at `start`.
     fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }

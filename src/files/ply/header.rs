@@ -24,7 +24,7 @@ pub enum PlyEncoding {
 }
 
 impl PlyEncoding {
-    /// Returns the encoding that the `format` line of a header calls `name`.
+    /// Returns the encoding that the `format` line of a header calls `name`; `None` for other names.
     fn parse(name: &str) -> Option<PlyEncoding> {
         match name {
             "ascii" => Some(PlyEncoding::Ascii),
@@ -50,7 +50,8 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// Returns the type that a header calls `name`, in the old (`float`) or the sized (`float32`) spelling.
+    /// Returns the type that a header calls `name`, in the old (`float`) or the sized (`float32`) spelling; `None` for
+    /// other names.
     fn parse(name: &str) -> Option<Scalar> {
         Some(match name {
             "char" | "int8" => Scalar::I8,

@@ -32,7 +32,8 @@ pub(crate) struct PlyLayout {
 }
 
 impl PlyLayout {
-    /// Finds the source of each plane among the properties of `vertex`. Other properties are ignored.
+    /// Finds, for each component of each attribute, the property of `vertex` that holds it. Other properties are
+    /// ignored.
     ///
     /// # Errors
     /// Fails if a property is missing, or if the number of properties `f_rest_*` belongs to no SH degree.

@@ -89,7 +89,7 @@ pub struct Ply {
 struct PlyBody {
     /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
-    /// Offset in bytes of the tables in the map.
+    /// Offset in bytes, in `map`, of the first table.
     start: usize,
     /// For a text file, its length in bytes and its converted rows; `None` for a binary file.
     text: Option<(u64, TextRows)>,
@@ -300,7 +300,7 @@ impl Ply {
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// Returns how many bytes of the binary body lie before and after the rows of `vertex`.
+    /// Returns the number of bytes of the binary body before the rows of `vertex`, and the number of bytes after them.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
         [self.rows.start, self.body.bytes().len() - self.rows.end]
     }
@@ -362,7 +362,8 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Returns the byte range of the rows of `vertex` in a binary body of `available` bytes.
+/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file. Fails if the body has
+/// fewer bytes (`available`) than its header declares.
 fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Range<usize>> {
     let mut end = 0u64;
     let mut rows = 0..0;

@@ -27,7 +27,8 @@ fn header(format: &str, kind: &str, names: &[String], count: &str, line_end: &st
     (text + "end_header\n").replace('\n', line_end)
 }
 
-/// Returns the bytes of a PLY file of `count` Gaussians whose properties all have the type `kind`.
+/// Returns the bytes of a PLY file of `count` Gaussians in the encoding `format`. The properties `names` all have the
+/// type `kind`, and the lines of the header end in `line_end`.
 pub(crate) fn file(format: &str, kind: &str, names: &[String], count: usize, line_end: &str) -> Vec<u8> {
     let mut bytes = header(format, kind, names, &count.to_string(), line_end).into_bytes();
     for i in 0..count {

@@ -123,8 +123,8 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     write_inria_with(gaussians, comments, &[], path)
 }
 
-/// Writes `gaussians` like [`write_inria`], with the further float properties `more` at the end of each row: names, and
-/// one value per Gaussian.
+/// Writes `gaussians` like [`write_inria`], with the float properties `more` appended to each row. Each of these
+/// properties is given by its name and one value per Gaussian.
 ///
 /// # Errors
 /// Fails like [`write_inria`].
@@ -163,8 +163,8 @@ pub(crate) fn write_inria_with(
     })
 }
 
-/// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`, followed
-/// by the properties `more`.
+/// Returns the header of a PLY file in the INRIA layout with `count` Gaussians and `rest` properties `f_rest_*`,
+/// followed by the properties `more`.
 fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl Iterator<Item = &'a str>) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
@@ -256,7 +256,8 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// Checks that all rows and proxies named in `rows` exist, and that the shapes of `proxies` and `change` match them.
+/// Checks that all proxies named in `rows` exist, that `proxies` have the SH degree of `template`, and that `change`
+/// has one value per row for each attribute that it changes.
 fn check_rows(template: &Ply, rows: &[OutputRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.attributes().iter() {
         let changes = change.0.column(column).len();

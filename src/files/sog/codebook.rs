@@ -5,7 +5,8 @@ pub const ENTRIES: usize = 256;
 /// Number of equal bins into which the range of the values is divided to find the entries.
 const BINS: usize = 1 << 14;
 
-/// Codebook of 256 numbers in increasing order.
+/// Codebook of at most 256 numbers; a byte stands for the number with this index. [`Codebook::fit`] chooses 256 numbers
+/// in increasing order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Codebook {
     entries: Vec<f32>,
@@ -73,7 +74,7 @@ impl Codebook {
     }
 }
 
-/// Values in one bin of the range.
+/// Number, smallest and largest of the values in one of the equal bins of the range of values.
 #[derive(Debug, Clone, Copy)]
 struct Bin {
     count: u64,
@@ -81,7 +82,8 @@ struct Bin {
     max: f32,
 }
 
-/// Returns the different values in increasing order, padded to 256 entries; `None` if there are more of them.
+/// Returns the different values among `values` in increasing order, padded to 256 entries; `None` if there are more
+/// than 256.
 fn few_different(values: impl Iterator<Item = f32>) -> Option<Vec<f32>> {
     let mut different: Vec<f32> = Vec::new();
     for value in values {

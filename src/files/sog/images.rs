@@ -11,7 +11,7 @@ use crate::model::{AttributeValues, logit};
 
 /// Largest value of a 16-bit number that is stored as a low and a high byte.
 const MAX_16_BIT: f64 = 65_535.0;
-/// Alpha of a rotation whose component w is left out; x, y and z follow.
+/// Alpha that marks a rotation whose component w is left out. The next three numbers mark x, y and z.
 const FIRST_ROTATION_TAG: u8 = 252;
 /// Number of palette entries in one row of the image of the palette.
 const ENTRIES_PER_ROW: usize = 64;
@@ -34,7 +34,8 @@ impl ImageSize {
         (width < MAX_SIDE && height < MAX_SIDE).then_some(ImageSize { width, height })
     }
 
-    /// Creates an image of this size whose pixel i is `pixel` of `order[i]`; the other pixels are (0, 0, 0, 255).
+    /// Creates an image of this size. Pixel i belongs to the Gaussian with index `order[i]`, and `pixel` returns the
+    /// bytes for the Gaussian with a given index; the remaining pixels are (0, 0, 0, 255).
     pub fn image(self, order: &[u32], pixel: impl Fn(usize) -> [u8; 4]) -> RgbaImage {
         let mut image = RgbaImage::new(self.width, self.height);
         image.pixels.iter_mut().zip(order).for_each(|(to, &row)| *to = pixel(row as usize));
@@ -42,17 +43,18 @@ impl ImageSize {
     }
 }
 
-/// Range of the three components of a value that is stored with 16 bits, component by component.
+/// Ranges of the three components of a value; each component is stored as a 16-bit number within its range.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range3 {
-    /// Value that 0 stands for.
+    /// Smallest value of each component, stored as 0.
     pub mins: [f64; 3],
-    /// Value that 65535 stands for.
+    /// Largest value of each component, stored as 65535.
     pub maxs: [f64; 3],
 }
 
 impl Range3 {
-    /// Returns the range of the finite values among `values`, rows of three components; 0 to 0 without such values.
+    /// Returns the ranges of the three components over the finite values in `values`; 0 to 0 for a component without
+    /// finite values.
     pub fn from_rows(values: impl Iterator<Item = [f64; 3]>) -> Range3 {
         let (mut mins, mut maxs) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for row in values {
@@ -66,13 +68,13 @@ impl Range3 {
         Range3 { mins, maxs }
     }
 
-    /// Returns component `axis` with value `value` as the nearest 16-bit number.
+    /// Returns the 16-bit number that stores `value` as component `axis`.
     pub fn encode(&self, axis: usize, value: f64) -> u16 {
         let range = self.maxs[axis] - self.mins[axis];
         if range > 0.0 { (MAX_16_BIT * (value - self.mins[axis]) / range).round() as u16 } else { 0 }
     }
 
-    /// Returns the value of component `axis` that `code` stands for.
+    /// Returns the value of component `axis` that the 16-bit number `code` stands for.
     pub fn decode(&self, axis: usize, code: u16) -> f64 {
         self.mins[axis] + (self.maxs[axis] - self.mins[axis]) * f64::from(code) / MAX_16_BIT
     }
@@ -88,8 +90,8 @@ pub fn from_log_coordinate(n: f64) -> f64 {
     n.abs().exp_m1().copysign(n)
 }
 
-/// Returns the indices of the Gaussians at `position` in Morton order of their logarithmic coordinates, 16 bits per axis:
-/// Gaussians near one another in space are near in the images, which then compress better.
+/// Returns the indices of the Gaussians at `position` in Morton order of their logarithmic coordinates, 16 bits per
+/// axis: Gaussians near one another in space are near in the images, which then compress better.
 pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
     let range = Range3::from_rows((0..position.len()).map(logs));
@@ -113,12 +115,14 @@ pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u
     })
 }
 
-/// Returns the three 16-bit numbers of which `low` and `high` are the pixels.
+/// Returns the three 16-bit numbers whose low bytes are red, green and blue of the pixel `low`, and whose high bytes
+/// are those of `high`.
 pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
     [0, 1, 2].map(|c| u16::from_le_bytes([low[c], high[c]]))
 }
 
-/// Returns the range of the logarithmic coordinates of `position` and their images of low and high bytes.
+/// Returns the ranges of the logarithmic coordinates of `position`, and the two images of their low and their high
+/// bytes. Pixel i holds the Gaussian `order[i]`.
 pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u32]) -> (Range3, [RgbaImage; 2]) {
     let logs = |row: usize| position.row::<3>(row).map(|x| log_coordinate(f64::from(x)));
     let range = Range3::from_rows(order.iter().map(|&row| logs(row as usize)));
@@ -129,14 +133,16 @@ pub fn encode_positions(position: &AttributeValues, size: ImageSize, order: &[u3
     (range, images)
 }
 
-/// Returns the position that two pixels of the images of positions stand for, in scene units.
+/// Returns the position, in scene units, whose logarithmic coordinates have the low bytes `low` and the high bytes
+/// `high`.
 pub fn decode_position(range: &Range3, low: [u8; 4], high: [u8; 4]) -> [f32; 3] {
     let codes = decode_16_bit(low, high);
     [0, 1, 2].map(|axis| from_log_coordinate(range.decode(axis, codes[axis])) as f32)
 }
 
-/// Encodes the quaternion `q`, wxyz of any length: the three components besides the largest one, in the range ±1/√2, and
-/// which one is left out. A quaternion of length 0 is stored as the identity.
+/// Encodes the quaternion `q`, wxyz of any length, as a pixel. Red, green and blue hold the components of the unit
+/// quaternion except the largest one, from −1/√2 to 1/√2. Alpha says which component is left out. A quaternion of
+/// length 0 is stored as the identity.
 pub fn encode_rotation(q: [f32; 4]) -> [u8; 4] {
     let q = q.map(f64::from);
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -163,8 +169,8 @@ pub fn decode_rotation(pixel: [u8; 4]) -> Option<[f32; 4]> {
     Some(q.map(|x| (x / length) as f32))
 }
 
-/// Returns the image of three-component values, each component as its index in `codebook`; `alpha` gives the alpha of a
-/// row.
+/// Returns the image of the three-component `values`. Each component is stored as its index in `codebook`, and `alpha`
+/// returns the alpha for the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`.
 pub fn encode_by_codebook(
     values: &AttributeValues,
     codebook: &Codebook,
@@ -178,12 +184,13 @@ pub fn encode_by_codebook(
     })
 }
 
-/// Returns the three values that a pixel stands for; `None` if the codebook is too short.
+/// Returns the three values whose indices in `codebook` are red, green and blue of `pixel`; `None` if the codebook is
+/// too short.
 pub fn decode_by_codebook(codebook: &Codebook, pixel: [u8; 4]) -> Option<[f32; 3]> {
     Some([codebook.decode(pixel[0])?, codebook.decode(pixel[1])?, codebook.decode(pixel[2])?])
 }
 
-/// Returns the byte of an opacity in [0, 1].
+/// Returns the byte that stores an opacity in [0, 1].
 pub fn encode_opacity(opacity: f64) -> u8 {
     (255.0 * opacity).round() as u8
 }
@@ -194,9 +201,9 @@ pub fn decode_opacity(code: u8) -> f32 {
     logit(f64::from(code).clamp(0.25, 254.75) / 255.0) as f32
 }
 
-/// Returns the image of the palette entries: 64 entries per row, and for each entry one pixel (red, green, blue) per SH
-/// coefficient above degree 0. The vectors of `palette` have red, green and blue of each coefficient one after the other.
-/// Returns also the codebook of the values.
+/// Returns the codebook of the values in `palette`, and the image of the palette entries: 64 entries per row, and for
+/// each entry one pixel (red, green, blue) per SH coefficient above degree 0. The vectors of `palette` have red, green
+/// and blue of each coefficient one after the other.
 pub fn encode_palette(palette: &Palette) -> (Codebook, RgbaImage) {
     let coefficients = palette.width / 3;
     let codebook = Codebook::fit(|| palette.centroids.iter().copied());
@@ -218,7 +225,8 @@ pub fn palette_entry(image: &RgbaImage, label: usize) -> Option<&[[u8; 4]]> {
     image.pixels.get(label.checked_mul(coefficients)?..)?.get(..coefficients)
 }
 
-/// Returns the image of the palette labels of the Gaussians, 16 bits each.
+/// Returns the image of the palette labels of the Gaussians, with 16 bits each in red and green. Pixel i holds the
+/// Gaussian `order[i]`.
 pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImage {
     size.image(order, |row| {
         let [low, high, ..] = labels[row].to_le_bytes();
@@ -226,7 +234,7 @@ pub fn encode_labels(labels: &[u32], size: ImageSize, order: &[u32]) -> RgbaImag
     })
 }
 
-/// Returns the palette label of a pixel.
+/// Returns the palette label that a pixel stores.
 pub fn decode_label(pixel: [u8; 4]) -> usize {
     usize::from(u16::from_le_bytes([pixel[0], pixel[1]]))
 }

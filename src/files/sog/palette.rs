@@ -1,9 +1,9 @@
-//! Palette of SH coefficients: each Gaussian refers to the nearest of a limited number of vectors (vector quantization by
-//! k-means).
+//! Palette of SH coefficients: each Gaussian refers to the nearest of a limited number of vectors (vector quantization
+//! by k-means).
 //!
-//! The vectors are first divided into √k groups by k-means, then each group gets its share of the k palette entries, also
-//! by k-means. This takes about N·√k comparisons of vectors per iteration instead of N·k. Starting points are evenly
-//! spaced in the order of the Gaussians, so the same Gaussians give the same palette for any number of threads.
+//! The vectors are first divided into √k groups by k-means, then each group gets its share of the k palette entries,
+//! also by k-means. This takes about N·√k comparisons of vectors per iteration instead of N·k. Starting points are
+//! evenly spaced in the order of the Gaussians, so the same Gaussians give the same palette for any number of threads.
 
 use rayon::prelude::*;
 
@@ -11,13 +11,13 @@ use rayon::prelude::*;
 pub const MAX_ENTRIES: usize = 1 << 16;
 /// Number of iterations of k-means.
 const ITERATIONS: usize = 6;
-/// Number of vectors per group from which the groups are computed.
+/// Number of sampled vectors per group. The centroids of the groups are computed from this sample.
 const SAMPLES_PER_GROUP: usize = 64;
 
-/// Palette of vectors, and the index of the entry of each Gaussian.
+/// Palette of vectors (SH coefficients), and for each Gaussian the index of its palette entry.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Palette {
-    /// Number of components of a vector.
+    /// Number of components of a vector (palette entry).
     pub width: usize,
     /// Entries one after the other, `width` numbers each.
     pub centroids: Vec<f32>,
@@ -95,8 +95,9 @@ fn evenly_spaced(count: usize, wanted: usize) -> impl Iterator<Item = usize> {
     (0..wanted).map(move |i| (i as u128 * count as u128 / wanted as u128) as usize)
 }
 
-/// Divides `entries` palette entries among groups with the numbers of members `sizes`. A group with members gets at least
-/// one entry and at most one per member; the sum is at most `entries`.
+/// Divides `entries` palette entries among groups of vectors and returns the number of entries of each group. `sizes`
+/// holds the number of vectors in each group. A group with vectors gets at least one entry and at most one per vector;
+/// the sum is at most `entries`.
 fn shares(sizes: &[usize], entries: usize) -> Vec<usize> {
     let total: usize = sizes.iter().sum();
     let filled = sizes.iter().filter(|&&size| size > 0).count();
@@ -110,7 +111,8 @@ fn shares(sizes: &[usize], entries: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Returns `k` centroids of `vectors` by Lloyd's k-means. A centroid that loses all its vectors keeps its place.
+/// Returns `k` centroids of `vectors` (`width` components each) by Lloyd's k-means. A centroid that loses all its
+/// vectors keeps its place.
 fn k_means(vectors: &[f32], width: usize, k: usize) -> Vec<f32> {
     let count = vectors.len() / width;
     let row = |i: usize| &vectors[i * width..][..width];

@@ -23,16 +23,16 @@ use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Maximum length in bytes of `meta.json`; three codebooks take about 20 kB.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Maximum number of files in an archive, and of bytes of its list of files.
+/// Maximum number of files in an archive, and (`MAX_LIST_BYTES`) maximum length in bytes of the list of these files.
 const MAX_ENTRIES: u64 = 1024;
 const MAX_LIST_BYTES: u64 = 4 << 20;
 /// Bytes of memory per pixel while an image is decoded: the image and the buffers of the decoder.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Number of images of a file that have a pixel per Gaussian and are decoded at the same time.
+/// Maximum number of images with one pixel per Gaussian that are in memory together while a file is read.
 const IMAGES: u64 = 6;
 /// Maximum number of pixels of the image of palette entries: 65536 entries of degree 3.
 const MAX_PALETTE_PIXELS: usize = 15 << 16;
-/// Largest magnitude of a logarithmic coordinate: the coordinate must be finite as f32.
+/// Largest magnitude of a logarithmic coordinate that is accepted, so that the coordinate is finite as f32.
 const MAX_LOG_COORDINATE: f64 = 88.0;
 /// Largest magnitude of a stored SH coefficient and of the logarithm of a scale.
 const MAX_CODEBOOK_VALUE: f32 = 1e30;
@@ -110,14 +110,14 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
     Ok(gaussians)
 }
 
-/// Files of an archive or of a folder.
+/// Place from which the files of a `.sog` archive are read: the archive, or a folder with the same files.
 pub(crate) enum Files {
     Archive(ZipArchive<BufReader<File>>),
     Folder(PathBuf),
 }
 
 impl Files {
-    /// Opens the archive at `path`.
+    /// Opens the ZIP archive at `path`. Fails if the file is no ZIP archive or has too many files.
     pub(crate) fn open_archive(path: &Path) -> Result<Files> {
         let damaged = |found: String| {
             Error::input(path, "", "a ZIP archive of images", found)
@@ -131,7 +131,8 @@ impl Files {
         Ok(Files::Archive(ZipArchive::new(file).map_err(|error| damaged(error.to_string()))?))
     }
 
-    /// Decodes the image called `name`, of at most `max_pixels` pixels.
+    /// Decodes the image called `name`. Fails if it has more than `max_pixels` pixels, if its file is larger than
+    /// `memory`, or if it is damaged. Messages call the archive `path`.
     fn image(&mut self, path: &Path, name: &str, max_pixels: usize, memory: ReadLimit) -> Result<RgbaImage> {
         // A lossless WebP takes little more than four bytes per pixel, so more cannot come from a valid file.
         let most = ReadLimit::new(memory.bytes().min(8 * max_pixels as u64 + (1 << 20)));
@@ -182,7 +183,7 @@ impl Files {
     }
 }
 
-/// Parses `meta.json`, whose text is `text`.
+/// Parses `text`, the content of `meta.json`. Fails if it is malformed or has another version than 2.
 fn parse(text: &[u8], path: &Path) -> Result<Meta> {
     let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
     if value["version"] != VERSION {
@@ -198,7 +199,8 @@ fn parse(text: &[u8], path: &Path) -> Result<Meta> {
     })
 }
 
-/// Returns the range of the logarithmic coordinates.
+/// Returns the ranges of the logarithmic coordinates of the positions from `meta`. Fails if a range is not within ±88
+/// ([`MAX_LOG_COORDINATE`]).
 fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
     let (mins, maxs) = (meta.means.mins, meta.means.maxs);
     for axis in 0..3 {
@@ -216,7 +218,8 @@ fn read_range(meta: &Meta, path: &Path) -> Result<Range3> {
     Ok(Range3 { mins, maxs })
 }
 
-/// Returns the codebook of `what`, of at most 256 finite numbers. Some writers leave out the first number.
+/// Returns the codebook with the numbers `entries`, which must be 1 to 256 finite numbers. `what` names it in messages.
+/// Some writers store null as the first number, which then counts as equal to the second one.
 fn codebook(entries: &[Option<f32>], path: &Path, what: &str) -> Result<Codebook> {
     let place = || format!("meta.json, {what}, codebook");
     if entries.is_empty() || entries.len() > super::codebook::ENTRIES {
@@ -243,7 +246,8 @@ struct DecodedPalette {
     values: Vec<f32>,
 }
 
-/// Decodes the image `image` of palette entries.
+/// Decodes the palette of SH coefficients. `image` holds the palette entries, and `entry` is the member of `meta.json`
+/// that describes them. Fails if the image does not fit the description. Messages call the archive `path`.
 fn read_palette(entry: &PaletteEntry, image: &RgbaImage, path: &Path) -> Result<DecodedPalette> {
     let name = &entry.files[0];
     let degree = (1..=MAX_SH_DEGREE).find(|&degree| image.width == 64 * (sh_coefficients(degree) - 1));

@@ -28,7 +28,7 @@ const MAX_LOG_SCALE: f32 = 20.0;
 /// Number of palette entries for the smallest files.
 const LEAST_PALETTE: usize = 1024;
 
-/// Differences between the Gaussians and a written file.
+/// Largest differences between the Gaussians and the values in a written file.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SogErrors {
     /// Largest error of a position, in scene units.
@@ -38,7 +38,7 @@ pub struct SogErrors {
 }
 
 impl SogErrors {
-    /// Returns the larger one of each error of `self` and `other`.
+    /// Returns, for each kind of error, the larger one of `self` and `other`.
     pub fn max(self, other: SogErrors) -> SogErrors {
         let sh = self.sh.into_iter().chain(other.sh).reduce(f64::max);
         SogErrors { position: self.position.max(other.position), sh }
@@ -99,8 +99,8 @@ pub fn visible_only(state: &Gaussians) -> Cow<'_, Gaussians> {
 /// Images of a file with their names in the archive.
 pub(crate) type NamedImages = Vec<(String, RgbaImage)>;
 
-/// Encodes the Gaussians `state`, in the order `order`, as images of size `size`. Returns the content of `meta.json`, the
-/// images with their names, and the errors. `kind` names the file in messages, for example "a .sog".
+/// Encodes the Gaussians `state`, in the order `order`, as images of size `size`. Returns the content of `meta.json`,
+/// the images with their names, and the errors. `kind` names the file in messages, for example "a .sog".
 ///
 /// # Errors
 /// Fails if stored values would exceed the error bounds of [`accuracy`](crate::files::accuracy).
@@ -161,8 +161,8 @@ pub(crate) fn encode(
     Ok((meta, images, SogErrors { position: accuracy.position_error(), sh }))
 }
 
-/// Adds the images of the SH coefficients above degree 0 to `images`. Returns their entry in `meta.json` and the root of
-/// the mean squared error; `None` if there are no such coefficients.
+/// Adds the images of the SH coefficients above degree 0 to `images`. Returns the member `shN` of `meta.json`, and the
+/// root of the mean squared error of these coefficients; `None` if there are no such coefficients.
 fn encode_sh(
     state: &Gaussians,
     size: ImageSize,
@@ -202,8 +202,8 @@ fn encode_sh(
     Some((entry, (sum / (state.len() * width) as f64).sqrt()))
 }
 
-/// Returns the maximum number of palette entries for a file of `count` Gaussians: a power of two between 1024 and 65536,
-/// at most the number of Gaussians if that is above 1024.
+/// Returns the maximum number of palette entries for a file of `count` Gaussians: a power of two between 1024 and
+/// 65536, at most the number of Gaussians if that is above 1024.
 fn palette_entries(count: usize) -> usize {
     let doublings = (count / LEAST_PALETTE).max(1).ilog2().min(6);
     LEAST_PALETTE << doublings

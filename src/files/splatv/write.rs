@@ -70,8 +70,9 @@ pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     ]
 }
 
-/// Adds the errors between `row` and the values stored for it to `to`, as Gaussian `id`. The error of the path is
-/// measured over the times around its center at which the Gaussian is visible.
+/// Adds the coding errors of Gaussian `id` to `to`: the differences between `row` and the values that a file stores for
+/// it. The position error includes the error of the path over the times around its center at which the Gaussian is
+/// visible.
 pub fn add_errors(row: &SplatvGaussian, id: usize, to: &mut CodingErrors) {
     let held = SplatvGaussian::from_words(&encode_words(row));
     let drawn = |row: &SplatvGaussian| RenderedAttributes {

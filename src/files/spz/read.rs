@@ -12,17 +12,17 @@ use crate::files::sog::images::decode_opacity;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
-/// First two bytes of a gzip file, which versions below 4 are.
+/// First two bytes of a gzip file. Files of versions 2 and 3 are gzip files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 /// Number of bytes of the header of versions 2 and 3.
 const HEADER_BYTES: usize = 16;
 /// Maximum SH degree of the format.
 const MAX_DEGREE: u8 = 4;
-/// Bit of the flags that says that extensions follow.
+/// Bit of the flags in the header that says that the file has extensions (optional data, which this reader skips).
 const HAS_EXTENSIONS: u8 = 2;
 /// Maximum number of bytes between the header and the table of streams of version 4.
 const MAX_EXTENSION_BYTES: u64 = 1 << 20;
-/// Largest window of a stream that is decoded, as a power of two in bytes.
+/// Largest zstd window that is accepted when an array is decoded, as a power of two in bytes.
 const MAX_WINDOW: u32 = 24;
 
 /// Values that the header of a file declares.
@@ -35,7 +35,7 @@ struct Header {
     flags: u8,
 }
 
-/// Arrays of a file, one after the other for all Gaussians.
+/// Arrays of a file. Each array holds one attribute of all Gaussians.
 #[derive(Default)]
 struct Arrays {
     positions: Vec<u8>,
@@ -62,8 +62,8 @@ impl Arrays {
     }
 }
 
-/// Reads the Gaussians of the `.spz` file at `path`. SH coefficients of degree 4 are left out. Files of versions 2 and 3
-/// are recognized by the magic bytes of gzip.
+/// Reads the Gaussians of the `.spz` file at `path`. SH coefficients of degree 4 are left out. Files of versions 2 and
+/// 3 are recognized by the magic bytes of gzip.
 ///
 /// # Errors
 /// Fails if the file is damaged, has another version than 2, 3 or 4, or needs more memory than `memory`.
@@ -81,7 +81,8 @@ pub fn read_spz(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     Ok(decode(&header, &arrays))
 }
 
-/// Parses the first 16 bytes of a header and checks that the Gaussians are within `memory`.
+/// Parses the first 16 bytes of the header of the file at `path`. Fails if a value is invalid, or if the Gaussians need
+/// more memory than `memory`.
 fn parse_header(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<Header> {
     let word = |at: usize| bytes.get(at..at + 4).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     if bytes.len() < HEADER_BYTES {
@@ -107,12 +108,13 @@ fn parse_header(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<Header> 
     Ok(Header { version, count: count as usize, sh_degree: usize::from(degree), bits: i32::from(bits), flags })
 }
 
-/// Returns the error for a file that ends before `expected`.
+/// Returns the error for a file that is cut short. `expected` describes the bytes that are missing, and `found` is the
+/// number of bytes that are there.
 fn cut(path: &Path, expected: String, found: usize) -> Error {
     Error::input(path, "", expected, format!("{found} bytes")).hint("the file is cut short; copy or export it again")
 }
 
-/// Reads a file of version 2 or 3, decompressed by `source`.
+/// Reads the header and the arrays of a file of version 2 or 3. `source` returns the decompressed bytes of the file.
 fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(Header, Arrays)> {
     let damaged = |error: std::io::Error| {
         Error::input(path, "", "an .spz compressed by gzip", error.to_string())
@@ -141,7 +143,8 @@ fn read_gzip(mut source: impl Read, path: &Path, memory: ReadLimit) -> Result<(H
     Ok((header, arrays))
 }
 
-/// Reads a file of version 4 of `length` bytes from `source`, whose first bytes are `head`.
+/// Reads the header and the arrays of a file of version 4, which is `length` bytes long. `source` returns all bytes of
+/// the file, and `head` holds the first of them.
 fn read_streams(
     mut source: impl Read,
     head: &[u8],
@@ -200,7 +203,7 @@ fn read_streams(
     Ok((header, arrays))
 }
 
-/// Decodes the arrays of a file.
+/// Decodes the Gaussians in the arrays of a file with the header `header`.
 fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
     let degree = header.sh_degree.min(MAX_SH_DEGREE);
     let mut gaussians = Gaussians::zeros(header.count, degree);
@@ -238,13 +241,15 @@ fn decode(header: &Header, arrays: &Arrays) -> Gaussians {
     gaussians
 }
 
-/// Returns the quaternion xyzw of version 2: x, y and z; w is positive.
+/// Returns the quaternion xyzw that version 2 stores in three bytes: x, y and z. The component w is positive and
+/// follows from the length 1.
 fn rotation_of_3_bytes(bytes: &[u8]) -> [f64; 4] {
     let [x, y, z] = [0, 1, 2].map(|k| f64::from(bytes[k]) / 127.5 - 1.0);
     [x, y, z, (1.0 - (x * x + y * y + z * z)).max(0.0).sqrt()]
 }
 
-/// Returns the unit quaternion xyzw of version 3: the index of its largest component, then the others.
+/// Returns the unit quaternion xyzw that versions 3 and 4 store in four bytes: the index of its largest component,
+/// which is positive, and the values of the other three.
 fn rotation_of_4_bytes(bytes: &[u8]) -> [f64; 4] {
     let mut word = u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
     let largest = (word >> 30) as usize;

@@ -129,7 +129,9 @@ struct TensorSearch<'a> {
 }
 
 impl TensorSearch<'_> {
-    /// Adds the tensors at and below node `id` of the object tree. `name` is the name of this node.
+    /// Adds the tensors at and below node `id` of the object tree. `name` is the name of this node and `depth` its
+    /// depth in the tree. Fails if the tree is too deep or too large, or if a value seems to be a tensor of an unknown
+    /// kind.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
         self.left =
@@ -172,7 +174,8 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Adds the tensors at and below node `id`, which is the child `part` of the node called `name`.
+    /// Adds the tensors at and below node `id`, which is the child with the key `part` of the node called `name`;
+    /// `depth` is the depth of that node.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {

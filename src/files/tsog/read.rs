@@ -20,9 +20,9 @@ use crate::model::{AttributeValues, StoredParams};
 const MAX_META_BYTES: u64 = 4 << 20;
 /// Bytes of memory per Gaussian for its time window and velocity, and for the images of both.
 const TIMELINE_BYTES: u64 = 4 * 5 + 4 * 16;
-/// Members that may be absent, but not null.
+/// Members of `meta.json` that may be absent, but not null.
 const OPTIONAL: [&str; 6] = ["shN", "timeline", "temporal", "fps", "playback", "profile"];
-/// Largest frame rate and duration in seconds.
+/// Largest accepted frame rate, in frames per second, and largest accepted duration, in seconds.
 const MAX_PLAYBACK: f64 = 1e6;
 
 /// Returns whether the file at `path` is a ZIP archive with a `meta.json` of version 4.
@@ -73,7 +73,8 @@ pub fn read_tsog(path: &Path, memory: ReadLimit) -> Result<TimedGaussians> {
     Ok(TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip })
 }
 
-/// Parses `meta.json`, whose text is `text`.
+/// Parses `text`, the content of `meta.json`. Fails if it is malformed, has another version than 4, or has a null in
+/// place of an optional member.
 fn parse(text: &[u8], path: &Path) -> Result<TsogMeta> {
     let value = read_from(text, &path.join(META_FILE), &ParseAbort::default(), PhantomData::<Value>)?;
     if value["version"] != VERSION {
@@ -88,7 +89,8 @@ fn parse(text: &[u8], path: &Path) -> Result<TsogMeta> {
     })
 }
 
-/// Returns the number of frames of a timeline of type 0.
+/// Returns the number of frames of the timeline `entry`. Fails if the timeline is not of type 0 or its numbers are
+/// invalid.
 fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
     let place = |name: &str| format!("meta.json, timeline, {name}");
     if entry.kind != 0 {
@@ -106,7 +108,8 @@ fn frame_count(entry: &TimelineEntry, path: &Path) -> Result<usize> {
     Ok(frames)
 }
 
-/// Reads the frames or the time windows of all Gaussians into `own`.
+/// Reads the images of the timeline `entry` and writes the frame or the time window of each Gaussian to `own`, its
+/// format-specific parameters.
 fn read_timeline(
     entry: &TimelineEntry,
     timeline: Timeline,
@@ -140,7 +143,8 @@ fn read_timeline(
     Ok(())
 }
 
-/// Reads the velocities of all Gaussians into `own`.
+/// Reads the images of the velocities that `entry` describes and writes the velocity of each Gaussian to `own`, its
+/// format-specific parameters.
 fn read_velocities(
     entry: &Velocity,
     files: &mut Files,
@@ -169,7 +173,8 @@ fn read_velocities(
     Ok(())
 }
 
-/// Returns `range` if its ends are finite numbers in order. `member` names its place in `meta.json`.
+/// Returns `range` if its ends are finite numbers in order, else fails. `member` is the member of `meta.json` that is
+/// named in the message.
 fn checked(range: Range3, path: &Path, member: &str) -> Result<Range3> {
     let wrong = (0..3).find(|&c| {
         let (min, max) = (range.mins[c], range.maxs[c]);
@@ -189,7 +194,8 @@ fn is_f32(value: f64) -> bool {
     (value as f32).is_finite()
 }
 
-/// Returns the times of the frames: those of the sequence that was converted if the file has them.
+/// Returns the number, the rate and the times of the frames. The times are those of the sequence that was converted if
+/// the file states them, else from 0 to 1.
 fn clip_times(meta: &TsogMeta, timeline: Timeline, path: &Path) -> Result<ClipTimes> {
     let playback = meta.playback.as_ref();
     let number = |name: &str, value: Option<f64>| match value {

@@ -65,7 +65,7 @@ fn image(path: &Path, name: &str) -> RgbaImage {
     RgbaImage::from_webp(&bytes, 1 << 20).unwrap()
 }
 
-/// Writes the archive again with another `meta.json` and another method of compression.
+/// Writes the archive at `path` again, with the changes that `change` makes to `meta.json`, and compressed by `method`.
 fn rewrite(path: &Path, method: CompressionMethod, change: impl FnOnce(&mut Value)) {
     let (mut text, names) = meta(path);
     change(&mut text);
@@ -86,7 +86,8 @@ fn rewrite(path: &Path, method: CompressionMethod, change: impl FnOnce(&mut Valu
     out.finish().unwrap();
 }
 
-/// Returns the row of `found` for each row of `written`, by the nearest position; files are in Morton order.
+/// Returns, for each Gaussian of `written`, the index of the Gaussian of `found` with the nearest position. The order
+/// differs because files are written in Morton order.
 fn matched(written: &TimedGaussians, found: &TimedGaussians) -> Vec<u32> {
     let nearest = |row: usize| {
         let at = written.params.gaussians.position.row::<3>(row);
@@ -138,7 +139,8 @@ fn windows_and_velocities_are_within_half_a_step() {
     assert!(all.iter().copied().eq(0..COUNT as u32), "{all:?}");
 }
 
-/// Returns the end of the pointer to component `axis` of a range: velocities have one more list around them.
+/// Returns the end of the JSON pointer to component `axis` of a range in `meta.json`. `member` is the beginning of the
+/// pointer. The range of velocities has one more list around it than other ranges.
 fn index(member: &str, axis: usize) -> String {
     if member.starts_with("/temporal") { format!("/0/{axis}") } else { format!("/{axis}") }
 }

@@ -13,23 +13,24 @@ use crate::files::sog::images::{ImageSize, Range3, encode_16_bit, morton_order};
 use crate::files::sog::write::{NamedImages, SogErrors, encode, write_archive};
 use crate::model::{StoredParams, logit, opacity};
 
-/// Largest standard deviation of a time window that is stored, in units of the sequence. Wider windows become windows of
-/// this width; the opacity changes by at most 1/500 of its value then. A larger limit would leave fewer of the 65536
-/// steps for narrow windows.
+/// Largest standard deviation of a time window that is stored, as a multiple of the length of the sequence. Wider
+/// windows become windows of this width; the opacity changes by at most 1/500 of its value then. A larger limit would
+/// leave fewer of the 65536 steps for narrow windows.
 const MAX_DEVIATION: f64 = 8.0;
 /// Largest opacity, so that its logit is finite.
 const MAX_OPACITY: f64 = 1.0 - 1e-6;
-/// Maximum number of frames of a timeline of single frames.
+/// Maximum number of frames of a timeline of type 0, in which each Gaussian is seen in a single frame.
 pub const MAX_FRAMES: usize = 1 << 16;
-/// Maximum error of positions by velocities of 8 bits, as a fraction of the middle scale: of the root of the mean square,
-/// and of the largest one.
+/// Maximum position errors up to which velocities are stored with 8 bits, as fractions of the middle one of a
+/// Gaussian's three scales: the root of the mean squared error, and the largest error.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
 /// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`.
 ///
 /// # Errors
-/// Fails if there are no Gaussians, or more than the images can hold; if there are too many frames; if a position is not
-/// finite; if stored values would exceed the error bounds of [`accuracy`](crate::files::accuracy); or if writing fails.
+/// Fails if there are no Gaussians, or more than the images can hold; if there are too many frames; if a position is
+/// not finite; if stored values would exceed the error bounds of [`accuracy`](crate::files::accuracy); or if writing
+/// fails.
 pub fn write_tsog(content: &TimedGaussians, path: &Path) -> Result<SogErrors> {
     let count = content.params.len();
     let refused = |what: String| Error::usage(format!("{}: {what}", path.shown()));
@@ -70,8 +71,9 @@ pub fn write_tsog(content: &TimedGaussians, path: &Path) -> Result<SogErrors> {
     Ok(errors)
 }
 
-/// Returns the Gaussians `params` with time windows of at most [`MAX_DEVIATION`]. A wider window is replaced by one that
-/// has the same opacity and the same slope of its logarithm in the middle of the sequence; the motion does not change.
+/// Returns the Gaussians `params` with time windows of at most [`MAX_DEVIATION`]. A wider window is replaced by one
+/// that has the same opacity and the same slope of its logarithm in the middle of the sequence; the motion does not
+/// change.
 fn narrowed(params: &StoredParams) -> StoredParams {
     let mut params = params.clone();
     for row in 0..params.len() {
@@ -95,7 +97,8 @@ fn narrowed(params: &StoredParams) -> StoredParams {
     params
 }
 
-/// Adds the images of the frame of each Gaussian to `images`, and returns their entry in `meta.json`.
+/// Adds the two images that hold the frame of each Gaussian to `images`, and returns the member `timeline` of
+/// `meta.json`.
 fn encode_frames(
     params: &StoredParams,
     frames: usize,
@@ -113,7 +116,8 @@ fn encode_frames(
     TimelineEntry { kind: 0, frames: Some(frames as u64), delta: Some(delta as u64), mins: None, maxs: None, files }
 }
 
-/// Adds the images of the time windows to `images`, and returns their entry in `meta.json`.
+/// Adds the two images that hold the time window of each Gaussian to `images`, and returns the member `timeline` of
+/// `meta.json`.
 fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images: &mut NamedImages) -> TimelineEntry {
     let window = |row: usize| {
         let deviation =
@@ -130,8 +134,8 @@ fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images:
     TimelineEntry { kind: 1, frames: None, delta: None, mins, maxs, files }
 }
 
-/// Adds the images of the velocities to `images`, with 8 bits if these are accurate enough, and returns their entry in
-/// `meta.json`; `None` if nothing moves.
+/// Adds the image or the two images of the velocities to `images`, with 8 bits if these are accurate enough, else with
+/// 16. Returns the member `temporal` of `meta.json`; `None` if nothing moves.
 fn encode_velocities(
     params: &StoredParams,
     size: ImageSize,
@@ -168,8 +172,9 @@ fn encode_velocities(
     Some(Temporal { means: Velocity { mins: [range.mins], maxs: [range.maxs], files } })
 }
 
-/// Returns whether velocities with 8 bits between the ends of `range` move the Gaussians closely enough, within two
-/// standard deviations of their time windows and within the sequence.
+/// Returns whether velocities that are stored with 8 bits within `range` keep the position errors within
+/// [`MAX_8_BIT_ERRORS`]. Errors count up to two standard deviations from the center of a time window, and only within
+/// the sequence.
 fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     let half_step = (0..3).map(|axis| ((range.maxs[axis] - range.mins[axis]) / 510.0).powi(2)).sum::<f64>().sqrt();
     let (mut squares, mut most) = (0.0, 0.0f64);
@@ -186,7 +191,8 @@ fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     (squares / params.len() as f64).sqrt() <= MAX_8_BIT_ERRORS[0] && most <= MAX_8_BIT_ERRORS[1]
 }
 
-/// Adds the images of low and high bytes called `name` to `images`, and returns the names of their files.
+/// Adds the images `low` and `high` to `images` under the file names `NAME_l.webp` and `NAME_u.webp`, where NAME is
+/// `name`, and returns these two file names.
 fn add_pair(images: &mut NamedImages, name: &str, [low, high]: [crate::files::webp::RgbaImage; 2]) -> [String; 2] {
     let names = [format!("{name}_l.webp"), format!("{name}_u.webp")];
     images.extend(names.iter().cloned().zip([low, high]));

@@ -39,7 +39,7 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Archive of a compressed model (`.gsz`).
+/// Model format of archives of compressed models (`.gsz`): recognizes and opens a file.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),

@@ -160,7 +160,8 @@ fn heaviest(cluster: &Cluster) -> u32 {
 }
 
 /// Reads the stored parameters of all Gaussians; the properties `fea_0`, `fea_1`, … become format-specific parameters
-/// ([`StoredParams::format_specific`]). Fails if a value is not finite that the network reads or that is needed for the covariance.
+/// ([`StoredParams::format_specific`]). Fails if a value is not finite that the network reads or that is needed for the
+/// covariance.
 fn raw(ply: &Ply) -> Result<StoredParams> {
     let count = ply.count();
     let gaussians = ply.whole()?;

@@ -106,8 +106,8 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// Returns for every Gaussian of `raw` the squared distance from the position that `wanted` returns, summed over
-/// `frames`.
+/// Returns for every Gaussian of `raw` the squared distance between its position and the position that `wanted` returns
+/// for it, summed over `frames`, in scene units squared.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -156,10 +156,11 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all stored parameters of the proxies `made` except their positions. Starts with the parameters of the leaders
-/// and, [`CORRECTIONS`] times, adds the mean over `frames` of target `wanted` minus state. One correction suffices if
-/// the network's output is simply added; quaternions that are not normalized need several. Each proxy keeps the scale
-/// and rotation with the smallest difference.
+/// Sets all stored parameters of the proxies `made` except their positions. The parameters start as those of the
+/// leaders. Then, [`CORRECTIONS`] times, the mean over `frames` of the target (returned by `wanted`) minus the proxy's
+/// state is added. One correction suffices if the network's output is simply added; quaternions that are not normalized
+/// need several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the
+/// target.
 fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,
@@ -207,7 +208,8 @@ struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared differences between target and proxy in log scales and in unit quaternions, summed over frames.
+    /// Squared difference between target and proxy, in log scales and in unit quaternions, summed over frames and
+    /// components.
     off: f64,
 }
 

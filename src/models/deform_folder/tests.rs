@@ -176,7 +176,8 @@ fn relative_difference(a: DMat3, b: DMat3) -> f64 {
     most(a - b) / most(b)
 }
 
-/// Returns the network's output for the canonical positions `places` at `time`.
+/// Returns the network's output for the canonical positions `places` at `time`. The names of the network's tensors
+/// begin with `prefix`.
 fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> PredictedMotion {
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();

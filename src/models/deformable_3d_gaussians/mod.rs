@@ -18,13 +18,13 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParam
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Model folder of Deformable-3D-Gaussians.
+/// Model format of Deformable-3D-Gaussians: recognizes and opens a model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_network(found.path),
     open: |path, options| DeformFolder::open(path, options, &ENTRY, DeformableMotion::new),
 };
 
-/// Attributes that are computed from the covariance.
+/// Attributes that are computed from the covariance of a deformed Gaussian: rotation and scales.
 const SHAPE: Attributes = Attributes::ROTATION.union(Attributes::LOG_SCALE);
 
 /// Motion model of Deformable-3D-Gaussians.
@@ -188,7 +188,8 @@ impl NetworkMotionModel for DeformableMotion {
     }
 }
 
-/// Returns the position, the axis w and the translation v of a screw motion as vectors.
+/// Returns as vectors the position `x`, the axis w (the first three of the six network outputs) and the translation v
+/// (the last three) of a screw motion.
 fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }

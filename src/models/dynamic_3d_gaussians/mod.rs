@@ -31,7 +31,7 @@ use proxies::MergedSource;
 /// Name of the file that holds the model.
 const FILE: &str = "params.npz";
 
-/// File `params.npz` of Dynamic3DGaussians, or the folder that contains it.
+/// Model format of Dynamic3DGaussians: recognizes and opens a file `params.npz`, or the folder that contains it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));

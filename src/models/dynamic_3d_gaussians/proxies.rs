@@ -16,7 +16,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Maximum number of frames over which the scales and opacities of proxies are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// Attributes that are constant in time.
+/// Attributes that are constant in time in this model format: scale and opacity.
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
 /// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. They are geometric means
@@ -72,8 +72,8 @@ impl<'a> MergedSource<'a> {
         MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Returns, for each of the output indices `places` that is a proxy (merged Gaussian), its position in `places` and
-    /// the index of its cluster.
+    /// Returns a pair for each proxy (Gaussian that replaces merged ones) among the output Gaussians with the indices
+    /// `places`: its position in `places`, and the index of its cluster.
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =

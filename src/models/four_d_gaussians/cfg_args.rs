@@ -259,7 +259,7 @@ pub(in crate::models) struct ConfigKey<'a> {
 }
 
 impl<'a> ConfigKey<'a> {
-    /// Returns the error that the value of this key is not what was `expected`.
+    /// Returns an error which says that the value of this key is wrong; `expected` describes a correct value.
     pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }

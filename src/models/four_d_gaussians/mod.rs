@@ -34,7 +34,7 @@ use crate::recipe::{FieldPrecision, MergeParams};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
-/// Model folder of 4DGaussians.
+/// Model format of 4DGaussians: recognizes and opens a model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && found.path.join("point_cloud").is_dir(),
     open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
@@ -277,7 +277,8 @@ fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize
     Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })
 }
 
-/// Returns how the deformation field uses the tensor called `name`.
+/// Returns the role of the tensor called `name` in the deformation field, by which an archive chooses how to store it:
+/// feature plane, weights of a layer, exact values, or unused.
 fn role(config: FieldConfig, name: &str) -> TensorRole {
     let Some(name) = name.strip_prefix("deformation_net.") else { return TensorRole::Unread };
     let part = name.split('.').next().unwrap_or_default();

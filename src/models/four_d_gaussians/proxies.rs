@@ -100,8 +100,8 @@ fn merged_states(
     Ok(states)
 }
 
-/// Returns `states` with quaternions of the same length as those of the leaders at the same frame. The field adds its
-/// delta to the stored quaternion, so the angle of rotation depends on the length.
+/// Returns the `states` of proxies with every quaternion scaled to the length that the quaternion of its leader has at
+/// the same frame. The field adds its delta to the stored quaternion, so the angle of rotation depends on the length.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);
@@ -139,9 +139,10 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in scene
-/// units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at the leader of
-/// the cluster (its most important member), the offset that the leader has from the mean at the reference frame is added.
+/// Returns for each proxy the largest distance between its actual and its expected position over sampled frames, in
+/// scene units. The expected position is the weighted mean of the members of the cluster. If the proxy was placed at
+/// the leader of the cluster (its most important member), the offset that the leader has from the mean at the reference
+/// frame is added.
 fn deviations(
     model: &ModelFolder,
     reference: ReferenceFrame,

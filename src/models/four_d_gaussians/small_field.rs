@@ -46,7 +46,8 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     if expanded_bytes > MAX_EXPANSION * stored_bytes { pack(false) } else { small }
 }
 
-/// Returns the compact form of the tensor called `name`.
+/// Returns the compact form of the tensor called `name`. `from_zero` states that the field is never read at times below
+/// 0, so that some rows of time planes need no storage of their own.
 fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
     if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {
@@ -94,7 +95,7 @@ fn halves(tensor: &Tensor) -> Option<Vec<f16>> {
 mod tests {
     use super::*;
 
-    /// Returns a tensor of distinct values between −`scale`/2 and `scale`/2.
+    /// Returns a tensor of the shape `shape` with distinct values between −`scale`/2 and `scale`/2.
     fn tensor(shape: &[usize], scale: f32) -> Tensor {
         let count: usize = shape.iter().product();
         let data = (0..count).map(|i| scale * ((i as f32 * 0.618_034).fract() - 0.5)).collect();

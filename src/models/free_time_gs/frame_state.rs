@@ -20,13 +20,15 @@ use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Motion model of FreeTimeGS: straight lines and a temporal window. The further parameters of a Gaussian
-/// ([`StoredParams::format_specific`]) are those of [`crate::files::ftgs`].
+/// Motion model of FreeTimeGS: straight lines and a temporal window. The parameters in
+/// [`StoredParams::format_specific`] are described in [`crate::files::ftgs`].
 #[derive(Debug, Clone)]
 pub(in crate::models) struct FreeTime {
-    /// Frames. Stored times, durations and velocities are in the unit of time of [`ClipTimes`], from 0 to 1.
+    /// Conversion from the times of frames to the time unit of the stored parameters, in which the clip lasts from 0 to
+    /// 1.
     pub(in crate::models) clip: ClipTimes,
-    /// Minimum standard deviation in time, and a value that is then added to it.
+    /// Two values in the time unit of the stored parameters: the minimum of the standard deviation in time, and the
+    /// value that is added to it after that.
     pub(in crate::models) deviation_floor: [f64; 2],
     /// Minimum opacity of a Gaussian at any time.
     pub(in crate::models) min_opacity: f64,
@@ -46,22 +48,24 @@ impl FreeTime {
     pub(in crate::models) const TRAINED: FreeTime =
         FreeTime { clip: ClipTimes::UNIT_INTERVAL, deviation_floor: [0.02, 1e-8], min_opacity: 1e-4 };
 
-    /// Returns the standard deviation s in time that belongs to a stored duration (its logarithm).
+    /// Returns the standard deviation s in time of a Gaussian. `duration` is the stored parameter, the logarithm of a
+    /// duration.
     fn deviation(&self, duration: f32) -> f64 {
         f64::from(duration).exp().max(self.deviation_floor[0]) + self.deviation_floor[1]
     }
 
-    /// Returns 1/(2s²), where s is the standard deviation in time that belongs to a stored duration.
+    /// Returns 1/(2s²), where s is the standard deviation in time of a Gaussian with the stored parameter `duration`.
     fn rate(&self, duration: f32) -> f64 {
         0.5 / self.deviation(duration).powi(2)
     }
 
-    /// Returns the opacity logit that belongs to the minimum opacity of a Gaussian.
+    /// Returns the logit of the minimum opacity of a Gaussian.
     fn min_logit(&self) -> f64 {
         (self.min_opacity / (1.0 - self.min_opacity)).ln()
     }
 
-    /// Returns the stored parameters `raw` with durations that need no minimum.
+    /// Returns the stored parameters `raw`, where each duration is replaced by the logarithm of the standard deviation
+    /// that this motion model uses. A reader of the result must not apply the minimum again.
     pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
         let mut raw = raw.clone();
         let durations = raw.format_specific.plane_mut(LOG_DEVIATION).iter_mut();

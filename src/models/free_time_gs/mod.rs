@@ -26,7 +26,7 @@ use frame_state::FreeTime;
 /// Name of the subfolder of a result folder that holds the checkpoints.
 const CHECKPOINT_FOLDER: &str = "ckpts";
 
-/// gsplat checkpoint, or the result folder of a training.
+/// Model format of gsplat checkpoints: recognizes and opens a checkpoint, or the result folder of a training.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),

@@ -56,11 +56,11 @@ impl LinearPath {
     }
 }
 
-/// Path, window and shape of a proxy that were matched to its members over the sampled frames.
+/// Path, temporal window and shape of a proxy, matched to its members (merged Gaussians) over the sampled frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
-    /// Path and temporal window of the proxy: the mean of those of its members (merged Gaussians) with the weights of
-    /// the cluster, see [`LinearPath::blended`].
+    /// Path and temporal window of the proxy: the weighted mean of the paths and windows of its members (merged
+    /// Gaussians), with the weights of the cluster. See [`LinearPath::blended`].
     pub(in crate::models) line: LinearPath,
     /// Opacity logit at the center of the window, and spatial covariance (xx xy xz yy yz zz). `None` if the proxy is
     /// visible at no sampled frame.

@@ -50,7 +50,7 @@ pub(super) trait ProxyRule: MotionModel {
     where
         Self: Sized;
 
-    /// Adds those settings to `hash` that determine the states of Gaussians but are not stored in the checkpoint.
+    /// Adds to `hash` the settings that determine the states of Gaussians but are not stored in the checkpoint.
     fn hash_settings(&self, hash: &mut Xxh3);
 
     /// Returns the motion model to use for frames at `times`; `None` if it does not depend on the times.
@@ -62,8 +62,8 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Returns the Gaussians `raw` in a form that files of players store without a fit; `None` if their motion has
-    /// another form.
+    /// Returns the Gaussians `raw` in the form in which player files (`.ftgs.ply`, `.tsog`) store motion, so that no
+    /// curves have to be fitted. Returns `None` if their motion does not have this form.
     fn timed(&self, raw: &StoredParams) -> Option<TimedGaussians> {
         let _ = raw;
         None
@@ -322,8 +322,8 @@ pub(super) fn write_frames<L: ProxyRule>(
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store the
-/// motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
+/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store
+/// the motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.
@@ -345,7 +345,7 @@ fn is_small(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= MAX_COPIED_BYTES)
 }
 
-/// Returns the paths of the small YAML files in the folder `root`, sorted by name.
+/// Returns the paths of the YAML files of at most [`MAX_COPIED_BYTES`] bytes in the folder `root`, sorted by name.
 pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     let is_small_yaml = |path: &Path| {
         path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)

@@ -30,8 +30,8 @@ impl RowElement {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Returns the meaning of `count` consecutive values in a tensor's row: the parameters in [`StoredParams::format_specific`],
-    /// from index `first` on.
+    /// Describes `count` consecutive values in a tensor's row that are format-specific parameters: value k is the
+    /// parameter with index `first` + k in [`StoredParams::format_specific`].
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }

@@ -13,7 +13,8 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
 /// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
-/// Bytes of memory per Gaussian of a frame for the list of its rows, and for a copy of this list for sorting.
+/// Bytes of memory per Gaussian of a frame for its entry (track and row) in a list, and for a copy of this list for
+/// sorting.
 const BYTES_PER_ROW: u64 = 16;
 /// Number of frames of which renders are compared before and after tracks are joined or attributes are made constant.
 pub(super) const SAMPLED_FRAMES: usize = 3;
@@ -50,7 +51,8 @@ impl Sizes {
         self.frame_gaussians * self.file()
     }
 
-    /// Returns the number of frames that are packed into the container together; whole tiles if frames are small.
+    /// Returns the number of frames that are packed into the container at a time: the number that fits into
+    /// [`TOGETHER_BYTES`], at least 1, at most the frames of a tile.
     pub(super) fn frame_block(&self) -> usize {
         (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }
@@ -67,7 +69,7 @@ impl Sizes {
     }
 
     /// Returns the bytes of memory that linking takes: a frame and its compared attributes, the tracks that may
-    /// continue, and for every track its first row and its last state.
+    /// continue, and for every track the row of its first frame and its last state.
     fn linking(&self) -> u64 {
         let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;
         let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_OPEN_TRACK) as u64;
@@ -75,9 +77,10 @@ impl Sizes {
         self.frame_gaussians * of_frame + self.live_tracks * of_living + self.linked * of_track
     }
 
-    /// Returns the bytes of memory for making attributes constant, the maximum of two steps. Computing means takes sums
+    /// Returns the bytes of memory for making attributes constant: the larger of two steps. Computing means takes sums
     /// for a batch of tracks and one frame per thread. Rendering takes the sampled frames before and after the change,
-    /// and their renders. Joining tracks needs as much for frames and less for tracks.
+    /// and their renders. Joining tracks reads as many frames as computing means and needs less per track, so it is
+    /// covered.
     fn holding(&self) -> u64 {
         let threads = rayon::current_num_threads() as u64;
         let sums = self.linked.min(BATCH as u64) * TrackSums::bytes(self.sh_degree);

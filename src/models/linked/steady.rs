@@ -77,7 +77,8 @@ impl Steady {
         Ok(Steady { columns, means: means.finish()?, sh_degree })
     }
 
-    /// Returns the fraction of tracks whose colors are constant, and the same for scales, rotations and opacities.
+    /// Returns four fractions of all tracks: of the tracks with constant colors, with constant scales, with constant
+    /// rotations, and with constant opacities.
     pub(super) fn parts(&self) -> [f64; 4] {
         [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
@@ -173,7 +174,7 @@ impl TrackSums {
         self.opacity.len()
     }
 
-    /// Adds the Gaussian in row `at` of `state` as the state of `track` in one frame.
+    /// Adds the Gaussian in row `at` of `state` to the sums of `track`, as its state in one frame.
     pub(super) fn add(&mut self, track: usize, state: &Gaussians, at: usize) {
         let [logit] = state.opacity_logit.row(at);
         let alpha = 1.0 / (1.0 + (-f64::from(logit)).exp());

@@ -383,7 +383,8 @@ impl FrameSource for FrameBlock<'_> {
 }
 
 impl FrameBlock<'_> {
-    /// Writes to `state` the states that the tracks of `range` have just before the first frame of the block.
+    /// Writes to `state` the states that the tracks of `range` have just before the first frame of this block of
+    /// frames.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -413,7 +414,7 @@ struct TrackReader<'a> {
     range: Range<usize>,
     /// Next frame of the block that is to be applied to `state`.
     next: usize,
-    /// Constant attributes of the tracks of `range`, with their values.
+    /// Values of the attributes that were made constant along the tracks of `range`; `None` if there are none.
     means: Option<HeldMeans>,
     state: Gaussians,
     part: Gaussians,

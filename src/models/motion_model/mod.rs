@@ -24,7 +24,8 @@ pub(super) use proxies::propose_proxies;
 /// Computes the states of Gaussians at any time from their stored parameters. States are in stored encoding (see
 /// [`Gaussians`]).
 pub(super) trait MotionModel: Debug + Send + Sync {
-    /// Values of some Gaussians that do not depend on time and are computed once.
+    /// Values of a block of Gaussians that do not depend on time. They are computed once, by [`MotionModel::prepare`],
+    /// and used for every frame.
     type Prepared: Send + Sync;
 
     /// Computes the values that do not depend on time from the stored parameters `raw`.
@@ -225,7 +226,8 @@ impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
     }
 }
 
-/// Up to [`GAUSSIANS_PER_BLOCK`] Gaussians, with the values that do not depend on time.
+/// Block of up to [`GAUSSIANS_PER_BLOCK`] Gaussians: their stored parameters, and the values prepared from them that do
+/// not depend on time.
 struct PreparedBlock<L: MotionModel> {
     raw: StoredParams,
     prepared: L::Prepared,

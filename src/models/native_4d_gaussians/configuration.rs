@@ -15,7 +15,7 @@ pub(super) struct TrainingConfig {
     pub(super) source_path: Option<String>,
     /// Whether the background of the training images is white; else it is black.
     pub(super) white_background: bool,
-    /// Variance in time that the training added to that of each Gaussian, Σ_tt (`prefilter_var`).
+    /// Variance in time (`prefilter_var`) that the training added to the temporal variance Σ_tt of each Gaussian.
     pub(super) prefilter: f64,
     /// Period L after which colors repeat, in the model's time unit, and the name of the file that gives it.
     pub(super) time_duration: Option<(f64, String)>,

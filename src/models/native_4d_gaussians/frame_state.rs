@@ -42,7 +42,8 @@ pub(super) struct Native {
     pub(super) has_4d_rotation: bool,
     /// Whether the order of rows and columns of the 4D rotation matrix is reversed, as since 15 September 2024.
     pub(super) flipped: bool,
-    /// Variance that is added to the variance in time Σ_tt in the temporal marginal.
+    /// Variance that is added to the temporal variance Σ_tt of a Gaussian when its temporal marginal (factor of the
+    /// opacity) is computed.
     pub(super) prefilter: f64,
     /// Number of time-dependent SH terms in use, from 0 to 2.
     pub(super) terms: usize,
@@ -52,7 +53,7 @@ pub(super) struct Native {
     pub(super) period: f64,
 }
 
-/// Values of some Gaussians that do not depend on time.
+/// Values of a block of Gaussians that do not depend on time. They are computed once and used for every frame.
 #[derive(Debug)]
 pub(super) struct Slices {
     /// Velocity of each Gaussian, axis by axis, in scene units per unit of time.
@@ -70,7 +71,7 @@ pub(super) struct Slices {
 /// Velocity, variance in time and spatial covariance of one four-dimensional Gaussian.
 pub(super) struct Slice {
     pub(super) velocity: [f64; 3],
-    /// Variance in time, Σ_tt, without `prefilter`.
+    /// Variance in time, Σ_tt, before the constant `prefilter` is added.
     pub(super) variance: f64,
     /// Spatial covariance Σ: xx xy xz yy yz zz; `None` if it follows from the stored scales and rotation.
     pub(super) covariance: Option<[f64; 6]>,

@@ -120,8 +120,8 @@ fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
     }
 }
 
-/// Returns the motion model of a 4D capture with the values `parts`. At most `stored_terms` time-dependent SH terms are
-/// in use.
+/// Returns the motion model of a 4D model. `parts` are the values of its capture tuple, the training state in the
+/// checkpoint. At most `stored_terms` time-dependent SH terms are in use.
 fn motion_model(
     checkpoint: &Checkpoint,
     parts: &[NodeId],
@@ -149,7 +149,8 @@ fn motion_model(
     })
 }
 
-/// Returns the values of a capture that only the training reads: statistics, and the tensors of the optimizer.
+/// Returns the values of a capture tuple (training state in the checkpoint) that only the training reads: statistics,
+/// and the tensors of the optimizer. `parts` are all values of the tuple.
 fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId> {
     let (optimizer, statistics) = if is_4d { (11, 7..11) } else { (10, 7..10) };
     let mut nodes: Vec<NodeId> = parts[statistics].to_vec();
@@ -160,7 +161,8 @@ fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId>
     nodes
 }
 
-/// Returns the place of value `i` of a capture, called `name`, for error messages.
+/// Returns the place of value `i` of a capture tuple (training state in the checkpoint), called `name`, for error
+/// messages.
 fn place(i: usize, name: &str) -> String {
     format!("capture[{i}] ({name})")
 }

@@ -15,8 +15,8 @@ use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Ridge term of the fit, as a fraction of the total weight of the frames. It keeps the coefficients of waves near 0 if
-/// the frames do not distinguish the waves from the constant.
+/// Ridge term of the fit of colors along time, as a fraction of the total weight of the frames. It keeps the
+/// coefficients of the cosine terms near 0 if the frames do not distinguish these terms from the constant term.
 const RIDGE: f64 = 1e-3;
 
 /// Returns the stored parameters of the proxies of `clusters`, one row each.
@@ -107,8 +107,8 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Returns, for each fitted value (one SH coefficient of one color channel over time), the least-squares coefficients of the
-    /// constant and of the first `terms` cosine waves; the other coefficients are 0.
+    /// Returns, for each fitted value (one SH coefficient of one color channel over time), the least-squares
+    /// coefficients of the constant and of the first `terms` cosine waves; the other coefficients are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];

@@ -40,7 +40,8 @@ pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
     if flipped { reversed(&whole) } else { whole }
 }
 
-/// Returns the left and the right unit quaternion of the rotation `matrix`, which must have determinant 1.
+/// Returns the left and the right unit quaternion of the 4D rotation `matrix`, which must have determinant 1. `flipped`
+/// states that the order of rows and columns of `matrix` is reversed, as in checkpoints since 15 September 2024.
 pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     let matrix = if flipped { reversed(matrix) } else { *matrix };
     let axis = |i: usize| {

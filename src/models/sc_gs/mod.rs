@@ -25,7 +25,8 @@ use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
 
-/// Model folder of SC-GS. A key of its configuration, or its nodes, distinguish it from Deformable-3D-Gaussians.
+/// Model format of SC-GS: recognizes and opens a model folder. A key of its configuration, or control nodes among its
+/// tensors, distinguish it from Deformable-3D-Gaussians.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let typed = || {

@@ -189,8 +189,9 @@ fn own_property_names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Replaces the colors in `raw` by SH coefficients of degree 0. With `activation`, a color is `activation` of the first
-/// three features. Without, it is the stored color, which the PLY reader put where a coefficient would be.
+/// Replaces the colors in `raw` by SH coefficients of degree 0. With `activation`, a color is `activation` applied to
+/// the first three features. Without it, `raw` holds stored colors in place of SH coefficients, and these are
+/// converted.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.format_specific.width() > FEATURES;

@@ -1,8 +1,8 @@
 //! Computes the states of Gaussians at a time from the stored parameters of a SpacetimeGaussians model.
 //!
 //! [`StoredParams::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH
-//! of degree 0. [`StoredParams::format_specific`] holds the other parameters, at the indices that the constants of this module
-//! give.
+//! of degree 0. [`StoredParams::format_specific`] holds the other parameters, at the indices that the constants of this
+//! module give.
 
 use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
@@ -15,14 +15,15 @@ use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 pub(super) const CENTER: usize = 0;
 /// Index in [`StoredParams::format_specific`] of the natural logarithm of the width of the temporal window.
 pub(super) const LOG_WIDTH: usize = 1;
-/// First of nine indices in [`StoredParams::format_specific`]: coefficients of dt, dt², dt³ of the position, each for x, y, z.
+/// First of nine indices in [`StoredParams::format_specific`]: coefficients of dt, dt², dt³ of the position, each for
+/// x, y, z.
 pub(super) const MOTION: usize = 2;
 /// First of four indices in [`StoredParams::format_specific`]: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
 /// Number of parameters in [`StoredParams::format_specific`] that both the lite and the full model have.
 pub(super) const WIDTH: usize = 15;
-/// First of six indices in [`StoredParams::format_specific`] of the full model: features that are constant in time. The first three
-/// are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
+/// First of six indices in [`StoredParams::format_specific`] of the full model: features that are constant in time. The
+/// first three are a color before the last function ([`ColorActivation`](super::decoder::ColorActivation)) is applied.
 pub(super) const FEATURES: usize = 15;
 /// First of three indices in [`StoredParams::format_specific`] of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
@@ -67,7 +68,7 @@ pub(super) struct Spacetime {
     pub(super) decoder: Option<ColorDecoder>,
 }
 
-/// Values of some Gaussians that do not depend on time.
+/// Values of a block of Gaussians that do not depend on time. They are computed once and used for every frame.
 #[derive(Debug)]
 pub(super) struct PreparedGaussian {
     /// For each Gaussian 1 / width², where width is the width of its temporal window.
@@ -101,8 +102,8 @@ impl MotionModel for Spacetime {
         Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY
     }
 
-    /// Returns the attributes that the optimizer can change: all, but for the full model without colors. Those are
-    /// computed from features, so no derivative leads to them.
+    /// Returns the attributes that the optimizer can change. These are all attributes for the lite model, and all but
+    /// the colors for the full model, because its colors are computed from features and have no derivatives.
     fn movable(&self) -> Attributes {
         if self.is_full { Attributes::all().difference(Attributes::SH) } else { Attributes::all() }
     }

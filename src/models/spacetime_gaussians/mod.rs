@@ -58,7 +58,7 @@ const CFG_ARGS: &str = "cfg_args";
 /// Name of the camera file of the model folder, which is copied to the output if it exists.
 const CAMERAS: &str = "cameras.json";
 
-/// Model folder of SpacetimeGaussians, or its PLY file.
+/// Model format of SpacetimeGaussians: recognizes and opens a model folder, or its PLY file.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None)

@@ -94,8 +94,9 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     (center, longest + 0.5 * squared.ln())
 }
 
-/// Returns the weighted mean of motions that have the same center. Its state at any time is the weighted mean of their
-/// states, where quaternions have the sign of that of the heaviest member. `None` without members.
+/// Returns the weighted mean of motions that have the same center. Its state at any time is the weighted mean of the
+/// states of all `members`. Before the mean is taken, each quaternion gets the sign that brings it nearer to the
+/// quaternion of the member with the largest weight. Returns `None` without members.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);
@@ -112,13 +113,14 @@ pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion
     Some(SpacetimeMotion { path, rotation, omega, ..heaviest })
 }
 
-/// State at one time that a fitted motion should approximate.
+/// State at one time that a fitted motion should approximate, with its weight in the least-squares fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TargetState {
     pub(super) time: f64,
     pub(super) weight: f64,
     pub(super) position: [f64; 3],
-    /// Quaternion wxyz; the caller chooses its sign.
+    /// Rotation at this time, quaternion wxyz. q and −q are the same rotation but are fitted differently; the caller
+    /// chooses the sign that is nearest to the mean motion.
     pub(super) rotation: [f64; 4],
 }
 

@@ -181,8 +181,8 @@ fn target_states(
     members.model.info().times.iter().filter_map(of_time).collect()
 }
 
-/// Returns the natural logarithms of the scales of the proxy, and sets the rotation of `motion` to the axes along which these
-/// scales are measured.
+/// Returns the natural logarithms of the scales of the proxy, and sets the rotation of `motion` to the axes along which
+/// these scales are measured.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {

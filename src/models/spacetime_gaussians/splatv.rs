@@ -46,7 +46,8 @@ const MIN_LENGTH: f64 = 1e-7;
 /// and so wide that the window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
 const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
-/// Compressed SpacetimeGaussians lite model for web players (`.splatv`).
+/// Model format of `.splatv` files, which hold a compressed SpacetimeGaussians lite model for web players: recognizes
+/// and opens a file.
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
@@ -127,8 +128,9 @@ fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
     }
 }
 
-/// Writes `raw` to the `.splatv` file `path`. `known` returns the exact color of a Gaussian if it has one. The cameras
-/// are those of the 3DGS camera list `cameras`, or else one camera that sees most of the Gaussians.
+/// Writes the Gaussians `raw` to the `.splatv` file `path`. `known` returns the exact color of the Gaussian with the
+/// given index; if it returns `None`, the color follows from `raw`. The cameras are those of the 3DGS camera list
+/// `cameras`, or else one camera that sees most of the Gaussians.
 ///
 /// # Errors
 /// Fails if half precision cannot hold the values or a write fails.

@@ -15,7 +15,7 @@ use crate::recipe::MergeParams;
 /// Index in [`StoredParams::format_specific`] of the frame in which a Gaussian is visible.
 const FRAME: usize = 0;
 
-/// Motion model of single frames.
+/// Motion model in which each Gaussian is visible in a single frame and does not move.
 #[derive(Debug, Clone)]
 pub(super) struct FrameByFrame {
     /// Times of the frames, increasing.
@@ -24,7 +24,9 @@ pub(super) struct FrameByFrame {
 }
 
 impl FrameByFrame {
-    /// Creates the motion model of `frames` frames, evenly spaced between the times of `clip`.
+    /// Creates the motion model of `frames` frames, whose times are evenly spaced from the first time of `clip`. The
+    /// last frame is at the last time of `clip`; but if `clip` is the range from 0 to 1, frame i of n is at the time
+    /// i/n.
     pub(super) fn new(frames: usize, clip: ClipTimes) -> FrameByFrame {
         let is_mapped = (clip.first, clip.last) != (0.0, 1.0);
         // Frames of a converted sequence reach its last time. Without it, frame i of n begins at i/n.

@@ -15,7 +15,7 @@ use crate::outputs::kind::OutputKind;
 /// Smallest standard deviation of a time window, so that no 0/0 arises.
 pub(super) const SMALLEST_DEVIATION: f64 = 1e-9;
 
-/// File of ftgs-player with linear motion in time windows.
+/// Model format of `.ftgs.ply` files of ftgs-player, with linear motion in time windows: recognizes and opens a file.
 pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply") && has_marker(found.path),
     open: |path, options| {

@@ -35,7 +35,7 @@ pub(super) use tsog::TSOG;
 const NO_TSOG: &str = "a .tsog holds compressed images, which an archive cannot make smaller\n  write a .tsog, or convert \
                        the input to a .ftgs.ply and make the archive of that";
 
-/// Opened file of a player, whose Gaussians move as `L` says.
+/// Opened file of a player. The motion model `L` computes the states of its Gaussians.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
@@ -43,7 +43,7 @@ struct WindowedModel<L: ProxyRule> {
     name: &'static str,
     /// Kind of output that has the format of this file.
     own: OutputKind,
-    /// Whether frames can be at any time.
+    /// Origin of the time stamps of frames: whether frames can be at any time.
     timing: TimeOrigin,
     /// Repairs and guesses made while opening.
     notes: Vec<String>,

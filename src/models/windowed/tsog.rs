@@ -15,7 +15,8 @@ use crate::models::input_model::{InputModel, ModelFormat, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
 use crate::outputs::kind::OutputKind;
 
-/// File of web players with linear motion in time windows, with single frames, or with a still.
+/// Model format of `.tsog` files of web players: recognizes and opens a file with linear motion in time windows, with
+/// single frames, or with a model without motion.
 pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
     recognizes: |found| !found.is_folder && is_named_or_zip(found.path, &found.head),
     open: |path, options| {
@@ -52,7 +53,8 @@ fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
     is_named || (head.starts_with(b"PK\x03\x04") && is_tsog(path))
 }
 
-/// Returns the opened file at `path`, whose frames `model` computes.
+/// Returns the opened `.tsog` file at `path`, whose frames `model` computes. `timing` states whether frames can be at
+/// any time.
 fn opened<L: ProxyRule + 'static>(
     path: &Path,
     timing: TimeOrigin,

@@ -25,7 +25,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let scan = &planning.request.recipe.scan;
     if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
         let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-        let visible = VisibilityStage { recipe: scan.clone() };
+        let visible = VisibilityStage { recipe: scan.clone(), is_preliminary: false };
         stages.leave_out_stage("visible coverage", why, move |work, limits| visible.resource_estimate(work, limits));
     }
     stages.add(Phase::Rank, MeasureStages::from_planning(planning));
@@ -52,6 +52,9 @@ impl MeasureStages {
             && planning.target.is_some()
             && planning.prunes_by_views()
             && Rounds::from_recipe(&recipe.select, planning.target_fraction()).is_some();
+        if let Some(visible) = &mut measure.visible {
+            visible.is_preliminary = measure.scan.can_be_partial;
+        }
         measure
     }
 

@@ -261,7 +261,8 @@ struct Trial<'a> {
     work: &'a Cache,
     /// Maximum number of pairs whose motion is measured at the same time.
     pairs_together: usize,
-    /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is tried.
+    /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is
+    /// tried.
     known: SimilarityCache,
     /// Progress of the stage: one unit per set of survivors on which merging was tried.
     progress: &'a Progress,
@@ -381,7 +382,8 @@ fn measure(
     })
 }
 
-/// Returns the compressed model made of the merged groups in `merged`, with the counts of the passes.
+/// Returns the compressed model of the survivors, in which proxies replace the groups in `merged`, with a summary of
+/// how many Gaussians each merge pass joined.
 fn outcome(
     survivors: &Survivors<'_>,
     merged: &MergeResult,

@@ -30,8 +30,8 @@ const PARTIAL_FRAMES: usize = 24;
 pub struct ScanStage {
     /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
-    /// Whether the statistics of motion and opacity (D, κ and V) decide nothing in this run. If a deformation field also
-    /// gives the frames, few of them are read: its values change smoothly with time.
+    /// Whether the statistics of motion and opacity (D, κ and V) decide nothing in this run. If a deformation field
+    /// also gives the frames, few of them are read: its values change smoothly with time.
     pub can_be_partial: bool,
 }
 
@@ -74,12 +74,12 @@ impl ScanStage {
     /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         let (source, info) = (scene.source(), scene.source().info());
-        let is_deformed = source.deformation().is_some();
-        let frames_read = self.frames_read(info.times.len(), is_deformed);
-        let with_views: Vec<usize> =
-            (0..).zip(scene.schedule.iter()).filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect();
-        let frames = evenly_spaced(&with_views, frames_read);
-        if frames.is_empty() || frames_read == info.times.len() {
+        let frames_read = self.frames_read(info.times.len(), source.deformation().is_some());
+        let frames = match frames_read < info.times.len() {
+            true => evenly_spaced(&frames_with_views(&scene.schedule), frames_read),
+            false => Vec::new(),
+        };
+        if frames.is_empty() {
             let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
             return self.scan_frames(scene, source, &scene.schedule, &plan, journal);
         }
@@ -121,6 +121,11 @@ impl ScanStage {
             Ok((found, info.count))
         })
     }
+}
+
+/// Returns the frames of `schedule` that have views, increasing.
+fn frames_with_views(schedule: &ViewSchedule) -> Vec<usize> {
+    (0..).zip(schedule.iter()).filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect()
 }
 
 /// Returns at most `count` of the frames `frames`, evenly spaced, the first and the last among them.

@@ -127,6 +127,13 @@ function overview() {
     return { size: [800, 600], focal: [800, 800], principal: [400, 300], near: 0.01 * stage.extent, rotation: [right, down, ahead], eye };
 }
 
+/// Returns whether no training camera, and no path between two of them, sees the scene from the direction of the camera.
+function isOutside() {
+    if (!stage.rig) return false;
+    const direction = unit(plus(camera.eye, stage.rig.focus, -1));
+    return stage.rig.faces.some((face) => dot(face, direction) < -stage.rig.tolerance);
+}
+
 /// Turns the camera around the focus.
 function turn(axis, angle) {
     const c = Math.cos(angle), s = Math.sin(angle), along = (v) => dot(axis, v) * (1 - c);
@@ -213,6 +220,7 @@ async function refresh() {
         draw();
         await painter.finished();
         el("poster")?.remove();
+        el("outside").hidden = !isOutside();
         rate();
         if (!isDirty && !playing && arrivals()) {
             isDirty = false;

@@ -1,5 +1,4 @@
-//! Tests that every failure mode is flagged in a scene with the corresponding damage, and in no scene with another
-//! damage.
+//! Tests that damage to one kind of Gaussian flags the failure mode of this kind, and no other failure mode.
 
 use glam::DVec3;
 
@@ -39,7 +38,7 @@ fn looked() -> Looked {
 }
 
 impl Looked {
-    /// Returns the fraction of the visible Gaussians of a body (object of the test scene) that belong to a kind.
+    /// Returns the fraction of the visible Gaussians of the object `body` (of the test scene) that belong to `kind`.
     fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
         let members: Vec<usize> = self.made.body_ids(body).filter(|&i| rows.c[i] > 0.0).collect();
@@ -47,7 +46,7 @@ impl Looked {
         with as f64 / members.len().max(1) as f64
     }
 
-    /// Returns the failure modes that are found in a result without the Gaussians for which `lost` is true.
+    /// Returns the failure modes of a compressed model that lacks the Gaussians for which `lost` is true.
     fn without(&self, lost: impl Fn(usize) -> bool) -> [FailureMode; 3] {
         let rig = self.made.rig();
         let all: Vec<u32> = (0..self.traits.len() as u32).collect();

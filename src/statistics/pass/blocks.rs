@@ -33,7 +33,7 @@ impl<'a> BlockScans<'a> {
         self.source.info().times.len()
     }
 
-    /// Returns the ids of the Gaussians of block `block`, counted from the first block to scan.
+    /// Returns the ids of the Gaussians of block number `block`, where 0 is the first block to scan.
     pub(crate) fn range(&self, block: usize) -> Range<usize> {
         let block = self.blocks.start + block;
         block * GAUSSIANS_PER_BLOCK..self.source.info().count.min((block + 1) * GAUSSIANS_PER_BLOCK)

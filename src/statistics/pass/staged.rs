@@ -22,7 +22,8 @@ use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
-/// Maximum number of units in a lane whose bytes have been fetched and that wait to be decoded.
+/// Maximum number of units of work per lane (a decoding thread and an accumulating thread) whose bytes have been
+/// fetched and that wait to be decoded.
 const FETCHED: usize = 4;
 
 /// Unit of work: a block of Gaussians at the frames of one frame block.
@@ -71,8 +72,8 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
     }
 }
 
-/// Fetches the bytes of every unit of work into the system's file cache and sends the unit to its lane. Stops when a
-/// lane has ended.
+/// Fetches the bytes of every unit of work into the system's file cache and sends the unit to its lane (the decoding
+/// thread and the accumulating thread that process it). Stops when a lane has ended.
 fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>>) {
     let frame_block = ahead.frame_block().max(1);
     for first in (0..scan.blocks()).step_by(to_lanes.len().max(1)) {
@@ -88,8 +89,8 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
     }
 }
 
-/// Decodes the units that a lane receives. Uses a reader again that the accumulating thread returned, if it reads the
-/// same block of Gaussians.
+/// Decodes the units of work that a lane receives. Reuses a reader that the accumulating thread of the lane returned,
+/// if that reader reads the same block of Gaussians.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,
@@ -110,7 +111,8 @@ fn decode<'a>(
     }
 }
 
-/// Adds the frames of the units that a lane receives to the statistics, and returns the readers to the decoding thread.
+/// Adds the frames of the decoded units of work that a lane receives to the statistics, and returns the readers to the
+/// decoding thread of the lane.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,

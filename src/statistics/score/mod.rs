@@ -142,7 +142,7 @@ pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, r
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// Sum of normalized terms that is being computed.
+/// State of the computation of one score, a weighted sum of normalized quantities.
 struct Summation<'a> {
     is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,

@@ -50,8 +50,8 @@ impl FloatSketch {
     }
 
     /// Returns the `p`-th percentile (`p` from 0 to 100) by nearest rank: the value of rank ⌈p·n/100⌉, at least 1,
-    /// among the n finite values; `None` if n = 0. `values` must be the values that were counted. Those of one bucket
-    /// are copied; these may be all values.
+    /// among the n finite values; `None` if n = 0. `values` must be the values that were counted. The values of one
+    /// bucket are copied; in the worst case, all values lie in it.
     pub fn percentile(&self, p: f64, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let (bucket, rank) = self.locate(p)?;
         let mut inside: Vec<f64> =

@@ -1,4 +1,4 @@
-//! Tests of `render --video`: films against single renders of the same frames.
+//! Tests of `render --video`: frames of a film are compared with single renders of the same frames.
 
 use std::env;
 use std::fs::{self, File};
@@ -9,7 +9,7 @@ use assert_cmd::Command;
 
 use super::{FRAMES, SIZE, done, files, refused, run, scene};
 
-/// Animated PNG.
+/// Decoded animated PNG.
 struct Apng {
     /// RGB bytes of every frame.
     frames: Vec<Vec<u8>>,
@@ -34,7 +34,7 @@ fn apng(path: &Path) -> Apng {
     Apng { frames, size, delays }
 }
 
-/// Returns the RGB bytes of the render of `input` at `frame` from `view`.
+/// Renders `input` at the frame `frame` from the view `view` and returns the RGB bytes of the image.
 fn single_render(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
     done(
         folder,
@@ -47,7 +47,7 @@ fn single_render(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8>
     pixels
 }
 
-/// Joins the rows of two images side by side.
+/// Joins the RGB bytes of two images, so that they stand side by side.
 fn side_by_side(left: &[u8], right: &[u8]) -> Vec<u8> {
     left.chunks(3 * SIZE.0).zip(right.chunks(3 * SIZE.0)).flat_map(|rows| [rows.0, rows.1].concat()).collect()
 }
@@ -150,7 +150,7 @@ fn impossible_films_are_refused_and_leave_no_files() {
     }
 }
 
-/// Returns a folder with a program `ffmpeg` that runs `script`.
+/// Returns a folder with a program named `ffmpeg` that runs the shell script `script`.
 #[cfg(unix)]
 fn encoder(script: &str) -> tempfile::TempDir {
     use std::os::unix::fs::PermissionsExt;
@@ -162,7 +162,8 @@ fn encoder(script: &str) -> tempfile::TempDir {
     folder
 }
 
-/// Runs `line` with the folder `programs` first in PATH, or alone in it. Returns the exit code and the standard error.
+/// Runs the program with the arguments `line`. PATH begins with the folder `programs`, or has only this folder
+/// (`alone`). Returns the exit code and the standard error.
 #[cfg(unix)]
 fn run_with_programs(programs: &Path, alone: bool, at: &Path, line: &str) -> (i32, String) {
     let others = env::var_os("PATH").filter(|_| !alone).unwrap_or_default();

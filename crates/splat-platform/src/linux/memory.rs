@@ -63,7 +63,8 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
 
 /// Mount of a hierarchy of control groups, or of a part of one, in the file system.
 struct Mount {
-    /// Path of the mounted part within the hierarchy of control groups.
+    /// Path, within the hierarchy of control groups, of the group whose folder is mounted; `/` if the whole hierarchy
+    /// is mounted.
     root: PathBuf,
     /// Folder at which the hierarchy is mounted.
     point: PathBuf,
@@ -88,7 +89,7 @@ impl Mount {
     }
 
     /// Returns the folder of the control group `path` in the file system, or the mount point if the group is outside
-    /// the mounted part.
+    /// the mounted part of the hierarchy.
     fn folder_of(&self, path: &str) -> PathBuf {
         let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
         // With `..`, the path is relative to the root of a control group namespace that does not contain this process.
@@ -124,10 +125,11 @@ pub fn reset_peak_memory() -> bool {
     fs::write("/proc/self/clear_refs", "5").is_ok()
 }
 
-/// Makes the allocator return every freed block of 256 KiB or more to the system at once, so that the resident memory of
-/// this process is what it uses. By default, glibc keeps freed blocks of up to 32 MiB in the heaps of the threads that
-/// allocated them: the same run then took between 62 and 69 MiB, instead of 43 MiB. Costs up to 5% more processor time,
-/// because returned pages have to be cleared when they are used again. No effect with other allocators than that of glibc.
+/// Makes the allocator return every freed block of 256 KiB or more to the system at once, so that the resident memory
+/// of this process is what it uses. By default, glibc keeps freed blocks of up to 32 MiB in the heaps of the threads
+/// that allocated them: one run took between 62 and 69 MiB that way, and 43 MiB with this function. Costs up to 5% more
+/// processor time, because returned pages have to be cleared when they are used again. No effect with other allocators
+/// than that of glibc.
 pub fn return_freed_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `mallopt` only sets a parameter of the allocator. It may be called at any time.

@@ -27,7 +27,8 @@ use splat_core::{Attributes, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
 
-/// Number of Gaussians whose gradients one parallel task computes: a multiple of the block size of the projection.
+/// Number of Gaussians whose gradients one parallel task computes: a multiple of [`BLOCK`], the block size of the
+/// projection.
 const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian for a render and its gradient.
@@ -95,8 +96,8 @@ impl Renderer {
     }
 
     /// Computes the gradient sums of every splat from the derivative `pixel_gradient` of the loss with respect to
-    /// `image`; without `SHAPE` only those of its color. Tiles run in parallel, then splats; each splat adds the sums
-    /// of its tiles in a fixed order.
+    /// `image`. If `SHAPE` is false, computes only the sums of its color. Tiles run in parallel, then splats; each
+    /// splat adds the sums of its tiles in a fixed order.
     fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
         let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();

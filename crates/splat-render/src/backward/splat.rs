@@ -27,7 +27,8 @@ pub(super) fn add(
 ) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// Calls [`add_blocks`], compiled for AVX2. Operations are not fused, so results have the same bits.
+        /// Adds the gradients like [`add_blocks`], compiled for AVX2. Operations are not fused, so results have the
+        /// same bits as without AVX2.
         #[target_feature(enable = "avx2")]
         fn add_avx2(
             gaussians: &Gaussians,
@@ -38,7 +39,7 @@ pub(super) fn add(
         ) {
             add_blocks(gaussians, splats, sums, view, out);
         }
-        /// Calls [`add_blocks`], compiled for AVX-512. Results have the same bits.
+        /// Adds the gradients like [`add_blocks`], compiled for AVX-512. Results have the same bits as without AVX-512.
         #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
         fn add_avx512(
             gaussians: &Gaussians,
@@ -64,7 +65,7 @@ pub(super) fn add(
     add_blocks(gaussians, splats, sums, view, out);
 }
 
-/// Does the work of [`add`] in blocks of [`BLOCK`] Gaussians.
+/// Adds the gradients of the Gaussians of `splats` to `out` like [`add`], in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn add_blocks(
     gaussians: &Gaussians,
@@ -277,8 +278,9 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// Computes the gradient from the stored attributes and from the sums `first` = [x, y] and `second` = [xx, xy, yy]
-    /// of [`SplatSums`]. `q` is the quaternion (w, x, y, z).
+    /// Computes the gradient of one Gaussian from its stored attributes (`q` is the quaternion in the order w, x, y, z)
+    /// and from the gradient sums of its splat: `first` = [x, y] and `second` = [xx, xy, yy], the fields of
+    /// [`SplatSums`].
     #[inline(always)]
     fn new(
         position: [f64; 3],

@@ -7,18 +7,20 @@
 /// splat, x from the position of the largest alpha in the row of the pixel.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SplatSums<T> {
-    /// Σ p over the pixels.
+    /// Σ p over the pixels, where p = alpha · ∂L/∂alpha.
     pub(super) p: T,
-    /// Σ p·x and Σ p·y over the pixels.
+    /// Σ p·x and Σ p·y over the pixels, where p = alpha · ∂L/∂alpha and (x, y) is the offset of the pixel as defined at
+    /// [`SplatSums`].
     pub(super) first: [T; 2],
-    /// Σ p·x², Σ p·x·y and Σ p·y² over the pixels.
+    /// Σ p·x², Σ p·x·y and Σ p·y² over the pixels, where p = alpha · ∂L/∂alpha and (x, y) is the offset of the pixel as
+    /// defined at [`SplatSums`].
     pub(super) second: [T; 3],
     /// Σ weight · ∂L/∂pixel for each color channel, where weight = alpha · transmittance.
     pub(super) color: [T; 3],
 }
 
 impl SplatSums<f64> {
-    /// Adds the sums over the pixels of one tile.
+    /// Adds `tile`, the sums over the pixels of one tile.
     #[inline(always)]
     pub(super) fn add(&mut self, tile: &SplatSums<f32>) {
         self.p += f64::from(tile.p);

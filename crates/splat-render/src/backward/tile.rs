@@ -18,7 +18,7 @@ const MAX_UNCLAMPED_ALPHA: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 /// Gradients ∂L/∂pixel of the loss with respect to the pixels of a tile, and the color that comes from behind the
 /// splats processed so far.
 pub(super) struct PixelGradients {
-    /// ∂L/∂pixel, one plane per color channel.
+    /// Derivatives ∂L/∂pixel of the loss L, one plane per color channel.
     pixel: [TilePlane; 3],
     /// Scalar product of ∂L/∂pixel and the color that comes from behind the splats processed so far.
     rest: TilePlane,
@@ -47,7 +47,8 @@ impl PixelGradients {
     }
 }
 
-/// Computes the gradient sums of the splats of a tile; without `SHAPE` only those of their colors.
+/// Receiver of weights that computes the gradient sums of the splats of a tile. If `SHAPE` is false, it computes only
+/// the sums of their colors.
 pub(super) struct GradientSink<'a, const SHAPE: bool> {
     pub(super) gradients: PixelGradients,
     /// Gradient sums of each splat of the tile.

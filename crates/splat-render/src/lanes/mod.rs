@@ -60,9 +60,9 @@ const EXP2: [f32; 6] =
 pub(super) trait Lanes: Copy {
     /// Mask: one truth value per lane.
     type Mask: Copy;
-    /// Sums over groups, one for each of the eight lanes of a group.
+    /// Type of eight sums over groups: sum k adds lane k of every group.
     type Sums: Sums;
-    /// Sums over the groups with even index, and separately over those with odd index.
+    /// Type of two sets of eight sums over groups: one over the groups with even index, one over those with odd index.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
     /// Number of groups of eight lanes in a vector; a power of two.
     const GROUPS: usize;
@@ -83,13 +83,13 @@ pub(super) trait Lanes: Copy {
     /// Stores the vector to [`Lanes::GROUPS`] consecutive groups of `to` (arrays of eight values), the first of which
     /// has index `first`, a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
-    /// Returns the sum of each lane.
+    /// Returns the sum `self + other` in each lane.
     fn add(self, other: Self) -> Self;
-    /// Returns the difference of each lane.
+    /// Returns the difference `self − other` in each lane.
     fn sub(self, other: Self) -> Self;
-    /// Returns the product of each lane.
+    /// Returns the product `self · other` in each lane.
     fn mul(self, other: Self) -> Self;
-    /// Returns the quotient of each lane.
+    /// Returns the quotient `self / other` in each lane.
     fn div(self, other: Self) -> Self;
     /// Returns the smaller value of each lane; that of `other` if either is NaN.
     fn min(self, other: Self) -> Self;
@@ -119,8 +119,8 @@ pub(super) trait Lanes: Copy {
     /// Returns `self · 2ⁿ` in each lane, where the low bits of `rounded` hold n, as after adding [`ROUND`].
     fn scale(self, rounded: Self) -> Self;
 
-    /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; smaller results stay at or
-    /// below 2⁻¹²⁶.
+    /// Computes 2^x of each lane x ≤ 0. The relative error is below 1.6e-7 down to 2⁻¹²⁶; for smaller x, the result is
+    /// at most 2⁻¹²⁶.
     #[inline(always)]
     fn exp2(self) -> Self {
         let power = self.max(Self::splat(-126.0));
@@ -151,8 +151,8 @@ pub(super) trait EvenOddSums: Copy {
     fn combined(self) -> Self::Sums;
 }
 
-/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps the pair
-/// after all groups with even index, and again after all with odd index.
+/// Pair of sums where a vector holds one group of eight pixels: groups are added to the first sums. The caller swaps
+/// the pair after all groups with even index, and again after all with odd index.
 impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]
@@ -169,7 +169,7 @@ impl<V: Sums> EvenOddSums for [V; 2] {
     }
 }
 
-/// Eight sums, one per lane of a group.
+/// Eight sums, one per SIMD lane: sum k is the total of lane k over all groups of eight values that were added.
 pub(super) trait Sums: Copy {
     /// Returns sums that are all 0.
     fn zero() -> Self;

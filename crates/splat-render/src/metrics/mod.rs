@@ -12,7 +12,7 @@ pub use ssim::{ssim, ssim_gradient};
 
 use crate::Image;
 
-/// Bytes of memory per pixel for comparing two images. SSIM, which needs the most, takes this much.
+/// Bytes of memory per pixel for comparing two images: those of SSIM, which needs the most of all metrics.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
 /// Bytes of memory per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and two copies of the

@@ -89,7 +89,7 @@ struct Moments {
 }
 
 impl Moments {
-    /// Creates sums of 0 for `count` pixels.
+    /// Creates windowed sums that are 0 at each of `count` pixels.
     fn new(count: usize) -> Moments {
         Moments { sums: std::array::from_fn(|_| vec![0.0; count]), scratch: vec![0.0; count] }
     }
@@ -117,9 +117,9 @@ impl Moments {
 struct Terms {
     /// Windowed means of the images a and b.
     means: [f64; 2],
-    /// Factors A₁ and A₂ of the numerator of S.
+    /// Factors A₁ and A₂ of the numerator of the SSIM S = (A₁A₂)/(B₁B₂).
     numerators: [f64; 2],
-    /// Factors B₁ and B₂ of the denominator of S.
+    /// Factors B₁ and B₂ of the denominator of the SSIM S = (A₁A₂)/(B₁B₂).
     denominators: [f64; 2],
 }
 
@@ -134,13 +134,14 @@ impl Terms {
         }
     }
 
-    /// Returns the SSIM S of the pixel.
+    /// Returns the SSIM of the pixel, S = (A₁A₂)/(B₁B₂).
     fn similarity(&self) -> f64 {
         let Terms { numerators, denominators, .. } = self;
         numerators[0] * numerators[1] / (denominators[0] * denominators[1])
     }
 
-    /// Returns the derivatives of S with respect to the windowed sums of a, a² + b² and a·b, and 0 as the fourth value.
+    /// Returns the derivatives of the SSIM S of the pixel with respect to the windowed sums of a, a² + b² and a·b. The
+    /// fourth value is 0.
     fn slopes(&self) -> [f64; 4] {
         let Terms { means: [a, b], numerators, denominators } = self;
         let (whole, s) = (denominators[0] * denominators[1], self.similarity());

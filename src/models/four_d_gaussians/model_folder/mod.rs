@@ -255,8 +255,8 @@ impl FrameSource for ModelFolder {
         }))
     }
 
-    /// Returns a reader that computes the Gaussians block by block: a model computes each frame on its own, so that a reader
-    /// of all Gaussians has nothing to keep in memory.
+    /// Returns a reader of all Gaussians that computes them block by block. Frames of this format do not depend on one
+    /// another, so the reader keeps nothing between frames.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
