@@ -105,8 +105,15 @@ impl Damage {
 /// Returns the bytes of an archive with the contents `sections`, and its size by purpose.
 ///
 /// # Errors
-/// Fails if the compression of a section fails.
+/// Fails if the compression of a section fails, or if the table of contents is longer than a reader accepts.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
+    if sections.table.len() as u64 > MAX_TABLE_BYTES {
+        return Err(Error::usage(format!(
+            "the table of an archive has at most {MAX_TABLE_BYTES} bytes; that of this model has {}\n  write a .gseq of \
+             its frames",
+            sections.table.len()
+        )));
+    }
     let pack = |bytes: &[u8]| {
         zstd::bulk::compress(bytes, ZSTD_LEVEL)
             .map_err(|error| Error::internal(format!("cannot compress an archive: {error}")))

@@ -7,6 +7,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use super::*;
 use crate::deform::{Tensor, tap};
+use crate::model::AttributeValues;
 
 /// Generator of deterministic pseudo-random numbers.
 struct NoiseGenerator(u64);
@@ -50,6 +51,11 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
     content.tensors.insert(BOX_TENSOR.to_owned(), corners);
     content.field.insert(BOX_TENSOR.to_owned(), TensorRole::Exact);
+    for (name, width) in [("motion", 2), ("window", 1), ("none", 0)] {
+        let mut values = AttributeValues::zeros(width, count);
+        values.planes_mut().iter_mut().for_each(|value| *value = noise.next());
+        content.columns.push(Column { name: name.to_owned(), values });
+    }
     content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.files.insert("empty".to_owned(), Vec::new());
@@ -60,6 +66,7 @@ fn some_steps(content: &ArchiveContent, octave: i32) -> QuantizationSteps {
     let step = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
     let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), step(k)));
     let mut steps = QuantizationSteps { cloud: [0; 8], columns: Vec::new(), field: FieldSteps(tensors.collect()) };
+    steps.columns = (0..content.columns.len() as i32).map(|k| 8 * octave + 3 * k).collect();
     steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
     steps
 }
@@ -91,6 +98,15 @@ proptest! {
             let step = step_size(steps.cloud[k]);
             for (a, b) in attribute_values(&expected, k).zip(attribute_values(&back.cloud, k)) {
                 prop_assert!(near(a, b, step), "{name}: {a} {b} of step {step}");
+            }
+        }
+        for ((column, decoded), &step) in content.columns.iter().zip(&back.columns).zip(&steps.columns) {
+            prop_assert_eq!((&column.name, column.values.width()), (&decoded.name, decoded.values.width()));
+            for c in 0..column.values.width() {
+                let pairs = order.iter().map(|&id| column.values.plane(c)[id as usize]).zip(decoded.values.plane(c));
+                for (a, &b) in pairs {
+                    prop_assert!(near(a, b, step_size(step)), "{}: {a} {b} of step {step}", column.name);
+                }
             }
         }
         for (i, &id) in order.iter().enumerate() {
@@ -224,12 +240,24 @@ fn content_beyond_the_memory_limit_is_refused() {
 }
 
 #[test]
-fn a_later_version_is_named() {
+fn archives_of_other_versions_are_refused_with_advice() {
     let content = content(6, 2, 0);
-    let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
-    bytes[8] = 2;
-    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
-    assert!(message.contains("version 1") && message.contains("version 2"), "{message}");
+    for version in [0, 1, 3] {
+        let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+        bytes[8] = version;
+        let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
+        for says in ["expected version 2", &format!("version {version}"), "write the archive again from its model"] {
+            assert!(message.contains(says), "{message}");
+        }
+    }
+}
+
+#[test]
+fn a_table_longer_than_readers_accept_is_not_written() {
+    let mut content = content(6, 2, 0);
+    (0..20_000).for_each(|k| _ = content.files.insert(format!("{k:060}"), Vec::new()));
+    let message = encode(&content, &some_steps(&content, -3)).unwrap_err().to_string();
+    assert!(message.contains("at most 1048576 bytes"), "{message}");
 }
 
 #[test]

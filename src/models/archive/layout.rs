@@ -5,6 +5,7 @@
 //! `file.k`. Everything read from an archive is checked before it is used: paths stay inside the output folder, and the
 //! restored files have at most [`MAX_GROWTH`] times the bytes of the decoded archive.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -25,8 +26,14 @@ pub(super) const LAYOUT: &str = "layout";
 const MAX_GROWTH: u64 = 4;
 /// Number of bytes that the restored files may have in addition to [`MAX_GROWTH`] times the decoded archive.
 const BASE_BYTES: u64 = 1 << 20;
+/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per frame.
+const MAX_LAYOUT_BYTES: usize = 4 << 20;
 /// Maximum length in bytes of a path in an archive.
 const MAX_PATH: usize = 256;
+/// Names, without the part after the first period, that Windows reserves for devices.
+const DEVICES: [&str; 4] = ["con", "prn", "aux", "nul"];
+/// Names of devices of Windows that end in a digit.
+const NUMBERED_DEVICES: [&str; 2] = ["com", "lpt"];
 /// Bits of a half-precision number per octave (doubling) of its value.
 const BITS_PER_OCTAVE: f32 = 1024.0;
 
@@ -176,7 +183,16 @@ pub(super) fn rest_name(k: usize) -> String {
 fn is_plain(path: &str) -> bool {
     let is_plain_name = |name: &str| {
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+');
-        !name.is_empty() && !name.starts_with(['.', ' ']) && !name.ends_with(['.', ' ']) && name.chars().all(allowed)
+        let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
+        let is_numbered = NUMBERED_DEVICES
+            .iter()
+            .any(|device| stem.strip_prefix(device).is_some_and(|rest| rest.len() == 1 && rest != "0"));
+        !name.is_empty()
+            && !name.starts_with(['.', ' '])
+            && !name.ends_with(['.', ' '])
+            && name.chars().all(allowed)
+            && !DEVICES.contains(&&*stem)
+            && !is_numbered
     };
     path.len() <= MAX_PATH && path.split('/').all(is_plain_name)
 }
@@ -193,11 +209,20 @@ impl Layout {
     /// Fails if the layout is malformed.
     pub(super) fn read(content: &ArchiveContent, path: &Path) -> Result<Option<Layout>> {
         let Some(text) = content.files.get(LAYOUT) else { return Ok(None) };
+        if text.len() > MAX_LAYOUT_BYTES {
+            let found = format!("{} bytes", text.len());
+            return Err(damaged(path, &format!("at most {MAX_LAYOUT_BYTES} bytes"), found));
+        }
         let layout: Layout = serde_json::from_slice(text)
             .map_err(|error| damaged(path, "the files of a model as JSON", error.to_string()))?;
         if let Some(file) = layout.files.iter().find(|file| !is_plain(&file.path)) {
             let found = format!("{:?}", file.path);
             return Err(damaged(path, "relative paths of letters, digits, _, -, +, . and spaces", found));
+        }
+        // Some file systems ignore case.
+        let mut names = BTreeSet::new();
+        if let Some(file) = layout.files.iter().find(|file| !names.insert(file.path.to_ascii_lowercase())) {
+            return Err(damaged(path, "one file for each path", format!("two files at {}", file.path)));
         }
         let is_single = layout.files.len() == 1 && layout.files.iter().all(|file| !file.path.contains('/'));
         if !layout.folder && !is_single {
@@ -334,11 +359,14 @@ fn repair_checksums(bytes: &mut [u8]) -> Option<()> {
     const RECORD_FOLLOWS: u8 = 1 << 3;
     const RECORD_MAGIC: &[u8] = b"PK\x07\x08";
     let mut sums = Vec::new();
+    // Files in an archive do not overlap. The sum of their lengths bounds the time that the checksums take.
+    let mut unread = bytes.len();
     let mut archive = ZipArchive::new(Cursor::new(&bytes[..])).ok()?;
     for index in 0..archive.len() {
         let entry = archive.by_index_raw(index).ok()?;
         let start = usize::try_from(entry.data_start()).ok()?;
         let data = bytes.get(start..start.checked_add(usize::try_from(entry.compressed_size()).ok()?)?)?;
+        unread = unread.checked_sub(data.len())?;
         if entry.crc32() == 0 || entry.compression() != zip::CompressionMethod::Stored {
             continue;
         }

@@ -4,10 +4,14 @@
 //! The file format is specified in `format/ARCHIVE.md`. Paths in an archive are checked before files are written
 //! ([`layout`]).
 
+#[cfg(test)]
+pub(super) mod checks;
 pub(super) mod files;
 mod layout;
 pub(super) mod pack;
 pub(super) mod reopen;
+#[cfg(test)]
+mod tests;
 
 use std::fs;
 use std::io::Read;

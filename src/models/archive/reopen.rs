@@ -16,7 +16,7 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
-/// How a model was opened, so that its archive can be opened in the same way.
+/// How the files in an archive of a model are opened: as the model itself was opened.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
     open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
@@ -24,7 +24,7 @@ pub(in crate::models) struct Reopener {
 }
 
 impl Reopener {
-    /// Returns a record of opening a model by `open` with `options`.
+    /// Creates a record of opening a model by `open` with `options`.
     pub(in crate::models) fn new(
         open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
         options: &OpenOptions,
@@ -34,9 +34,9 @@ impl Reopener {
         Reopener { open, options }
     }
 
-    /// Returns the content of an archive of the compressed model `reduction` of `model`. `name` is the name of the
-    /// model if it is a single file. `holds` returns what a file of the model holds, by its path relative to the model
-    /// folder.
+    /// Returns the content of an archive of the compressed model `reduction` of `model`, which is written as `kind`.
+    /// `name` is the name of the model if it is a single file. `holds` returns what a file of the model holds, by its
+    /// path relative to the model folder.
     ///
     /// # Errors
     /// Fails if the model cannot be written, or if an archive cannot hold its files.
@@ -44,12 +44,11 @@ impl Reopener {
         &self,
         model: &dyn InputModel,
         reduction: &CompressedModel,
-        name: &str,
+        (kind, name): (OutputKind, &str),
         holds: impl Fn(&str) -> FileContent<'a>,
     ) -> Result<ArchiveContent> {
         let scratch = ScratchFolder::new(&self.options.scratch())?;
         let path = scratch.path().join(name);
-        let kind = model.own_output();
         if kind == OutputKind::Model {
             std::fs::create_dir(&path).map_err(Error::io("create", &path))?;
         }

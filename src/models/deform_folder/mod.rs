@@ -298,7 +298,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     }
 
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, "model", FileContent::from_name)
+        self.reopener.content(self, reduction, (self.own_output(), "model"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -116,7 +116,7 @@ impl InputModel for Params {
     }
 
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener().content(self, reduction, "model", |_| FileContent::Npz(Params::archived))
+        self.reopener().content(self, reduction, (self.own_output(), "model"), |_| FileContent::Npz(Params::archived))
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -274,9 +274,11 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
         let checkpoint = self.relative_path();
-        self.reopener()?.content(self, reduction, "model", |name| match Path::new(name) == checkpoint {
-            true => FileContent::Checkpoint(&self.tensors),
-            false => FileContent::Other,
+        self.reopener()?.content(self, reduction, (self.own_output(), "model"), |name| {
+            match Path::new(name) == checkpoint {
+                true => FileContent::Checkpoint(&self.tensors),
+                false => FileContent::Other,
+            }
         })
     }
 

@@ -328,7 +328,7 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, "model.ply", FileContent::from_name)
+        self.reopener.content(self, reduction, (self.own_output(), "model.ply"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

@@ -231,7 +231,7 @@ impl InputModel for SplatvModel {
     }
 
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener.content(self, reduction, "model.splatv", FileContent::from_name)
+        self.reopener.content(self, reduction, (self.own_output(), "model.splatv"), FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {

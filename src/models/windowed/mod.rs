@@ -31,10 +31,6 @@ use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
 pub(super) use tsog::TSOG;
 
-/// Error message for `.tsog` files, which cannot be written as an archive.
-const NO_TSOG: &str = "a .tsog holds compressed images, which an archive cannot make smaller\n  write a .tsog, or convert \
-                       the input to a .ftgs.ply and make the archive of that";
-
 /// Opened file of a player. The motion model `L` computes the states of its Gaussians.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
@@ -48,14 +44,15 @@ struct WindowedModel<L: ProxyRule> {
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// How the file was opened; `None` for formats that have no archives.
+    /// How the `.ftgs.ply` in an archive of this file is opened. `None` for Gaussians without windows of time, which a
+    /// `.ftgs.ply` cannot hold; their archives hold frames.
     reopener: Option<Reopener>,
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns how the file was opened.
+    /// Returns how the `.ftgs.ply` in an archive of this file is opened.
     fn reopener(&self) -> Result<&Reopener> {
-        self.reopener.as_ref().ok_or_else(|| Error::usage(NO_TSOG))
+        self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }
 }
 
@@ -143,7 +140,6 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
                 "a file of a player cannot be written as a trained model\n  write its own format, a .gseq or --as \
                  ply-sequence",
             )),
-            OutputKind::Archive if self.reopener.is_none() => Err(Error::usage(NO_TSOG)),
             _ => Ok(()),
         }
     }
@@ -152,8 +148,13 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
     }
 
+    fn archives_as_frames(&self) -> bool {
+        self.reopener.is_none()
+    }
+
     fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
-        self.reopener()?.content(self, reduction, "model.ftgs.ply", FileContent::from_name)
+        let written = (OutputKind::Ftgs, "model.ftgs.ply");
+        self.reopener()?.content(self, reduction, written, FileContent::from_name)
     }
 
     fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
