@@ -229,9 +229,11 @@ pub(super) fn encode(
         parts: Vec::new(),
     };
     let mut coder = PlaneCoder::new(cloud.len());
+    let rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
     for coded in shape.planes() {
         let (grid, group) = (shape.grid(coded), coded.group);
         let plane = match coded.source {
+            PlaneSource::Attribute(Attributes::ROTATION, c) => rotation.plane(c),
             PlaneSource::Attribute(attribute, c) => cloud.column(attribute).plane(c),
             PlaneSource::Column(k, c) => columns[k].values.plane(c),
         };
@@ -392,9 +394,29 @@ fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usiz
     }))
 }
 
+/// Returns the quaternions `rotation`, but those that `grid` would make zero with ± one step in their largest component
+/// and zeros in the others. Renderers cannot show a Gaussian with a quaternion of zero.
+fn nonzero_rotations(rotation: &AttributeValues, grid: QuantizationGrid) -> AttributeValues {
+    let mut nonzero = rotation.clone();
+    for i in 0..rotation.len() {
+        let row: [f32; 4] = rotation.row(i);
+        if row.iter().all(|&value| grid.multiple(value) == 0) {
+            let largest = (1..4).fold(0, |largest, c| if row[c].abs() > row[largest].abs() { c } else { largest });
+            if row[largest] != 0.0 {
+                let sign = if row[largest] > 0.0 { 1 } else { -1 };
+                nonzero.set_row::<4>(i, std::array::from_fn(|c| grid.value(if c == largest { sign } else { 0 })));
+            }
+        }
+    }
+    nonzero
+}
+
 /// Rounds values in place to the quantization grids of `steps`. Only attributes whose index in [`ATTRIBUTES`] is in
 /// `attributes` are rounded.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
+    if attributes.contains(&1) {
+        cloud.rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
+    }
     for (column, c, attribute) in components(cloud.sh_degree()) {
         if attributes.contains(&attribute) {
             round_all(cloud.column_mut(column).plane_mut(c), steps[attribute]);

@@ -33,6 +33,7 @@ use crate::pipeline::summary::ArchiveSummary;
 use crate::progress::Progress;
 use crate::render;
 use crate::scene::Scene;
+use crate::source::FrameSource;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
@@ -200,10 +201,16 @@ impl ArchiveStage {
             progress.advance(1);
             archive::encode(&content, &grids.steps(added))
         };
-        let measure_views = |encoded: EncodedArchive| -> Result<(EncodedArchive, [f64; 2])> {
-            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
-            let shown = scene.input.decode_frames(&decoded)?;
+        let measure_frames = |encoded: EncodedArchive, shown: Box<dyn FrameSource + '_>| -> Result<_> {
             Ok((encoded, [reference_views.psnr(&*shown)?, level - original.psnr(&*shown)?]))
+        };
+        let decoded = |encoded: &EncodedArchive| -> Result<Box<dyn FrameSource + '_>> {
+            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
+            scene.input.decode_frames(&decoded)
+        };
+        let measure_views = |encoded: EncodedArchive| {
+            let shown = decoded(&encoded)?;
+            measure_frames(encoded, shown)
         };
         let (encoded, [psnr, loss]) = match quality_target {
             QualityTarget::Bytes(most) => {
@@ -216,7 +223,10 @@ impl ArchiveStage {
             }
             QualityTarget::Close(_) | QualityTarget::Loss(_) => {
                 let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
-                    Ok(Some(measure_views(encoded(added)?)?)
+                    let encoded = encoded(added)?;
+                    // The reader of a model format may refuse values that coarse steps have made zero.
+                    let Ok(shown) = decoded(&encoded) else { return Ok(None) };
+                    Ok(Some(measure_frames(encoded, shown)?)
                         .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
                 })?;
                 best.map_or_else(|| measure_views(encoded(OCTAVE_RANGE[0])?), Ok)?
