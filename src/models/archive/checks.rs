@@ -93,7 +93,7 @@ fn values(state: &Gaussians, i: usize) -> Vec<f64> {
     let covariance = (axes * axes.transpose()).to_cols_array();
     let largest = covariance.iter().fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
     let mut values: Vec<f64> = state.position.row::<3>(i).map(f64::from).to_vec();
-    values.push(opacity(state.opacity_logit.plane(0)[i]).into());
+    values.push(opacity(state.opacity_logit.plane(0)[i]));
     values.extend((0..state.sh.width()).map(|c| f64::from(state.sh.plane(c)[i])));
     values.extend(covariance.map(|entry| entry / largest));
     values

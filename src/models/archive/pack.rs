@@ -19,7 +19,7 @@ use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, TensorView, ValueType};
 use crate::files::npz::Npz;
 use crate::files::npz::write::GaussianAxis;
-use crate::files::ply::{Ply, PlyEncoding, Scalar};
+use crate::files::ply::{Ply, PlyEncoding, Property, Scalar};
 use crate::files::splatv::{ROW_BYTES, Splatv};
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficients};
@@ -66,6 +66,44 @@ enum Target {
     Bytes,
     /// No place: the value is restored as zero, because no evaluation reads it.
     Zeros,
+}
+
+/// Field of a row of a file.
+#[derive(Debug, Clone)]
+struct RowField {
+    /// Kind of the field: returns the field with the values of a plane, or with a number of bytes.
+    kind: fn(usize) -> Field,
+    /// Number of bytes.
+    bytes: usize,
+    target: Target,
+}
+
+impl RowField {
+    fn f32(target: Target) -> RowField {
+        RowField { kind: Field::F32, bytes: 4, target }
+    }
+
+    fn half(target: Target) -> RowField {
+        RowField { kind: Field::Half, bytes: 2, target }
+    }
+
+    fn octaves(target: Target) -> RowField {
+        RowField { kind: Field::Octaves, bytes: 2, target }
+    }
+
+    fn byte(target: Target) -> RowField {
+        RowField { kind: Field::Byte, bytes: 1, target }
+    }
+
+    /// Creates a field that is stored exactly.
+    fn exact(bytes: usize) -> RowField {
+        RowField { kind: Field::Bytes, bytes, target: Target::Bytes }
+    }
+
+    /// Creates a field that is restored as zero.
+    fn zeros(bytes: usize) -> RowField {
+        RowField { kind: Field::Zeros, bytes, target: Target::Zeros }
+    }
 }
 
 /// Content of an archive to which files are added.
@@ -160,17 +198,11 @@ impl Packer {
         Ok(())
     }
 
-    /// Returns the span of one row per Gaussian at byte `at` of a file with the content `bytes`, and its length. `fields` holds
-    /// the kind and the place of every field of a row. Reads the values of the fields.
-    fn rows(
-        &mut self,
-        file: &Path,
-        bytes: &[u8],
-        at: usize,
-        fields: &[(fn(usize) -> Field, usize, Target)],
-    ) -> Result<(Span, usize)> {
+    /// Reads the values of the fields `fields` in one row per Gaussian, from byte `at` of a file with the content `bytes`.
+    /// Returns the span of the rows and its length in bytes.
+    fn rows(&mut self, file: &Path, bytes: &[u8], at: usize, fields: &[RowField]) -> Result<(Span, usize)> {
         let count = self.content.cloud.len();
-        let stride: usize = fields.iter().map(|(_, bytes, _)| bytes).sum();
+        let stride: usize = fields.iter().map(|field| field.bytes).sum();
         let length = count * stride;
         let stored = bytes.get(at..at + length).ok_or_else(|| cannot_hold(file, "fewer rows than Gaussians"))?;
         let mut coded = Vec::with_capacity(fields.len());
@@ -178,41 +210,36 @@ impl Packer {
         let mut first = 0;
         while first < fields.len() {
             // Fields of one column follow one another.
-            let (_, _, target) = &fields[first];
+            let target = &fields[first].target;
             let together = match target {
-                Target::Column(_) => fields[first..].iter().take_while(|field| field.2 == *target).count(),
+                Target::Column(_) => fields[first..].iter().take_while(|field| field.target == *target).count(),
                 _ => 1,
             };
             let group = &fields[first..first + together];
-            let planes: Vec<Vec<f32>> = group
-                .iter()
-                .scan(offset, |at, (kind, bytes, _)| {
-                    let place = *at..*at + bytes;
-                    *at += bytes;
-                    Some(
-                        stored
-                            .chunks_exact(stride.max(1))
-                            .filter_map(|row| kind(0).decode(&row[place.clone()]))
-                            .collect(),
-                    )
-                })
-                .collect();
+            let width: usize = group.iter().map(|field| field.bytes).sum();
+            let rows = || stored.chunks_exact(stride.max(1)).map(|row| &row[offset..offset + width]);
+            let decoded = |field: &RowField, from: usize| -> Vec<f32> {
+                rows().filter_map(|row| (field.kind)(0).decode(&row[from..from + field.bytes])).collect()
+            };
+            let mut from = 0;
+            let mut planes = Vec::with_capacity(together);
+            for field in group {
+                planes.push(decoded(field, from));
+                from += field.bytes;
+            }
             let is_finite = planes.iter().flatten().all(|value: &f32| value.is_finite());
-            let width: usize = group.iter().map(|(_, bytes, _)| bytes).sum();
             match target {
                 Target::Attribute(attribute, c) => {
                     self.content.cloud.column_mut(*attribute).plane_mut(*c).copy_from_slice(&planes[0]);
-                    coded.push(group[0].0(first_plane(*attribute) + c));
+                    coded.push((group[0].kind)(first_plane(*attribute) + c));
                 }
                 Target::Column(name) if is_finite => {
                     let plane = self.add_column(name, planes);
-                    coded.extend(group.iter().enumerate().map(|(c, (kind, ..))| kind(plane + c)));
+                    coded.extend(group.iter().enumerate().map(|(c, field)| (field.kind)(plane + c)));
                 }
                 Target::Zeros => coded.push(Field::Zeros(width)),
                 Target::Column(_) | Target::Bytes => {
-                    let of_row = |row: &[u8]| row[offset..offset + width].to_vec();
-                    let values = stored.chunks_exact(stride.max(1)).flat_map(of_row).collect();
-                    self.beside.push((width, values));
+                    self.beside.push((width, rows().flatten().copied().collect()));
                     coded.push(Field::Bytes(width));
                 }
             }
@@ -250,16 +277,11 @@ impl Packer {
         let degree = self.content.cloud.sh_degree();
         let rest = ply.properties().iter().filter(|property| property.name.starts_with("f_rest_")).count();
         let has_all_degrees = rest == 3 * (sh_coefficients(degree) - 1);
-        let fields: Vec<(fn(usize) -> Field, usize, Target)> = ply
-            .properties()
-            .iter()
-            .map(|property| match property.scalar {
-                Scalar::F32 => {
-                    (Field::F32 as fn(usize) -> Field, 4, ply_target(&property.name, degree, has_all_degrees))
-                }
-                other => (Field::Bytes as fn(usize) -> Field, other.bytes(), Target::Bytes),
-            })
-            .collect();
+        let field = |property: &Property| match property.scalar {
+            Scalar::F32 => RowField::f32(ply_target(&property.name, degree, has_all_degrees)),
+            other => RowField::exact(other.bytes()),
+        };
+        let fields: Vec<RowField> = ply.properties().iter().map(field).collect();
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
@@ -267,25 +289,21 @@ impl Packer {
     fn splatv(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let splatv = Splatv::open(file)?;
         let at = splatv.start();
-        let half = |target: Target| (Field::Half as fn(usize) -> Field, 2, target);
-        let octaves = |target: Target| (Field::Octaves as fn(usize) -> Field, 2, target);
-        let byte = |target: Target| (Field::Byte as fn(usize) -> Field, 1, target);
         let attribute = Target::Attribute;
         let column = |name: &str| Target::Column(name.to_owned());
-        let padding = || (Field::Zeros as fn(usize) -> Field, 2, Target::Zeros);
-        let mut fields: Vec<(fn(usize) -> Field, usize, Target)> = Vec::new();
-        fields.extend((0..3).map(|c| (Field::F32 as fn(usize) -> Field, 4, attribute(Attributes::POSITION, c))));
-        fields.extend((0..4).map(|c| half(attribute(Attributes::ROTATION, c))));
-        fields.extend((0..3).map(|c| octaves(attribute(Attributes::LOG_SCALE, c))));
-        fields.push(padding());
-        fields.extend((0..3).map(|c| byte(attribute(Attributes::SH, c))));
-        fields.push(byte(attribute(Attributes::OPACITY, 0)));
-        fields.extend((0..9).map(|c| half(column(["motion_1", "motion_2", "motion_3"][c / 3]))));
-        fields.push(padding());
-        fields.extend((0..4).map(|_| half(column("omega"))));
-        fields.push(half(column("center")));
-        fields.push(octaves(column("width")));
-        debug_assert_eq!(fields.iter().map(|field| field.1).sum::<usize>(), ROW_BYTES);
+        let mut fields: Vec<RowField> = Vec::new();
+        fields.extend((0..3).map(|c| RowField::f32(attribute(Attributes::POSITION, c))));
+        fields.extend((0..4).map(|c| RowField::half(attribute(Attributes::ROTATION, c))));
+        fields.extend((0..3).map(|c| RowField::octaves(attribute(Attributes::LOG_SCALE, c))));
+        fields.push(RowField::zeros(2));
+        fields.extend((0..3).map(|c| RowField::byte(attribute(Attributes::SH, c))));
+        fields.push(RowField::byte(attribute(Attributes::OPACITY, 0)));
+        fields.extend((0..9).map(|c| RowField::half(column(["motion_1", "motion_2", "motion_3"][c / 3]))));
+        fields.push(RowField::zeros(2));
+        fields.extend((0..4).map(|_| RowField::half(column("omega"))));
+        fields.push(RowField::half(column("center")));
+        fields.push(RowField::octaves(column("width")));
+        debug_assert_eq!(fields.iter().map(|field| field.bytes).sum::<usize>(), ROW_BYTES);
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
@@ -348,10 +366,8 @@ impl Packer {
                 RowElement::Of(attribute, c) => Target::Attribute(*attribute, *c),
                 RowElement::Own(_) => Target::Column(name.to_owned()),
             };
-            let fields: Vec<_> = stored
-                .iter()
-                .map(|element| (Field::F32 as fn(usize) -> Field, bytes_per_value, target(element)))
-                .collect();
+            let field = |element: &RowElement| RowField { bytes: bytes_per_value, ..RowField::f32(target(element)) };
+            let fields: Vec<RowField> = stored.iter().map(field).collect();
             spans.push(self.rows(file, bytes, place.start, &fields)?);
         }
         for id in rows.training_only() {
@@ -392,7 +408,7 @@ impl Packer {
                 let bytes_of = |k: usize| bytes.get(at + k * frame_bytes..at + (k + 1) * frame_bytes);
                 for frame in 0..frames {
                     bytes_of(frame).ok_or_else(|| cannot_hold(file, "an array that is cut short"))?;
-                    let fields = [(Field::Bytes as fn(usize) -> Field, width * value_bytes, Target::Bytes)];
+                    let fields = [RowField::exact(width * value_bytes)];
                     spans.push(self.rows(file, bytes, at + frame * frame_bytes, &fields)?);
                 }
                 continue;
