@@ -249,10 +249,8 @@ pub(super) fn encode(
         let factors = factors(&parts);
         let before = encoder.cost();
         coder.plane(group, grid, mean, |i, around, size, models| {
-            let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
-            let residual = multiples[i] - expected;
-            models.encode(residual, size, &mut encoder);
-            (multiples[i], residual)
+            let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
+            (multiples[i], models.encode(multiples[i], predicted, size, &mut encoder))
         });
         let name = match group.checked_sub(ATTRIBUTES.len()) {
             Some(column) => columns[column].name.as_str(),
@@ -294,9 +292,8 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
             PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),
         };
         coder.plane(coded.group, grid, mean, |i, around, size, models| {
-            let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
-            let residual = models.decode(size, &mut decoder);
-            let multiple = expected.wrapping_add(residual);
+            let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
+            let (multiple, residual) = models.decode(predicted, size, &mut decoder);
             plane[i] = grid.value(multiple);
             (multiple, residual)
         });

@@ -156,7 +156,9 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
     // While decoding, two values and one mean error size (12 bytes) are kept for each Gaussian.
-    let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
+    // While decoding a tensor, one mean error size is kept for each of its places.
+    let places = table.tensors.iter().map(TensorEntry::places).max().unwrap_or(0) as u64;
+    let needed = head.bytes() + 4 * values + 4 * places + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
