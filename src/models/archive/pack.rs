@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
+use super::files::yaml_without_folders;
 use super::layout::{Field, FileLayout, LAYOUT, Layout, Span, Values, first_column_plane, first_plane, rest_name};
 use crate::archive::{ArchiveContent, Column, TensorRole};
 use crate::deform::Tensor;
@@ -178,7 +179,12 @@ impl Packer {
                 bytes = cfg_args::without_folders(&cfg_args::read(file)?, file)?.into_bytes();
                 Vec::new()
             }
-            FileContent::Other => Vec::new(),
+            FileContent::Other => {
+                if let (true, Ok(text)) = (name.ends_with(".yaml") || name.ends_with(".yml"), str::from_utf8(&bytes)) {
+                    bytes = yaml_without_folders(text).into_bytes();
+                }
+                Vec::new()
+            }
         };
         spans.retain(|(span, length)| *length > 0 || !matches!(span.of, Values::Zeros(_)));
         spans.sort_by_key(|(span, _)| span.at);
