@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use zip::ZipArchive;
 
 use crate::archive::ArchiveContent;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 use crate::model::{Attributes, sh_coefficients};
 
 /// Name of the archive part with the layout.
@@ -54,6 +54,13 @@ pub(super) struct FileLayout {
     pub(super) path: String,
     /// Parts of the file that hold values, in order and without overlap.
     pub(super) spans: Vec<Span>,
+}
+
+impl FileLayout {
+    /// Returns whether the file is at `path` on a file system that ignores case.
+    pub(super) fn has_path(&self, path: &str) -> bool {
+        self.path.eq_ignore_ascii_case(path)
+    }
 }
 
 /// Part of a file that holds values.
@@ -179,10 +186,21 @@ pub(super) fn rest_name(k: usize) -> String {
     format!("file.{k}")
 }
 
+/// Returns whether a name of a file or folder in an archive may contain `c`.
+fn is_plain_char(c: char) -> bool {
+    c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+')
+}
+
+/// Returns `path` with `_` in place of characters that paths in an archive may not have; `None` if that does not make
+/// it a path of plain names ([`is_plain`]).
+pub(super) fn plain_path(path: &str) -> Option<String> {
+    let plain: String = path.chars().map(|c| if c == '/' || is_plain_char(c) { c } else { '_' }).collect();
+    is_plain(&plain).then_some(plain)
+}
+
 /// Returns whether `path` is a relative path of plain names, so that it stays inside a folder on every system.
 fn is_plain(path: &str) -> bool {
     let is_plain_name = |name: &str| {
-        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+');
         let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
         let is_numbered = NUMBERED_DEVICES
             .iter()
@@ -190,7 +208,7 @@ fn is_plain(path: &str) -> bool {
         !name.is_empty()
             && !name.starts_with(['.', ' '])
             && !name.ends_with(['.', ' '])
-            && name.chars().all(allowed)
+            && name.chars().all(is_plain_char)
             && !DEVICES.contains(&&*stem)
             && !is_numbered
     };
@@ -216,7 +234,7 @@ impl Layout {
         let layout: Layout = serde_json::from_slice(text)
             .map_err(|error| damaged(path, "the files of a model as JSON", error.to_string()))?;
         if let Some(file) = layout.files.iter().find(|file| !is_plain(&file.path)) {
-            let found = format!("{:?}", file.path);
+            let found = quoted(&file.path);
             return Err(damaged(path, "relative paths of letters, digits, _, -, +, . and spaces", found));
         }
         // Some file systems ignore case.

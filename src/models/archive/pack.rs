@@ -13,7 +13,9 @@ use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
 use super::files::yaml_without_folders;
-use super::layout::{Field, FileLayout, LAYOUT, Layout, Span, Values, first_column_plane, first_plane, rest_name};
+use super::layout::{
+    Field, FileLayout, LAYOUT, Layout, Span, Values, first_column_plane, first_plane, plain_path, rest_name,
+};
 use crate::archive::{ArchiveContent, Column, TensorRole};
 use crate::deform::Tensor;
 use crate::error::{Error, Result};
@@ -160,6 +162,8 @@ impl Packer {
 
     /// Adds the file at `file`, whose path relative to the model folder is `name`.
     fn add_file(&mut self, name: String, file: &Path, holds: FileContent<'_>) -> Result<()> {
+        let path = plain_path(&name).filter(|path| !self.layout.files.iter().any(|known| known.has_path(path)));
+        let path = path.ok_or_else(|| cannot_hold(file, "the name of a file that archives do not allow"))?;
         let length = fs::metadata(file).map_err(Error::io("read", file))?.len();
         self.memory.check(file, "", "the file and its values", 2 * length)?;
         let mut bytes = fs::read(file).map_err(Error::io("read", file))?;
@@ -200,7 +204,7 @@ impl Packer {
         rest.extend_from_slice(&bytes[end..]);
         self.content.files.insert(rest_name(self.layout.files.len()), rest);
         let spans = spans.into_iter().map(|(span, _)| span).collect();
-        self.layout.files.push(FileLayout { path: name, spans });
+        self.layout.files.push(FileLayout { path, spans });
         Ok(())
     }
 

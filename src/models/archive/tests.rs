@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use super::layout::{Field, FileLayout, LAYOUT, Layout, Span, Values, rest_name};
+use super::layout::{Field, FileLayout, LAYOUT, Layout, Span, Values, plain_path, rest_name};
 use super::{kind_with_layout, unpack};
 use crate::archive::{ArchiveContent, Column};
 use crate::deform::Tensor;
@@ -118,6 +118,20 @@ fn paths_outside_the_output_are_refused() {
         layout.files[1].path = path.to_owned();
         let message = refusal(&with_layout(&layout));
         assert!(message.contains("a.gsz, layout: expected relative paths"), "{path:?}: {message}");
+    }
+}
+
+#[test]
+fn names_of_files_become_plain() {
+    for (name, plain) in [
+        ("a/config.yaml", Some("a/config.yaml")),
+        ("é (1).yaml", Some("_ _1_.yaml")),
+        ("a\\b", Some("a_b")),
+        ("nul", None),
+        ("../x", None),
+        (".hidden", None),
+    ] {
+        assert_eq!(plain_path(name).as_deref(), plain, "{name}");
     }
 }
 
