@@ -1,9 +1,9 @@
-//! Encodes the canonical Gaussians, each attribute on its own quantization grid.
+//! Encodes the canonical Gaussians, each attribute and each further column on its own quantization grid.
 //!
-//! Input: Gaussians, and a quantization step for each attribute. Output: entropy-coded symbols, and the order in which
-//! the Gaussians are restored. This order follows a Morton curve; a position is stored as the distance along the curve
-//! from the previous position. Every other attribute is coded plane by plane; a plane is one scalar component for all
-//! Gaussians.
+//! Input: Gaussians with their attributes and further columns, and a quantization step for each. Output: entropy-coded
+//! symbols, and the order in which the Gaussians are restored. This order follows a Morton curve; a position is stored
+//! as the distance along the curve from the previous position. All other values are coded plane by plane; a plane is
+//! one scalar component for all Gaussians.
 
 use std::collections::BTreeMap;
 
@@ -30,6 +30,27 @@ const NEIGHBORS: usize = 4;
 /// Number of bits per axis from which an index along the Morton curve is made.
 const CURVE_BITS: u32 = 21;
 
+/// Further values of the Gaussians, which only some model formats have, such as coefficients of a motion. The values of
+/// a column share one quantization step.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Column {
+    /// Name of the column, unique among the columns of an archive.
+    pub name: String,
+    /// Values of all Gaussians.
+    pub values: AttributeValues,
+}
+
+/// Parameters that are needed to decode a [`Column`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ColumnShape {
+    pub(super) name: String,
+    /// Number of planes (scalar components).
+    pub(super) planes: usize,
+    /// Quantization step `k`: 2^(k/8); see [`super::step_size()`].
+    pub(super) step: i32,
+}
+
 /// Parameters of encoded Gaussians that a decoder needs besides the symbols.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -37,6 +58,7 @@ pub(super) struct PointCloudShape {
     pub(super) gaussians: usize,
     pub(super) sh_degree: usize,
     pub(super) steps: CloudSteps,
+    pub(super) columns: Vec<ColumnShape>,
     /// Minimum position on each axis, in quantization steps.
     pub(super) lowest: [i64; 3],
     /// Number of low bits of each coordinate that are stored as plain bits and not used by the Morton curve.
@@ -48,13 +70,31 @@ pub(super) struct PointCloudShape {
     pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
-/// Returns all planes (scalar components) except those of the position, in coding order. Each is given by its
-/// attribute, its component within the attribute, and the index of its quantization step in [`ATTRIBUTES`].
-fn planes(sh_degree: usize) -> Vec<(Attributes, usize, usize)> {
-    let mut planes: Vec<_> = (0..4).map(|c| (Attributes::ROTATION, c, 1)).collect();
-    planes.extend((0..3).map(|c| (Attributes::LOG_SCALE, c, 2)));
-    planes.push((Attributes::OPACITY, 0, 3));
-    planes.extend((0..3 * sh_coefficients(sh_degree)).map(|c| (Attributes::SH, c, 4 + (c / 3).isqrt())));
+/// Plane (scalar component of all Gaussians) that is coded after the positions.
+#[derive(Debug, Clone, Copy)]
+struct Plane {
+    source: PlaneSource,
+    /// Index of the values that share a quantization step and entropy models: an index in [`ATTRIBUTES`], or the number
+    /// of attributes plus the index of a column.
+    group: usize,
+}
+
+/// Place of the values of a [`Plane`].
+#[derive(Debug, Clone, Copy)]
+enum PlaneSource {
+    /// Component of an attribute.
+    Attribute(Attributes, usize),
+    /// Component (second number) of a column.
+    Column(usize, usize),
+}
+
+/// Returns the planes of the attributes in coding order, without the position.
+fn attribute_planes(sh_degree: usize) -> Vec<Plane> {
+    let plane = |attribute, c, group| Plane { source: PlaneSource::Attribute(attribute, c), group };
+    let mut planes: Vec<_> = (0..4).map(|c| plane(Attributes::ROTATION, c, 1)).collect();
+    planes.extend((0..3).map(|c| plane(Attributes::LOG_SCALE, c, 2)));
+    planes.push(plane(Attributes::OPACITY, 0, 3));
+    planes.extend((0..3 * sh_coefficients(sh_degree)).map(|c| plane(Attributes::SH, c, 4 + (c / 3).isqrt())));
     planes
 }
 
@@ -62,17 +102,42 @@ impl PointCloudShape {
     /// Returns whether the parameters, which may come from an untrusted file, are consistent: a valid SH degree, one
     /// mean and one set of predictor weights per plane, and steps and counts in their allowed ranges.
     pub(super) fn is_sound(&self) -> bool {
+        let steps = self.steps.iter().chain(self.columns.iter().map(|column| &column.step));
         self.sh_degree <= MAX_SH_DEGREE
-            && self.means.len() == planes(self.sh_degree).len()
+            && self.plane_count() == Some(self.means.len())
             && self.parts.len() == self.means.len()
-            && self.steps.iter().all(|step| super::STEP_NUMBERS.contains(step))
+            && steps.into_iter().all(|step| super::STEP_NUMBERS.contains(step))
             && self.loose <= 32
             && self.gaussians <= u32::MAX as usize
     }
 
+    /// Returns the number of planes after the three of the position; `None` if it overflows.
+    fn plane_count(&self) -> Option<usize> {
+        let attributes = Attributes::all().width(self.sh_degree.min(MAX_SH_DEGREE)) - 3;
+        self.columns.iter().try_fold(attributes, |sum, column| sum.checked_add(column.planes))
+    }
+
+    /// Returns the planes in coding order, without the position. The shape must be sound.
+    fn planes(&self) -> Vec<Plane> {
+        let mut planes = attribute_planes(self.sh_degree);
+        for (k, column) in self.columns.iter().enumerate() {
+            let group = ATTRIBUTES.len() + k;
+            planes.extend((0..column.planes).map(|c| Plane { source: PlaneSource::Column(k, c), group }));
+        }
+        planes
+    }
+
+    /// Returns the quantization grid of the values of `plane`.
+    fn grid(&self, plane: Plane) -> QuantizationGrid {
+        QuantizationGrid::new(match plane.group.checked_sub(ATTRIBUTES.len()) {
+            Some(column) => self.columns[column].step,
+            None => self.steps[plane.group],
+        })
+    }
+
     /// Returns the number of f32 values that all Gaussians have together; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
-        self.gaussians.checked_mul(Attributes::all().width(self.sh_degree))
+        self.gaussians.checked_mul(self.plane_count()?.checked_add(3)?)
     }
 }
 
@@ -124,12 +189,14 @@ fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
     x | y << 1 | z << 2
 }
 
-/// Encodes the Gaussians `cloud` with the quantization steps `steps`. Returns the parameters for decoding, the
-/// entropy-coded symbols, and for each Gaussian in the new order its index in `cloud`. Adds the approximate number of
-/// bits of every attribute to `bits`.
+/// Encodes the Gaussians `cloud` with the quantization steps `steps` of their attributes, and the further values
+/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for each
+/// Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and column to
+/// `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
-    steps: &CloudSteps,
+    columns: &[Column],
+    (steps, column_steps): (&CloudSteps, &[i32]),
     bits: &mut BTreeMap<String, f64>,
 ) -> (PointCloudShape, Vec<u8>, Vec<u32>) {
     let mut encoder = SymbolEncoder::default();
@@ -146,48 +213,66 @@ pub(super) fn encode(
         place.iter().for_each(|&x| encoder.long_bits(x, loose));
     }
     bits.insert(ATTRIBUTES[0].to_owned(), encoder.cost());
-    let planes = planes(cloud.sh_degree());
+    let column_shape = |(column, &step): (&Column, &i32)| ColumnShape {
+        name: column.name.clone(),
+        planes: column.values.width(),
+        step,
+    };
     let mut shape = PointCloudShape {
         gaussians: cloud.len(),
         sh_degree: cloud.sh_degree(),
         steps: *steps,
+        columns: columns.iter().zip(column_steps).map(column_shape).collect(),
         lowest,
         loose,
         means: Vec::new(),
         parts: Vec::new(),
     };
     let mut coder = PlaneCoder::new(cloud.len());
-    for (column, c, attribute) in planes {
-        let grid = QuantizationGrid::new(steps[attribute]);
-        let plane = cloud.column(column).plane(c);
+    let rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
+    for coded in shape.planes() {
+        let (grid, group) = (shape.grid(coded), coded.group);
+        let plane = match coded.source {
+            PlaneSource::Attribute(Attributes::ROTATION, c) => rotation.plane(c),
+            PlaneSource::Attribute(attribute, c) => cloud.column(attribute).plane(c),
+            PlaneSource::Column(k, c) => columns[k].values.plane(c),
+        };
         let multiples: Vec<i64> = order.iter().map(|&id| grid.multiple(plane[id as usize])).collect();
         let sum: i128 = multiples.iter().map(|&multiple| i128::from(multiple)).sum();
         let mean = (sum / multiples.len().max(1) as i128) as i64;
         let mut fit = PredictorFit::new();
-        coder.clone().plane(attribute, grid, mean, |i, around, _, _| {
+        coder.clone().plane(group, grid, mean, |i, around, _, _| {
             fit.add(around, grid.value(multiples[i]) - grid.value(mean));
             (multiples[i], 0)
         });
         let parts = fit.parts();
         let factors = factors(&parts);
         let before = encoder.cost();
-        coder.plane(attribute, grid, mean, |i, around, size, models| {
-            let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
-            let residual = multiples[i] - expected;
-            models.encode(residual, size, &mut encoder);
-            (multiples[i], residual)
+        coder.plane(group, grid, mean, |i, around, size, models| {
+            let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
+            (multiples[i], models.encode(multiples[i], predicted, size, &mut encoder))
         });
-        *bits.entry(ATTRIBUTES[attribute].to_owned()).or_default() += encoder.cost() - before;
+        let name = match group.checked_sub(ATTRIBUTES.len()) {
+            Some(column) => columns[column].name.as_str(),
+            None => ATTRIBUTES[group],
+        };
+        *bits.entry(name.to_owned()).or_default() += encoder.cost() - before;
         shape.means.push(mean);
         shape.parts.push(parts);
     }
     (shape, encoder.finish(), order)
 }
 
-/// Decodes the Gaussians from their symbols `bytes`; `None` if the bytes do not match `shape`.
-pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians> {
+/// Decodes the Gaussians and their further columns from their symbols `bytes`; `None` if the bytes do not match
+/// `shape`, which must be sound.
+pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians, Vec<Column>)> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
+    let zeros = |column: &ColumnShape| Column {
+        name: column.name.clone(),
+        values: AttributeValues::zeros(column.planes, shape.gaussians),
+    };
+    let mut columns: Vec<Column> = shape.columns.iter().map(zeros).collect();
     let grid = QuantizationGrid::new(shape.steps[0]);
     let (mut lengths, mut at) = (CurveDistances::new(), 0u64);
     for i in 0..shape.gaussians {
@@ -199,20 +284,21 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians>
         cloud.position.set_row(i, place);
     }
     let mut coder = PlaneCoder::new(shape.gaussians);
-    for (k, (column, c, attribute)) in planes(shape.sh_degree).into_iter().enumerate() {
-        let grid = QuantizationGrid::new(shape.steps[attribute]);
-        let mean = shape.means[k];
+    for (k, coded) in shape.planes().into_iter().enumerate() {
+        let (grid, mean) = (shape.grid(coded), shape.means[k]);
         let factors = factors(&shape.parts[k]);
-        let plane = cloud.column_mut(column).plane_mut(c);
-        coder.plane(attribute, grid, mean, |i, around, size, models| {
-            let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
-            let residual = models.decode(size, &mut decoder);
-            let multiple = expected.wrapping_add(residual);
+        let plane = match coded.source {
+            PlaneSource::Attribute(attribute, c) => cloud.column_mut(attribute).plane_mut(c),
+            PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),
+        };
+        coder.plane(coded.group, grid, mean, |i, around, size, models| {
+            let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
+            let (multiple, residual) = models.decode(predicted, size, &mut decoder);
             plane[i] = grid.value(multiple);
             (multiple, residual)
         });
     }
-    decoder.is_finished().then_some(cloud)
+    decoder.is_finished().then_some((cloud, columns))
 }
 
 /// Adaptive models for coding distances along the Morton curve. The number of bits of a distance is coded as two
@@ -252,9 +338,8 @@ struct PlaneCoder {
     known: [Vec<f32>; 2],
     /// Moving average of the absolute prediction errors of each Gaussian over the planes, in quantization steps.
     sizes: Vec<f32>,
-    /// Attribute of the current plane, as an index in [`ATTRIBUTES`]. All planes of an attribute share the entropy
-    /// models.
-    attribute: usize,
+    /// [`Plane::group`] of the current plane. All planes of a group share the entropy models.
+    group: usize,
     models: Residuals,
 }
 
@@ -262,7 +347,7 @@ impl PlaneCoder {
     /// Returns the state before the first plane is coded, for `count` Gaussians.
     fn new(count: usize) -> PlaneCoder {
         let none = || vec![0.0; count];
-        PlaneCoder { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
+        PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }
     }
 
     /// Visits every Gaussian of one plane (scalar component) in coding order. `code` encodes or decodes one value. It
@@ -272,13 +357,13 @@ impl PlaneCoder {
     #[inline(always)]
     fn plane(
         &mut self,
-        attribute: usize,
+        group: usize,
         grid: QuantizationGrid,
         mean: i64,
         mut code: impl FnMut(usize, &[f32; NEIGHBORS], f32, &mut Residuals) -> (i64, i64),
     ) {
-        if self.attribute != attribute {
-            (self.attribute, self.models) = (attribute, Residuals::new());
+        if self.group != group {
+            (self.group, self.models) = (group, Residuals::new());
         }
         let mean = grid.value(mean);
         let [one, two] = &mut self.known;
@@ -297,22 +382,54 @@ impl PlaneCoder {
     }
 }
 
+/// Returns attribute, component and index in [`ATTRIBUTES`] of every plane of the attributes, with the position.
+fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usize)> {
+    let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
+    positions.chain(attribute_planes(sh_degree).into_iter().filter_map(|plane| match plane.source {
+        PlaneSource::Attribute(attribute, c) => Some((attribute, c, plane.group)),
+        PlaneSource::Column(..) => None,
+    }))
+}
+
+/// Returns the quaternions `rotation`, but those that `grid` would make zero with ± one step in their largest component
+/// and zeros in the others. Renderers cannot show a Gaussian with a quaternion of zero.
+fn nonzero_rotations(rotation: &AttributeValues, grid: QuantizationGrid) -> AttributeValues {
+    let mut nonzero = rotation.clone();
+    for i in 0..rotation.len() {
+        let row: [f32; 4] = rotation.row(i);
+        if row.iter().all(|&value| grid.multiple(value) == 0) {
+            let largest = (1..4).fold(0, |largest, c| if row[c].abs() > row[largest].abs() { c } else { largest });
+            if row[largest] != 0.0 {
+                let sign = if row[largest] > 0.0 { 1 } else { -1 };
+                nonzero.set_row::<4>(i, std::array::from_fn(|c| grid.value(if c == largest { sign } else { 0 })));
+            }
+        }
+    }
+    nonzero
+}
+
 /// Rounds values in place to the quantization grids of `steps`. Only attributes whose index in [`ATTRIBUTES`] is in
 /// `attributes` are rounded.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
-    let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
-    for (column, c, attribute) in positions.chain(planes(cloud.sh_degree())) {
+    if attributes.contains(&1) {
+        cloud.rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
+    }
+    for (column, c, attribute) in components(cloud.sh_degree()) {
         if attributes.contains(&attribute) {
-            let grid = QuantizationGrid::new(steps[attribute]);
-            cloud.column_mut(column).plane_mut(c).iter_mut().for_each(|value| *value = grid.round(*value));
+            round_all(cloud.column_mut(column).plane_mut(c), steps[attribute]);
         }
     }
+}
+
+/// Rounds `values` to the quantization grid with the step 2^(`step`/8).
+pub(super) fn round_all(values: &mut [f32], step: i32) {
+    let grid = QuantizationGrid::new(step);
+    values.iter_mut().for_each(|value| *value = grid.round(*value));
 }
 
 /// Returns the values of the attribute [`ATTRIBUTES`]`[attribute]`: all Gaussians' first scalar component, then their
 /// second, and so on.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
-    let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
-    let own = positions.chain(planes(cloud.sh_degree())).filter(move |plane| plane.2 == attribute);
+    let own = components(cloud.sh_degree()).filter(move |plane| plane.2 == attribute);
     own.flat_map(|(column, c, _)| cloud.column(column).plane(c).iter().copied())
 }

@@ -14,6 +14,8 @@ const TOTAL: i16 = i16::MAX;
 pub(super) const SYMBOLS: usize = 16;
 /// Minimum probability of a symbol, in units of 1/2^15. It keeps every symbol possible.
 const MIN_PROBABILITY: i16 = 8;
+/// Minimum probability of a bit that is coded with a model, in units of 1/2^15.
+const MIN_BIT_PROBABILITY: i32 = 64;
 /// Lower bound of the 64-bit state of the ANS coder; when the state is below it, the decoder reads another 32-bit word.
 const MIN_STATE: u64 = 1 << 31;
 /// Initial value of `rate`, the learning rate of a model. After each symbol, the model's probabilities move by
@@ -83,6 +85,34 @@ impl SymbolModel {
     }
 }
 
+/// Adaptive probability of a bit.
+#[derive(Debug, Clone)]
+pub(super) struct BitModel {
+    /// Probability that the bit is 0, in units of 1/2^15.
+    zero: i32,
+    /// Number of bits that the model has seen so far; it determines the learning rate.
+    seen: u32,
+}
+
+impl BitModel {
+    /// Model that has seen no bit: 0 and 1 are equally likely.
+    pub(super) const NEW: BitModel = BitModel { zero: 1 << (PRECISION - 1), seen: 0 };
+
+    /// Returns the interval of `bit`, in units of 1/2^15: its start and its length.
+    fn interval(&self, bit: bool) -> (u32, u32) {
+        let zero = self.zero as u32;
+        if bit { (zero, (1 << PRECISION) - zero) } else { (0, zero) }
+    }
+
+    /// Updates the probability after `bit` was coded. Both probabilities stay at least [`MIN_BIT_PROBABILITY`].
+    fn learn(&mut self, bit: bool) {
+        let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
+        self.seen = self.seen.saturating_add(1);
+        let known = if bit { MIN_BIT_PROBABILITY } else { (1 << PRECISION) - MIN_BIT_PROBABILITY };
+        self.zero += (known - self.zero) >> rate;
+    }
+}
+
 /// Writer of entropy-coded symbols and plain bits.
 #[derive(Debug, Default)]
 pub(super) struct SymbolEncoder {
@@ -102,10 +132,20 @@ impl SymbolEncoder {
 
     /// Writes `symbol`, coded with the probability that `model` gives it. Then updates the model.
     pub(super) fn symbol(&mut self, model: &mut SymbolModel, symbol: usize) {
-        let (start, interval) = model.interval(symbol);
-        self.cost += f64::from(PRECISION) - f64::from(interval).log2();
-        self.symbols.push((start as u16, interval as u16));
+        self.interval(model.interval(symbol));
         model.learn(symbol);
+    }
+
+    /// Writes `bit`, coded with the probability that `model` gives it. Then updates the model.
+    pub(super) fn bit(&mut self, model: &mut BitModel, bit: bool) {
+        self.interval(model.interval(bit));
+        model.learn(bit);
+    }
+
+    /// Writes a symbol with this start and length of its interval, in units of 1/2^15.
+    fn interval(&mut self, (start, length): (u32, u32)) {
+        self.cost += f64::from(PRECISION) - f64::from(length).log2();
+        self.symbols.push((start as u16, length as u16));
     }
 
     /// Writes the low `count` (at most 32) bits of `value` as plain bits.
@@ -192,8 +232,25 @@ impl<'a> SymbolDecoder<'a> {
         let place = (self.state & ((1 << PRECISION) - 1)) as i16;
         let at_or_below: i16 = model.starts.iter().map(|&start| i16::from(start <= place)).sum();
         let symbol = (at_or_below as usize - 1) & (SYMBOLS - 1);
-        let (start, interval) = model.interval(symbol);
-        self.state = u64::from(interval) * (self.state >> PRECISION) + u64::from(place as u32 - start);
+        self.advance(place as u32, model.interval(symbol));
+        model.learn(symbol);
+        symbol
+    }
+
+    /// Reads the next bit, which is coded with the probability of `model`. Then updates the model.
+    #[inline(always)]
+    pub(super) fn bit(&mut self, model: &mut BitModel) -> bool {
+        let place = (self.state & ((1 << PRECISION) - 1)) as u32;
+        let bit = place >= model.zero as u32;
+        self.advance(place, model.interval(bit));
+        model.learn(bit);
+        bit
+    }
+
+    /// Moves the state past a symbol with this start and length of its interval, which contains `place`.
+    #[inline(always)]
+    fn advance(&mut self, place: u32, (start, length): (u32, u32)) {
+        self.state = u64::from(length) * (self.state >> PRECISION) + u64::from(place - start);
         if self.state < MIN_STATE {
             let word = self.words.next().map_or_else(
                 || {
@@ -204,8 +261,6 @@ impl<'a> SymbolDecoder<'a> {
             );
             self.state = self.state << 32 | u64::from(word);
         }
-        model.learn(symbol);
-        symbol
     }
 
     /// Reads `count` (at most 32) plain bits.
@@ -261,18 +316,20 @@ mod tests {
         fn symbols_and_bits_are_read_back_in_order(
             items in prop::collection::vec((0usize..SYMBOLS, 0usize..3, any::<u64>(), 0u32..64), 0..2000)
         ) {
-            let mut models = vec![SymbolModel::NEW; 3];
+            let (mut models, mut signs) = (vec![SymbolModel::NEW; 3], vec![BitModel::NEW; 3]);
             let mut encoder = SymbolEncoder::default();
             for &(symbol, model, value, count) in &items {
                 encoder.symbol(&mut models[model], symbol);
+                encoder.bit(&mut signs[model], value & 5 == 0);
                 encoder.long_bits(value, count);
                 encoder.number(value >> (count + 1).min(63));
             }
             let bytes = encoder.finish();
-            let mut models = vec![SymbolModel::NEW; 3];
+            let (mut models, mut signs) = (vec![SymbolModel::NEW; 3], vec![BitModel::NEW; 3]);
             let mut decoder = SymbolDecoder::new(&bytes).unwrap();
             for &(symbol, model, value, count) in &items {
                 prop_assert_eq!(decoder.symbol(&mut models[model]), symbol);
+                prop_assert_eq!(decoder.bit(&mut signs[model]), value & 5 == 0);
                 prop_assert_eq!(decoder.long_bits(count), value & ((1 << count) - 1));
                 prop_assert_eq!(decoder.number(), value >> (count + 1).min(63));
             }
@@ -282,9 +339,10 @@ mod tests {
         #[test]
         fn decoding_any_bytes_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
             if let Some(mut decoder) = SymbolDecoder::new(&bytes) {
-                let mut model = SymbolModel::NEW;
+                let (mut model, mut sign) = (SymbolModel::NEW, BitModel::NEW);
                 for _ in 0..300 {
                     prop_assert!(decoder.symbol(&mut model) < SYMBOLS);
+                    decoder.bit(&mut sign);
                     decoder.number();
                 }
             }
@@ -299,6 +357,15 @@ mod tests {
                     prop_assert!(model.interval(other).1 >= MIN_PROBABILITY as u32, "{:?}", model.starts);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn no_bit_ever_becomes_impossible() {
+        for bit in [false, true] {
+            let mut model = BitModel::NEW;
+            (0..10_000).for_each(|_| model.learn(bit));
+            assert!(model.interval(!bit).1 >= MIN_BIT_PROBABILITY as u32, "{model:?}");
         }
     }
 

@@ -110,6 +110,12 @@ impl TensorEntry {
         }
     }
 
+    /// Returns the number of places (rows times columns) of a tensor with several channels; 0 for other tensors.
+    pub(super) fn places(&self) -> usize {
+        let [channels, rows, columns] = self.extents();
+        if channels > 1 { rows.saturating_mul(columns) } else { 0 }
+    }
+
     /// Returns whether shape, role and quantization steps fit together. An entry from an untrusted file must pass this
     /// check.
     pub(super) fn is_sound(&self) -> bool {

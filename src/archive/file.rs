@@ -15,7 +15,7 @@ use crate::limits::ReadLimit;
 /// First bytes of an archive. Their line ends reveal a file that was transferred as text.
 pub const MAGIC: [u8; 8] = *b"\x89GSZ\r\n\x1a\n";
 /// Format version that is written, and the only version that can be read.
-pub const VERSION: u16 = 1;
+pub const VERSION: u16 = 2;
 
 /// Number of sections of an archive.
 const SECTIONS: usize = 4;
@@ -80,26 +80,40 @@ pub(super) struct Damage {
     place: String,
     expected: String,
     found: String,
+    /// What the user can do.
+    advice: &'static str,
 }
+
+/// What a user can do about a damaged archive.
+const COPY_AGAIN: &str = "the archive is damaged or cut short; copy it again";
+/// What a user can do about an archive of another version.
+const WRITE_AGAIN: &str = "write the archive again from its model with this version of splatsieve, or open it with the \
+                           version that wrote it";
 
 impl Damage {
     /// Creates a defect. `place` is a part of the file, such as a section.
     pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
-        Damage { place: place.to_owned(), expected: expected.into(), found: found.into() }
+        Damage { place: place.to_owned(), expected: expected.into(), found: found.into(), advice: COPY_AGAIN }
     }
 
     /// Returns the error about this defect in the file at `path`.
     pub(super) fn in_file(self, path: &Path) -> Error {
-        Error::input(path, self.place, self.expected, self.found)
-            .hint("the archive is damaged or cut short; copy it again")
+        Error::input(path, self.place, self.expected, self.found).hint(self.advice)
     }
 }
 
 /// Returns the bytes of an archive with the contents `sections`, and its size by purpose.
 ///
 /// # Errors
-/// Fails if the compression of a section fails.
+/// Fails if the compression of a section fails, or if the table of contents is longer than a reader accepts.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
+    if sections.table.len() as u64 > MAX_TABLE_BYTES {
+        return Err(Error::usage(format!(
+            "the table of an archive has at most {MAX_TABLE_BYTES} bytes; that of this model has {}\n  write a .gseq of \
+             its frames",
+            sections.table.len()
+        )));
+    }
     let pack = |bytes: &[u8]| {
         zstd::bulk::compress(bytes, ZSTD_LEVEL)
             .map_err(|error| Error::internal(format!("cannot compress an archive: {error}")))
@@ -141,11 +155,9 @@ impl ArchiveHeader {
         }
         let version = head[MAGIC.len()..].first_chunk().map(|&bytes| u16::from_le_bytes(bytes));
         if let Some(found) = version.filter(|&version| version != VERSION) {
-            return Err(Damage::new(
-                "byte 8",
-                format!("version {VERSION}"),
-                format!("version {found}, of another version of splatsieve"),
-            ));
+            let found = format!("version {found}, of another version of splatsieve");
+            let damage = Damage::new("byte 8", format!("version {VERSION}"), found);
+            return Err(Damage { advice: WRITE_AGAIN, ..damage });
         }
         let Some(head) = head.get(..HEADER_BYTES) else {
             return Err(Damage::new("head", format!("{HEADER_BYTES} bytes"), format!("{whole} bytes")));

@@ -25,7 +25,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use cloud::spread;
-pub use cloud::{ATTRIBUTES, CloudSteps};
+pub use cloud::{ATTRIBUTES, CloudSteps, Column};
 pub use field::{FieldSteps, TensorRole, TensorSteps, round_tensor};
 pub use file::{ArchiveSize, HEADER_BYTES, MAGIC, VERSION};
 pub use importance::step_offsets;
@@ -46,6 +46,8 @@ pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 pub struct ArchiveContent {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
+    /// Further values of the Gaussians, as many rows as `cloud` has.
+    pub columns: Vec<Column>,
     /// Use of each tensor by the deformation field, by name; empty if there is no field.
     pub field: BTreeMap<String, TensorRole>,
     /// Tensors of the deformation field, by name.
@@ -64,6 +66,8 @@ pub struct ArchiveContent {
 pub struct QuantizationSteps {
     /// Quantization step number of each attribute of the Gaussians.
     pub cloud: CloudSteps,
+    /// Quantization step of each of [`ArchiveContent::columns`], as an exponent; see [`step_size()`].
+    pub columns: Vec<i32>,
     /// Quantization step of each tensor of the deformation field.
     pub field: FieldSteps,
 }
@@ -77,7 +81,7 @@ pub struct EncodedArchive {
     pub parts: ArchiveSize,
     /// For each Gaussian in the order of the archive, its index in the encoded [`ArchiveContent`].
     pub order: Vec<u32>,
-    /// Approximate number of bits that each attribute and each quantized tensor take, by name.
+    /// Approximate number of bits that each attribute, column and quantized tensor takes, by name.
     pub bits: BTreeMap<String, f64>,
 }
 
@@ -103,9 +107,10 @@ struct Table {
 pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<EncodedArchive> {
     check(content, steps)?;
     let mut bits = BTreeMap::new();
-    let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
+    let grids = (&steps.cloud, &steps.columns[..]);
+    let (shape, cloud, order) = cloud::encode(&content.cloud, &content.columns, grids, &mut bits);
     // Positions as a reader of the archive will decode them.
-    let stored =
+    let (stored, _) =
         cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
     let readers = Readers { position: &stored.position, space: field_box(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
@@ -151,7 +156,9 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(ArchiveCo
     let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
     // While decoding, two values and one mean error size (12 bytes) are kept for each Gaussian.
-    let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
+    // While decoding a tensor, one mean error size is kept for each of its places.
+    let places = table.tensors.iter().map(TensorEntry::places).max().unwrap_or(0) as u64;
+    let needed = head.bytes() + 4 * values + 4 * places + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
@@ -195,7 +202,7 @@ fn decoded(
 ) -> std::result::Result<(ArchiveContent, ArchiveSize), Damage> {
     let Sections { cloud, field, blobs, .. } = sections;
     let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
-    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
+    let (cloud, columns) = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
 
     let count = |entry: &&TensorEntry| entry.role == TensorRole::Exact;
     let exact = table.tensors.iter().filter(count).filter_map(TensorEntry::values).sum::<usize>() * 4;
@@ -236,7 +243,7 @@ fn decoded(
     let readers = Readers { position: &cloud.position, space, times: content.times };
     content.tensors = field::decode(&table.tensors, &field, &exact, &readers).ok_or_else(|| unsound("field"))?;
     content.field = table.tensors.into_iter().map(|entry| (entry.name, entry.role)).collect();
-    content.cloud = cloud;
+    (content.cloud, content.columns) = (cloud, columns);
     Ok((content, parts))
 }
 
@@ -250,6 +257,11 @@ pub fn field_box(content: &ArchiveContent) -> Option<Box3> {
 /// the Gaussians. Only attributes whose index in [`ATTRIBUTES`] is in `attributes` are rounded.
 pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     cloud::round(cloud, steps, attributes);
+}
+
+/// Rounds the values of `column` to the quantization grid with the step 2^(`step`/8), as an archive would.
+pub fn round_column(column: &mut Column, step: i32) {
+    cloud::round_all(column.values.planes_mut(), step);
 }
 
 /// Returns the values of the attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
@@ -271,6 +283,17 @@ fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
             )));
         }
     }
+    if content.columns.len() != steps.columns.len() {
+        return Err(Error::internal("the columns of an archive have no quantization steps"));
+    }
+    for Column { name, values } in &content.columns {
+        if values.len() != content.cloud.len() {
+            return Err(Error::internal(format!("{} values of {name} for {}", values.len(), content.cloud.len())));
+        }
+        if let Some(value) = values.planes().iter().find(|value| !value.is_finite()) {
+            return Err(Error::usage(format!("an archive holds finite values: {name} of a Gaussian is {value}")));
+        }
+    }
     for (name, tensor) in &content.tensors {
         if matches!(content.field.get(name), Some(TensorRole::Exact | TensorRole::Unread)) {
             continue;
@@ -279,7 +302,7 @@ fn check(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<()> {
             return Err(Error::usage(format!("an archive holds finite values: tensor {name} has {value}")));
         }
     }
-    let coarse = steps.cloud.iter().chain(steps.field.0.values().map(|steps| &steps.step));
+    let coarse = steps.cloud.iter().chain(&steps.columns).chain(steps.field.0.values().map(|steps| &steps.step));
     match coarse.into_iter().find(|step| !STEP_NUMBERS.contains(step)) {
         Some(step) => Err(Error::usage(format!(
             "the steps of an archive are {} to {}; found {step}",

@@ -2,7 +2,7 @@
 //!
 //! Input: values `[channels, rows, columns]`, and a class for every place (row and column), which gives the
 //! quantization step of the place or marks it as never read. Output: symbols, and the values that a decoder restores.
-//! Memory: three rows.
+//! Memory: three rows, and one value per place (row and column) if there are several channels.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
@@ -38,7 +38,8 @@ pub(super) struct QuantizedTensor<'a> {
 struct Context {
     /// Values of the neighbors of the place, less the mean of the tensor.
     values: [f32; NEIGHBORS],
-    /// Mean absolute prediction error of the neighbors of the place, in quantization steps of the place.
+    /// Expected absolute prediction error, in quantization steps of the place: a weighted mean of the errors of its
+    /// neighbors and of the moving average of the errors at the same place in earlier channels.
     size: f32,
 }
 
@@ -90,10 +91,10 @@ impl QuantizedTensor<'_> {
     ) {
         let factors = factors(parts);
         self.visit(data, |_, value, context, grid| {
-            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &context.values)));
+            let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let multiple = grid.multiple(value);
-            models.encode(multiple - expected, context.size, to);
-            (grid.value(multiple), (multiple - expected).unsigned_abs() as f32 * grid.size())
+            let residual = models.encode(multiple, predicted, context.size, to);
+            (grid.value(multiple), residual.unsigned_abs() as f32)
         });
     }
 
@@ -108,17 +109,16 @@ impl QuantizedTensor<'_> {
     ) {
         let factors = factors(parts);
         self.visit(data, |_, _, context, grid| {
-            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &context.values)));
-            let residual = models.decode(context.size, from);
-            let multiple = expected.wrapping_add(residual);
-            (grid.value(multiple), residual.unsigned_abs() as f32 * grid.size())
+            let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
+            let (multiple, residual) = models.decode(predicted, context.size, from);
+            (grid.value(multiple), residual.unsigned_abs() as f32)
         });
     }
 
     /// Visits every place (row and column) that is read, row by row. `code` encodes or decodes one value. It receives
     /// the index of the place in its channel, the value in `data`, the known neighbors and the quantization grid. It
-    /// returns the restored value and the absolute prediction error; later places are predicted from both. Places that
-    /// are never read get the mean of their neighbors.
+    /// returns the restored value and the absolute prediction error in quantization steps; later places are predicted
+    /// from both. Places that are never read get the mean of their neighbors.
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
@@ -126,6 +126,8 @@ impl QuantizedTensor<'_> {
         let line = || vec![0.0f32; columns + 3];
         let (mut above2, mut above, mut here) = (line(), line(), line());
         let (mut sizes_above, mut sizes) = (line(), line());
+        // Moving average of the errors at every place over the channels, in quantization steps.
+        let mut averages = vec![1.0f32; if self.channels > 1 { self.rows * columns } else { 0 }];
         for (channel, data) in data.chunks_exact_mut((self.rows * columns).max(1)).take(self.channels).enumerate() {
             let grids: Vec<QuantizationGrid> =
                 (0..self.class_count).map(|class| (self.grids)(channel, class as u8)).collect();
@@ -149,11 +151,15 @@ impl QuantizedTensor<'_> {
                         continue;
                     };
                     let values = [left, up, up_left, up_right, here[at - 2], above2[at]];
-                    let context = Context { values, size: grid.in_steps(size) };
-                    let (coded, off) = code(row * columns + column, *value, &context, grid);
+                    let (place, nearby) = (row * columns + column, grid.in_steps(size));
+                    let size = averages.get(place).map_or(nearby, |average| 0.25 * nearby + 0.75 * average);
+                    let (coded, off) = code(place, *value, &Context { values, size }, grid);
                     *value = coded;
                     here[at] = coded - self.mean;
-                    sizes[at] = off;
+                    sizes[at] = off * grid.size();
+                    if let Some(average) = averages.get_mut(place) {
+                        *average = 0.875 * *average + 0.125 * off;
+                    }
                 }
                 // The place to the right of the last column repeats its value.
                 (here[columns + 2], sizes[columns + 2]) = (here[columns + 1], sizes[columns + 1]);

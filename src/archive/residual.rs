@@ -2,9 +2,11 @@
 //! selects the entropy model.
 //!
 //! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. Its position within the
-//! class and its sign are plain bits, because probabilities within a class hardly differ.
+//! class is plain bits, because probabilities within a class hardly differ. The sign depends on the side of the
+//! predicted multiple on which the predicted value lies.
 
-use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
+use super::entropy::{BitModel, SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
+use super::step::{OFFSETS, PredictedMultiple};
 
 /// Classes of error magnitudes: the smallest magnitude of each class, and the number of plain bits for the position of
 /// a magnitude in the class. The last class has no upper limit.
@@ -31,15 +33,22 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
 /// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Entropy models of prediction errors, one for each range of the expected error size. Similar planes or tensors share
-/// them.
+/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all others.
+const SIGN_CONTEXTS: usize = 4;
+
+/// Entropy models of prediction errors. Similar planes or tensors share them.
 #[derive(Debug, Clone)]
-pub(super) struct Residuals([SymbolModel; CONTEXTS]);
+pub(super) struct Residuals {
+    /// Model of the class of the magnitude for each range of the expected error size.
+    classes: [SymbolModel; CONTEXTS],
+    /// Models of the sign by [`PredictedMultiple::offset`] and class of the magnitude.
+    signs: [[BitModel; SIGN_CONTEXTS]; OFFSETS],
+}
 
 impl Residuals {
     /// Returns models that have seen no error yet.
     pub(super) fn new() -> Residuals {
-        Residuals([SymbolModel::NEW; CONTEXTS])
+        Residuals { classes: [SymbolModel::NEW; CONTEXTS], signs: [const { [BitModel::NEW; SIGN_CONTEXTS] }; OFFSETS] }
     }
 
     /// Returns the entropy model for the expected error size `size`: the mean magnitude of neighboring errors, in
@@ -47,12 +56,24 @@ impl Residuals {
     #[inline(always)]
     fn model_for_size(&mut self, size: f32) -> &mut SymbolModel {
         let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
-        &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
+        &mut self.classes[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Writes the prediction error `residual`, in quantization steps, to `to`. `size` is its expected magnitude, which
-    /// selects the entropy model.
-    pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut SymbolEncoder) {
+    /// Returns the entropy model of the sign of an error whose magnitude has the class `class`, which is not 0.
+    fn sign_model(&mut self, offset: usize, class: usize) -> &mut BitModel {
+        &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
+    }
+
+    /// Writes the multiple `multiple`, which was predicted as `predicted`, to `to`. `size` is the expected magnitude of
+    /// the prediction error, in quantization steps, which selects the entropy model. Returns the prediction error.
+    pub(super) fn encode(
+        &mut self,
+        multiple: i64,
+        predicted: PredictedMultiple,
+        size: f32,
+        to: &mut SymbolEncoder,
+    ) -> i64 {
+        let residual = multiple - predicted.multiple;
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
         to.symbol(self.model_for_size(size), class);
@@ -62,23 +83,31 @@ impl Residuals {
         } else {
             to.bits(above, CLASSES[class].1);
         }
-        if magnitude > 0 {
-            to.bits(u64::from(residual < 0), 1);
+        if class > 0 {
+            to.bit(self.sign_model(predicted.offset, class), residual < 0);
         }
+        residual
     }
 
-    /// Reads a prediction error, in quantization steps. `size` is its expected magnitude, which selects the entropy
-    /// model.
+    /// Reads a multiple that was predicted as `predicted`. `size` is the expected magnitude of the prediction error, in
+    /// quantization steps, which selects the entropy model. Returns the multiple and the prediction error.
     #[inline(always)]
-    pub(super) fn decode(&mut self, size: f32, from: &mut SymbolDecoder<'_>) -> i64 {
+    pub(super) fn decode(
+        &mut self,
+        predicted: PredictedMultiple,
+        size: f32,
+        from: &mut SymbolDecoder<'_>,
+    ) -> (i64, i64) {
         let class = from.symbol(self.model_for_size(size));
         if class == 0 {
-            return 0;
+            return (predicted.multiple, 0);
         }
         let (first, bits) = CLASSES[class];
         let above = if class == SYMBOLS - 1 { from.number() } else { from.bits(bits) };
         let magnitude = first.wrapping_add(above) as i64;
-        if from.bits(1) == 1 { magnitude.wrapping_neg() } else { magnitude }
+        let is_negative = from.bit(self.sign_model(predicted.offset, class));
+        let residual = if is_negative { magnitude.wrapping_neg() } else { magnitude };
+        (predicted.multiple.wrapping_add(residual), residual)
     }
 }
 
@@ -96,13 +125,16 @@ mod tests {
     #[test]
     fn errors_are_read_back_for_every_expected_size() {
         let values: Vec<i64> = (-300..300).chain([1 << 40, -(1 << 50), i64::from(i32::MAX)]).collect();
+        let predicted = PredictedMultiple { multiple: -7, offset: 3 };
         for size in [0.0, 0.3, 1.0, 50.0, f32::INFINITY, f32::NAN] {
             let (mut models, mut encoder) = (Residuals::new(), SymbolEncoder::default());
-            values.iter().for_each(|&value| models.encode(value, size, &mut encoder));
+            for &value in &values {
+                assert_eq!(models.encode(value, predicted, size, &mut encoder), value + 7);
+            }
             let bytes = encoder.finish();
             let (mut models, mut decoder) = (Residuals::new(), SymbolDecoder::new(&bytes).unwrap());
             for &value in &values {
-                assert_eq!(models.decode(size, &mut decoder), value);
+                assert_eq!(models.decode(predicted, size, &mut decoder), (value, value + 7));
             }
             assert!(decoder.is_finished());
         }

@@ -38,6 +38,18 @@ pub fn nearest_step_number(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
 
+/// Number of intervals of a [`PredictedMultiple`].
+pub(super) const OFFSETS: usize = 8;
+
+/// Multiple of a quantization step that is nearest to a predicted value.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PredictedMultiple {
+    pub(super) multiple: i64,
+    /// Eighth of a step in which the predicted value lies: 0 begins half a step below the multiple, 7 ends half a step
+    /// above it.
+    pub(super) offset: usize,
+}
+
 /// Uniform grid of the values to which quantization rounds: all multiples of a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct QuantizationGrid {
@@ -63,6 +75,16 @@ impl QuantizationGrid {
     pub(super) fn nearest(self, value: f64) -> i64 {
         let x = (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
         (x + ROUNDING - ROUNDING) as i64
+    }
+
+    /// Returns the multiple nearest to the predicted value `value`, and how far the value is from it.
+    #[inline(always)]
+    pub(super) fn predicted(self, value: f32) -> PredictedMultiple {
+        let x = (f64::from(value) * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
+        let multiple = (x + ROUNDING - ROUNDING) as i64;
+        // `as` rounds down, and turns NaN into 0.
+        let offset = ((x - multiple as f64 + 0.5) * OFFSETS as f64) as usize;
+        PredictedMultiple { multiple, offset: offset.min(OFFSETS - 1) }
     }
 
     /// Returns the value that the whole number `multiple` stands for: `multiple` times the step.

@@ -7,6 +7,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use super::*;
 use crate::deform::{Tensor, tap};
+use crate::model::AttributeValues;
 
 /// Generator of deterministic pseudo-random numbers.
 struct NoiseGenerator(u64);
@@ -50,6 +51,11 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
     content.tensors.insert(BOX_TENSOR.to_owned(), corners);
     content.field.insert(BOX_TENSOR.to_owned(), TensorRole::Exact);
+    for (name, width) in [("motion", 2), ("window", 1), ("none", 0)] {
+        let mut values = AttributeValues::zeros(width, count);
+        values.planes_mut().iter_mut().for_each(|value| *value = noise.next());
+        content.columns.push(Column { name: name.to_owned(), values });
+    }
     content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.files.insert("empty".to_owned(), Vec::new());
@@ -59,7 +65,8 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
 fn some_steps(content: &ArchiveContent, octave: i32) -> QuantizationSteps {
     let step = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
     let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), step(k)));
-    let mut steps = QuantizationSteps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
+    let mut steps = QuantizationSteps { cloud: [0; 8], columns: Vec::new(), field: FieldSteps(tensors.collect()) };
+    steps.columns = (0..content.columns.len() as i32).map(|k| 8 * octave + 3 * k).collect();
     steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
     steps
 }
@@ -90,7 +97,18 @@ proptest! {
         for (k, name) in ATTRIBUTES.iter().enumerate().take(4 + degree + 1) {
             let step = step_size(steps.cloud[k]);
             for (a, b) in attribute_values(&expected, k).zip(attribute_values(&back.cloud, k)) {
+                // A rotation that would become zero errs by at most a step.
+                let step = if k == 1 { 2.0 * step } else { step };
                 prop_assert!(near(a, b, step), "{name}: {a} {b} of step {step}");
+            }
+        }
+        for ((column, decoded), &step) in content.columns.iter().zip(&back.columns).zip(&steps.columns) {
+            prop_assert_eq!((&column.name, column.values.width()), (&decoded.name, decoded.values.width()));
+            for c in 0..column.values.width() {
+                let pairs = order.iter().map(|&id| column.values.plane(c)[id as usize]).zip(decoded.values.plane(c));
+                for (a, &b) in pairs {
+                    prop_assert!(near(a, b, step_size(step)), "{}: {a} {b} of step {step}", column.name);
+                }
             }
         }
         for (i, &id) in order.iter().enumerate() {
@@ -224,12 +242,24 @@ fn content_beyond_the_memory_limit_is_refused() {
 }
 
 #[test]
-fn a_later_version_is_named() {
+fn archives_of_other_versions_are_refused_with_advice() {
     let content = content(6, 2, 0);
-    let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
-    bytes[8] = 2;
-    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
-    assert!(message.contains("version 1") && message.contains("version 2"), "{message}");
+    for version in [0, 1, 3] {
+        let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+        bytes[8] = version;
+        let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
+        for says in ["expected version 2", &format!("version {version}"), "write the archive again from its model"] {
+            assert!(message.contains(says), "{message}");
+        }
+    }
+}
+
+#[test]
+fn a_table_longer_than_readers_accept_is_not_written() {
+    let mut content = content(6, 2, 0);
+    (0..20_000).for_each(|k| _ = content.files.insert(format!("{k:060}"), Vec::new()));
+    let message = encode(&content, &some_steps(&content, -3)).unwrap_err().to_string();
+    assert!(message.contains("at most 1048576 bytes"), "{message}");
 }
 
 #[test]
@@ -241,6 +271,24 @@ fn non_finite_values_are_refused_by_name() {
     let mut bad = content(7, 3, 0);
     bad.tensors.get_mut("a.matrix").unwrap().data[4] = f32::INFINITY;
     assert!(encode(&bad, &some_steps(&bad, -3)).unwrap_err().to_string().contains("a.matrix"));
+}
+
+#[test]
+fn coarse_steps_leave_no_rotation_at_zero() {
+    let mut content = content(8, 4, 0);
+    let rows = [[0.1, -0.2, 0.3, 0.1], [0.0, -0.4, 0.3, 0.1], [0.0; 4], [0.9, 0.0, 0.0, 0.1]];
+    rows.iter().enumerate().for_each(|(i, row)| content.cloud.rotation.set_row(i, *row));
+    // A step of 1.
+    let EncodedArchive { bytes, order, .. } = encode(&content, &some_steps(&content, 0)).unwrap();
+    let mut steps = [0; 8];
+    steps[1] = some_steps(&content, 0).cloud[1];
+    let (back, _) = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap();
+    let mut rounded = content.cloud.clone();
+    round_cloud(&mut rounded, &steps, &[1]);
+    assert_eq!(back.cloud.rotation, rounded.pick(&order).rotation);
+    let is_zero = |i: usize| rounded.rotation.row::<4>(i) == [0.0; 4];
+    assert_eq!([0, 1, 2, 3].map(is_zero), [false, false, true, false]);
+    assert!(rounded.rotation.plane(2)[0] > 0.0 && rounded.rotation.plane(1)[1] < 0.0, "{rounded:?}");
 }
 
 #[test]

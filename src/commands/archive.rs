@@ -1,5 +1,5 @@
-//! Unpacking of an archive into files of the original model format, which the renderer of the model opens. Part of the
-//! command `convert`.
+//! Writing of an archive, and unpacking of an archive into files that the renderer of the model opens. Part of the command
+//! `convert`.
 
 use std::fs;
 use std::io::Read;
@@ -8,14 +8,22 @@ use std::path::Path;
 use crate::TOOL;
 use crate::archive::MAGIC;
 use crate::commands::converted::ConvertReport;
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
 use crate::files::names::name_of;
 use crate::files::open::open_file;
+use crate::journal::Journal;
 use crate::limits::ReadLimit;
 use crate::model::Attributes;
-use crate::models::archive::{is_folder, read_archive, unpack};
+use crate::models::archive::{is_folder, kind_with_layout, read_archive, unpack};
 use crate::outputs::kind::{OutputKind, check_folder_name};
+use crate::pipeline::stage::PreparedArchive;
+use crate::pipeline::stages::archive::ArchiveStage;
+use crate::pipeline::stages::reference_views::ArchiveTarget;
+use crate::pipeline::stages::write::write_within;
+use crate::recipe::Recipe;
+use crate::scene::{InputOptions, open_scene};
 
 /// Returns whether the file at `path` begins with the magic bytes of an archive; false for a folder.
 ///
@@ -31,14 +39,28 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Unpacks the archive at `path` and writes its model to `output`: a model folder, or a PLY file if the archive was
-/// made from a PLY file.
+/// Writes the model in the archive at `path` to `output` as it was before: a model folder or a single file. Returns
+/// `None` and writes nothing if the model has a layout of its own and `kind` is another kind of output, for which the
+/// model has to be opened.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
-pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<ConvertReport> {
+pub fn unpack_archive(
+    path: &Path,
+    (output, kind): (&Path, OutputKind),
+    overwrite: Replace,
+    memory: ReadLimit,
+) -> Result<Option<ConvertReport>> {
     let (content, parts) = read_archive(path, memory)?;
-    let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
+    let with_layout = kind_with_layout(&content, path)?;
+    match with_layout {
+        Some(own) if own != kind => return Ok(None),
+        // Other archives hold a model folder or a PLY.
+        None if !matches!(kind, OutputKind::Model | OutputKind::Ply) => return Ok(None),
+        _ => (),
+    }
+    let columns = content.columns.iter().map(|column| column.values.planes().len());
+    let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).chain(columns).sum();
     let attributes = content.cloud.len() * Attributes::all().width(content.cloud.sh_degree());
     let converted = |kind| ConvertReport {
         path: output.to_owned(),
@@ -53,12 +75,13 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
             parts.total()
         )],
     };
-    if !is_folder(&content) {
+    let single = with_layout.map_or(!is_folder(&content), |own| own != OutputKind::Model);
+    if single {
         check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;
         staged.commit()?;
-        return Ok(converted(OutputKind::Ply));
+        return Ok(Some(converted(with_layout.unwrap_or(OutputKind::Ply))));
     }
     check_folder_name(output, "convert")?;
     check_target(output, TargetKind::Folder, &[path], overwrite)?;
@@ -68,5 +91,49 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
     let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
-    Ok(converted(OutputKind::Model))
+    Ok(Some(converted(OutputKind::Model)))
+}
+
+/// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the
+/// archive have about 50 dB PSNR against renders of the input; an archive of frames is a container with error bounds.
+///
+/// # Errors
+/// Fails if the input cannot be read or has no archives, or if the output exists already or cannot be written.
+pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<ConvertReport> {
+    if input.is_stream() {
+        return Err(Error::usage(
+            "convert writes no archive of a stream\n  write a .gseq, or use compress - -o NAME.gsz",
+        ));
+    }
+    check_target(output, TargetKind::File, &[&input.path], overwrite)?;
+    let mut scene = open_scene(input)?;
+    scene.input.check_output(OutputKind::Archive, output)?;
+    let stage = ArchiveStage { psnr: None };
+    scene.plan_memory(input.memory, |work, limits| vec![stage.resource_estimate(work, limits)])?;
+    let info = scene.source().info();
+    let (gaussians, frames) = (info.count, info.times.len());
+    let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
+    let mut journal = Journal { whole: scene.full_read()?, notes: scene.notes.clone(), ..Journal::default() };
+    let (archived, summary) = stage.archive(&scene, &all, ArchiveTarget::Nothing, &mut journal)?;
+    let staged = StagedFile::new(output, overwrite)?;
+    match archived {
+        PreparedArchive::Content(encoded) => {
+            fs::write(staged.path(), &encoded.bytes).map_err(Error::io("write", staged.path()))?;
+        }
+        PreparedArchive::Frames(bounds) => {
+            write_within(&*scene.input.reduced(&all)?, bounds, staged.path(), &scene.events)?;
+        }
+    }
+    let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+    staged.commit()?;
+    journal.notes.push(format!("archive: {:.2} dB PSNR against renders of the input", summary.psnr));
+    Ok(ConvertReport {
+        path: output.to_owned(),
+        kind: OutputKind::Archive,
+        gaussians,
+        frames: Some(frames),
+        bytes,
+        larger: None,
+        notes: journal.notes,
+    })
 }

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::TOOL;
-use crate::commands::archive::{is_archive, unpack_archive};
+use crate::commands::archive::{is_archive, unpack_archive, write_archive};
 use crate::commands::converted::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -52,10 +52,17 @@ pub fn convert(
     if requested.is_none() {
         OutputKind::check_name(output)?;
     }
-    let is_own = |kind| matches!(kind, OutputKind::Model | OutputKind::Ply);
-    let is_model = is_own(OutputKind::from_path(output, requested, OutputKind::Model));
-    if is_model && !input.is_stream() && is_archive(&input.path)? {
-        return unpack_archive(&input.path, output, overwrite, input.memory.read_limit());
+    let named = OutputKind::from_path(output, requested, OutputKind::Model);
+    if named == OutputKind::Archive {
+        return write_archive(input, output, overwrite);
+    }
+    let may_unpack = matches!(named, OutputKind::Model | OutputKind::Ply | OutputKind::Splatv | OutputKind::Ftgs)
+        && !input.is_stream();
+    if may_unpack
+        && is_archive(&input.path)?
+        && let Some(unpacked) = unpack_archive(&input.path, (output, named), overwrite, input.memory.read_limit())?
+    {
+        return Ok(unpacked);
     }
     let opened = open_input(input)?;
     let (model, source) = (&*opened.input, opened.input.source());
@@ -64,9 +71,6 @@ pub fn convert(
         own => own,
     };
     let kind = OutputKind::from_path(output, requested, own);
-    if kind == OutputKind::Archive {
-        return Err(Error::usage("archives are written by compress: splatsieve compress INPUT -o NAME.gsz"));
-    }
     if kind.is_folder() {
         check_folder_name(output, "convert")?;
     }

@@ -338,6 +338,14 @@ impl Checkpoint {
         self.pickle.ids().filter_map(|id| self.plain_tensor(id))
     }
 
+    /// Returns the bytes of the file that hold the storage (block of tensor values) `key`; `None` if there is no such
+    /// storage.
+    pub(crate) fn storage_range(&self, key: &str) -> Option<Range<usize>> {
+        let &(index, bytes) = self.storages.get(key)?;
+        let start = usize::try_from(self.archive.clone().by_index(index).ok()?.data_start()).ok()?;
+        Some(start..start.checked_add(bytes)?)
+    }
+
     /// Returns the non-negative integer at node `id` and its byte range in the pickle; `None` for other nodes.
     fn number(&self, id: NodeId) -> Option<(usize, Range<usize>)> {
         match self.pickle.node(id) {

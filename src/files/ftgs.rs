@@ -238,13 +238,31 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Result<()> {
+    write_ftgs_with(params, clip, MIN_DEVIATION, path)
+}
+
+/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most [`MIN_DEVIATION`]
+/// that leaves all deviations in `params` as they are.
+///
+/// # Errors
+/// Fails if the file cannot be written.
+pub fn write_exact_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Result<()> {
+    let smallest = params.format_specific.plane(LOG_DEVIATION).iter().fold(f32::INFINITY, |least, &x| least.min(x));
+    let smallest = f64::from(smallest).exp();
+    // The logarithm of the usual minimum is rounded to f32.
+    let is_usual = smallest >= MIN_DEVIATION * (1.0 - 1e-6);
+    write_ftgs_with(params, clip, if is_usual { MIN_DEVIATION } else { smallest }, path)
+}
+
+/// Writes a file whose header states `min_deviation`, the minimum standard deviation in time.
+fn write_ftgs_with(params: &StoredParams, clip: &ClipTimes, min_deviation: f64, path: &Path) -> Result<()> {
     let degree = params.gaussians.sh_degree();
     let mut comments = vec![
         format!("{MARKER_COMMENT} 1"),
         "time_units normalized".to_owned(),
         format!("sh_degree {degree}"),
         "use_velocity 1".to_owned(),
-        format!("min_duration {MIN_DEVIATION}"),
+        format!("min_duration {min_deviation}"),
         format!("opacity_floor {OPACITY_FLOOR}"),
     ];
     comments.extend(clip.frames.map(|frames| format!("n_frames {frames}")));

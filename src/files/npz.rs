@@ -120,6 +120,16 @@ impl NpzArray {
     pub(crate) fn len(&self) -> usize {
         self.shape.iter().product()
     }
+
+    /// Returns the offset in bytes of the values in the file; meaningless if they are compressed.
+    pub(crate) fn start(&self) -> usize {
+        self.start
+    }
+
+    /// Returns whether the values are stored as little-endian f32, the last axis fastest.
+    pub(crate) fn is_little_f32(&self) -> bool {
+        self.float == Some(Float::F32)
+    }
 }
 
 impl Npz {

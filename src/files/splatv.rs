@@ -174,6 +174,11 @@ impl Splatv {
         &self.path
     }
 
+    /// Returns the offset in bytes of the first Gaussian in the file.
+    pub(crate) fn start(&self) -> usize {
+        self.start
+    }
+
     /// Returns N, the number of Gaussians.
     pub fn count(&self) -> usize {
         self.count

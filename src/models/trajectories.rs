@@ -34,8 +34,8 @@ const ZSTD_LEVEL: i32 = 1;
 pub const DEFAULT_OUTPUT: OutputKind = OutputKind::PlySequence;
 
 /// Error message for inputs that cannot be written as an archive.
-pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
-                                     archive\n  write a .gseq instead, or pack the input into a .gseq first";
+pub(super) const NO_ARCHIVE: &str = "this input cannot be written as an archive\n  write a .gseq instead, or \
+                                     pack the input into a .gseq first";
 
 /// Returns the bytes that the attributes `columns` of one Gaussian at one frame take if every value is stored as f32.
 pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {

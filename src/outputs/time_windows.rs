@@ -9,7 +9,9 @@
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_ftgs};
+use crate::files::ftgs::{
+    CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_exact_ftgs,
+};
 use crate::files::tsog::write::{MAX_FRAMES, write_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::fit::{CubicTrack, CurveForm, FitError, MIN_VISIBLE_OPACITY, Tolerance, fit_curves};
@@ -65,7 +67,7 @@ pub fn can_store(kind: OutputKind, timeline: Timeline) -> bool {
 pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Result<Vec<String>> {
     match kind {
         OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
-            write_ftgs(&timed.params, &timed.clip, path).map(|()| Vec::new())
+            write_exact_ftgs(&timed.params, &timed.clip, path).map(|()| Vec::new())
         }
         OutputKind::Tsog => Ok(vec![write_tsog(timed, path)?.note()]),
         _ => Err(Error::internal("time windows in a format without them")),

@@ -397,7 +397,9 @@ fn convert_writes_every_kind_and_refuses_misfits() {
     assert_eq!(&fs::read(workplace.path("a.gsd")).unwrap()[..4], b"GSD1");
     assert_eq!(&fs::read(workplace.path("a.4dgs")).unwrap()[1..5], b"4DGS");
     workplace.refused(2, "convert {tiny} a.spz --cameras {tiny}", &["a.spz", "10 frames", ".splatv"]);
-    workplace.refused(2, "convert {tiny} a.gsz", &["splatsieve compress INPUT -o NAME.gsz"]);
+    workplace.done("convert {tiny} a.gsz");
+    workplace.done("convert a.gsz unpacked");
+    workplace.refused(2, "convert - a.gsz", &["splatsieve", "compress - -o NAME.gsz"]);
     workplace.refused(2, "convert {tiny} a.gseq --cameras {tiny}", &["a.gseq"]);
     workplace.refused(2, "convert a.gseq b --as model", &["only a trained model"]);
     for name in ["a.spz", "b"] {

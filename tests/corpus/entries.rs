@@ -20,7 +20,8 @@ use splatsieve::limits::ReadLimit;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models;
 use splatsieve::models::OpenOptions;
-use splatsieve::models::archive::unpack;
+use splatsieve::models::archive::{kind_with_layout, unpack};
+use splatsieve::outputs::kind::OutputKind;
 use splatsieve::passes::gather;
 use splatsieve::recipe::Recipe;
 use splatsieve::source::FrameSource;
@@ -258,13 +259,19 @@ fn archive(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let path = folder.path("a.gsz");
     let (content, _) = archive::decode(bytes, &path, ReadLimit::NONE)?;
     let to = folder.path("unpacked");
+    let layout = kind_with_layout(&content, &path)?;
+    if layout == Some(OutputKind::Model) {
+        fs::create_dir(&to)?;
+    }
     let unpacked = unpack(&content, &path, &to);
     if to.is_dir() {
         fs::remove_dir_all(to)?
     } else if to.exists() {
         fs::remove_file(to)?
     }
-    Ok(unpacked?)
+    unpacked?;
+    // Models with a layout of their own have readers of their own.
+    if layout.is_some() { model(&folder.write_file("a.gsz", bytes)) } else { Ok(()) }
 }
 
 /// Reads an archive whose sections this function compresses. `bytes` has three lengths, then the sections table, point
@@ -282,7 +289,8 @@ fn archive_sections(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let [table, blobs] = packed;
     let (table, blobs) = (table?, blobs?);
     let mut file = archive::MAGIC.to_vec();
-    file.extend([1, 0, 0, 0]);
+    file.extend(archive::VERSION.to_le_bytes());
+    file.extend([0; 2]);
     let stored: [&[u8]; 4] = [&table, sections[1], sections[2], &blobs];
     for (stored, section) in stored.iter().zip(sections) {
         file.extend((stored.len() as u64).to_le_bytes());

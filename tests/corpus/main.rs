@@ -99,6 +99,23 @@ fn whole_inputs_are_read() {
 }
 
 #[test]
+fn archives_of_other_formats_are_read() {
+    let _counted = COUNTED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let folder = InputFolder::new();
+    for (target, names) in [
+        ("archive", &["of_splatv", "of_windows", "of_checkpoint", "of_params", "of_network"][..]),
+        ("archive_sections", &["layout"]),
+    ] {
+        let entry = ENTRIES.iter().find(|entry| entry.name == target).unwrap();
+        for name in names {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(entry.corpus).join(name);
+            let outcome = (entry.read)(&fs::read(path).unwrap(), &folder);
+            assert!(outcome.is_ok(), "{name}: {}", outcome.unwrap_err());
+        }
+    }
+}
+
+#[test]
 fn repaired_checksums_let_changed_values_through() {
     let _counted = COUNTED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let folder = InputFolder::new();

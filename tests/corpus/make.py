@@ -544,8 +544,8 @@ def make_frames(program, ply):
     make_sections(whole)
 
 
-def make_sections(archive):
-    """Writes the sections of an archive before compression, and tables with wrong contents."""
+def sections_of(archive):
+    """Returns the stored sections of an archive, and its table and blobs before compression."""
     heads = [struct.unpack_from("<QQ", archive, 12 + 24 * k) for k in range(4)]
     at, stored = 116, []
     for length, _ in heads:
@@ -553,9 +553,20 @@ def make_sections(archive):
         at += length
     plain = zstandard.ZstdDecompressor()
     table, blobs = (plain.decompress(stored[k], max_output_size=heads[k][1]) for k in (0, 3))
+    return stored, table, blobs
+
+
+def joined(table, cloud, field, blobs):
+    """Returns an input of the target archive_sections."""
+    return struct.pack("<3I", len(table), len(cloud), len(field)) + table + cloud + field + blobs
+
+
+def make_sections(archive):
+    """Writes the sections of an archive before compression, and tables with wrong contents."""
+    stored, table, blobs = sections_of(archive)
 
     def sections(table, cloud=stored[1], field=stored[2], blobs=blobs):
-        return struct.pack("<3I", len(table), len(cloud), len(field)) + table + cloud + field + blobs
+        return joined(table, cloud, field, blobs)
 
     write("archive_sections", "whole", sections(table))
     write("archive_sections", "no_cloud", sections(table, cloud=b""))
@@ -582,6 +593,68 @@ def make_sections(archive):
                 node = node[key]
             node[path[-1]] = value
             write("archive_sections", f"number_{k}_{name}", sections(json.dumps(changed, separators=(",", ":")).encode()))
+
+
+def make_layouts(program, ply):
+    """Writes archives of models that are restored in their own layout, and damaged layouts."""
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        for name, path, source in (
+            ("splatv", "a.splatv", "splatv"),
+            ("windows", "a.ftgs.ply", "ftgs"),
+            ("checkpoint", "splats/ckpt_7.pt", "checkpoint"),
+            ("params", "params/params.npz", "params"),
+            ("network", "network/deform/iteration_7/deform.pth", "deform"),
+        ):
+            file = folder / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes((HERE / source / "whole").read_bytes())
+            if name == "network":
+                cloud = folder / "network/point_cloud/iteration_7/point_cloud.ply"
+                cloud.parent.mkdir(parents=True)
+                cloud.write_bytes(ply)
+                (folder / "network/cfg_args").write_text("Namespace(sh_degree=1, source_path='data')")
+            model = path.split("/")[0]
+            frames = [] if name == "params" else ["--frames", "3"]
+            keep = ["--count", str(COUNT - 1), "--no-refine", "--prune-only", "--archive-psnr", "30"]
+            command = [program, "--quiet", "compress", model, "-o", f"{name}.gsz", *frames, *keep]
+            subprocess.run(command, check=True, cwd=folder)
+            write("archive", f"of_{name}", (folder / f"{name}.gsz").read_bytes())
+        archive = (folder / "windows.gsz").read_bytes()
+
+    stored, table, blobs = sections_of(archive)
+    document = json.loads(table)
+    parts, at = {}, len(blobs) - sum(length for _, length in document["files"])
+    before = blobs[:at]
+    for name, length in document["files"]:
+        parts[name], at = blobs[at : at + length], at + length
+
+    def with_layout(layout):
+        files = parts | {"layout": layout.encode()}
+        table = document | {"files": [[name, len(files[name])] for name in parts]}
+        text = json.dumps(table, separators=(",", ":")).encode()
+        return joined(text, stored[1], stored[2], before + b"".join(files.values()))
+
+    text = parts["layout"].decode()
+    write("archive_sections", "layout", with_layout(text))
+    for name, old, new in (
+        ("up", "model.ftgs.ply", "../model.ftgs.ply"),
+        ("root", "model.ftgs.ply", "/model.ftgs.ply"),
+        ("device", "model.ftgs.ply", "nul"),
+        ("folder", '"folder":false', '"folder":true'),
+        ("far", '"at":', '"at":9'),
+        ("huge", '"at":', '"at":9999999999999'),
+        ("plane", '"f32":0', '"f32":999'),
+        ("negative", '"f32":0', '"f32":-1'),
+        ("bytes", '{"f32":0}', '{"bytes":4}'),
+        ("zeros", '{"f32":0}', '{"zeros":9999999999999}'),
+        ("tensor", '"rows":', '"tensor":"a","rows":'),
+        ("unknown", '"f32":0', '"f64":0'),
+    ):
+        assert old in text, (name, text)
+        write("archive_sections", f"layout_{name}", with_layout(text.replace(old, new, 1)))
+    write("archive_sections", "layout_no_json", with_layout("layout"))
+    write("archive_sections", "layout_nested", with_layout("[" * 5000))
 
 
 # --- models of other families ------------------------------------------------------------------------------------------
@@ -1239,6 +1312,7 @@ def main():
     make_colmap()
     make_frames(program, ply)
     make_families()
+    make_layouts(program, ply)
     make_stills(program, ply)
 
 

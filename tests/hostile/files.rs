@@ -201,7 +201,7 @@ fn stream_with_constant_rows_beyond_memory_is_refused() {
 /// Returns an archive (format/ARCHIVE.md) with the sections `stored`, whose header declares the lengths `content` of
 /// their decompressed contents.
 fn archive(stored: [&[u8]; 4], content: [u64; 4]) -> Vec<u8> {
-    let mut out = b"\x89GSZ\r\n\x1a\n\x01\0\0\0".to_vec();
+    let mut out = b"\x89GSZ\r\n\x1a\n\x02\0\0\0".to_vec();
     for (bytes, length) in stored.iter().zip(content) {
         out.extend([bytes.len() as u64, length, xxh3_64(bytes)].map(u64::to_le_bytes).concat());
     }

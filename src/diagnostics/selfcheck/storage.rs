@@ -123,7 +123,7 @@ fn model() -> (ArchiveContent, QuantizationSteps) {
     content.beside = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
     let matrix_steps = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
     let field = FieldSteps([("a.matrix".to_owned(), matrix_steps)].into());
-    (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
+    (content, QuantizationSteps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], columns: Vec::new(), field })
 }
 
 /// Returns how many entries of [`ATTRIBUTES`] the Gaussians of `content` have: all entries from position to opacity,

@@ -57,3 +57,57 @@ pub(super) fn write_cloud(content: &ArchiveContent, path: &Path, to: &Path) -> R
     let header = PlyHeader::parse(path, part(HEADER)?)?;
     write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.beside, &content.cloud, to)
 }
+
+/// Characters that separate the folders of a path.
+const SEPARATORS: [char; 2] = ['/', '\\'];
+
+/// Returns the last component of the path `text`; text without separators is returned unchanged.
+fn last_name(text: &str) -> &str {
+    if !text.contains(SEPARATORS) {
+        return text;
+    }
+    text.trim_end_matches(SEPARATORS).rsplit(SEPARATORS).next().unwrap_or_default()
+}
+
+/// Returns the YAML text `text` without the folders of the training machine, because archives are made to be shared.
+/// Paths are replaced by their last components: the value of a line `key: value` or `- value`, and every item of a list
+/// in brackets. All other bytes are unchanged.
+pub(super) fn yaml_without_folders(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for line in text.split_inclusive('\n') {
+        let start = [": ", "- "].iter().filter_map(|mark| line.find(mark)).min().map_or(0, |at| at + 2);
+        let (key, value) = line.split_at(start);
+        out += key;
+        let is_list = value.trim_start().starts_with(['[', '{']);
+        let ends_item = |c: char| matches!(c, '\n' | '\r' | '"' | '\'') || is_list && "[]{}, \t".contains(c);
+        let mut rest = value;
+        while !rest.is_empty() {
+            let end = rest.find(ends_item).unwrap_or(rest.len());
+            out += last_name(&rest[..end]);
+            let next = rest[end..].chars().next().map_or(end, |c| end + c.len_utf8());
+            out += &rest[end..next];
+            rest = &rest[next..];
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn yaml_keeps_the_last_names_of_paths() {
+        for (before, after) in [
+            ("a: 1\nsource_path: \"data/N3V/scene\"\r\n", "a: 1\nsource_path: \"scene\"\r\n"),
+            ("  path: /home/My Name/data/\n", "  path: data\n"),
+            ("- C:\\Users\\Name\\x.ply", "- x.ply"),
+            ("scenes: [/a/b, 'c/d', 1.5]\n", "scenes: [b, 'd', 1.5]\n"),
+            ("rate: 0.5\n\n# text\n", "rate: 0.5\n\n# text\n"),
+            ("/only/a/path", "path"),
+            ("", ""),
+        ] {
+            assert_eq!(yaml_without_folders(before), after);
+        }
+    }
+}

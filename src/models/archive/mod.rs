@@ -1,10 +1,17 @@
 //! Archives (`.gsz`) as a model format. The content of an archive is decoded into a temporary folder and opened there
 //! as a model of its own format.
 //!
-//! The file format is specified in `format/ARCHIVE.md`. Names in an archive are never used as paths: this module
-//! decides which files are written.
+//! The file format is specified in `format/ARCHIVE.md`. Paths in an archive are checked before files are written
+//! ([`layout`]).
 
+#[cfg(test)]
+pub(super) mod checks;
 pub(super) mod files;
+mod layout;
+pub(super) mod pack;
+pub(super) mod reopen;
+#[cfg(test)]
+mod tests;
 
 use std::fs;
 use std::io::Read;
@@ -13,17 +20,24 @@ use std::path::Path;
 use xxhash_rust::xxh3::xxh3_128;
 
 use files::{CFG_ARGS, ITERATION, write_cloud};
+use layout::Layout;
 
 use super::size::ModelSize;
-use super::{four_d_gaussians, ply_sequence};
+use super::{
+    deformable_3d_gaussians, dynamic_3d_gaussians, four_d_gaussians, free_time_gs, native_4d_gaussians, ply_sequence,
+    sc_gs, spacetime_gaussians, windowed,
+};
 use crate::archive::{self, ArchiveContent, ArchiveSize};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
+use crate::files::cameras::TimeConvention;
 use crate::files::open::open_file;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
-use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
+use crate::models::input_model::{
+    ColumnInfo, FoundInput, InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin,
+};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
@@ -34,6 +48,18 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
+
+/// Model formats whose archives hold their own files. The first entry that recognizes the restored model opens it.
+const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
+    windowed::FTGS,
+    spacetime_gaussians::ENTRY,
+    spacetime_gaussians::SPLATV,
+    sc_gs::ENTRY,
+    deformable_3d_gaussians::ENTRY,
+    native_4d_gaussians::ENTRY,
+    free_time_gs::ENTRY,
+    dynamic_3d_gaussians::ENTRY,
+];
 
 /// Reads an archive. Returns its decoded content, and its size in bytes divided by purpose.
 ///
@@ -58,11 +84,14 @@ fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
 }
 
 /// Writes the content of an archive, which was read from `path`, as the original files: a model folder into the folder
-/// `to`, or a single PLY to the new file `to`.
+/// `to`, or a single file to the new file `to`.
 ///
 /// # Errors
 /// Fails if the content is not a complete model or a write fails.
 pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
+    if let Some(layout) = Layout::read(content, path)? {
+        return layout.write(content, path, to);
+    }
     let Some(cfg_args) = content.files.get(CFG_ARGS) else { return write_cloud(content, path, to) };
     let number = content.files.get(ITERATION).and_then(|text| std::str::from_utf8(text).ok()?.parse::<u32>().ok());
     let Some(iteration) = number else {
@@ -76,7 +105,20 @@ pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
     write_cloud(content, path, &folder.join("point_cloud.ply"))
 }
 
-/// Returns whether the archive holds a model folder rather than a single PLY.
+/// Returns the kind of output as which [`unpack`] restores the model that `content` holds in the layout of its own
+/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the archive.
+///
+/// # Errors
+/// Fails if the layout is malformed.
+pub fn kind_with_layout(content: &ArchiveContent, path: &Path) -> Result<Option<OutputKind>> {
+    let layout = Layout::read(content, path)?;
+    Ok(layout.map(|layout| match layout.files.first().filter(|_| !layout.folder) {
+        Some(file) => OutputKind::from_path(Path::new(&file.path), None, OutputKind::Model),
+        None => OutputKind::Model,
+    }))
+}
+
+/// Returns whether the archive holds a 4DGaussians model folder rather than a single PLY.
 pub fn is_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
@@ -100,7 +142,11 @@ impl OpenArchive {
         drop(bytes);
         let folder = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
         let scratch = ScratchFolder::new(&folder)?;
-        let inner: Box<dyn InputModel> = if is_folder(&content) {
+        let inner: Box<dyn InputModel> = if let Some(layout) = Layout::read(&content, path)? {
+            let model = layout.restore(&content, path, scratch.path())?;
+            drop(content);
+            open_restored(&model, path, options)?
+        } else if is_folder(&content) {
             unpack(&content, path, scratch.path())?;
             drop(content);
             (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
@@ -112,6 +158,17 @@ impl OpenArchive {
         };
         Ok(OpenArchive { inner, scratch, digest, size: parts.into() })
     }
+}
+
+/// Opens the model at `model`, whose files were restored from the archive at `path`.
+fn open_restored(model: &Path, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+    let found = FoundInput::new(model, options.memory)?;
+    let format = FORMATS_WITH_LAYOUT.iter().find(|format| (format.recognizes)(&found));
+    let unknown = || {
+        Error::input(path, layout::LAYOUT, "the files of a model", "files of no known format")
+            .hint("the archive is damaged; copy it again")
+    };
+    (format.ok_or_else(unknown)?.open)(model, options)
 }
 
 impl InputModel for OpenArchive {
@@ -154,6 +211,26 @@ impl InputModel for OpenArchive {
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         let OpenArchive { inner, scratch, digest, size } = *self;
         Ok(Box::new(OpenArchive { inner: inner.with_times(times)?, scratch, digest, size }))
+    }
+
+    fn clock(&self) -> TimeConvention {
+        self.inner.clock()
+    }
+
+    fn span(&self) -> f64 {
+        self.inner.span()
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.inner.notes()
+    }
+
+    fn data_frames(&self) -> Option<usize> {
+        self.inner.data_frames()
+    }
+
+    fn class(&self, id: u32) -> u8 {
+        self.inner.class(id)
     }
 
     fn data_folder(&self) -> Option<&str> {

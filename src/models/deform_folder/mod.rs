@@ -19,10 +19,13 @@ pub(super) use arguments::Arguments;
 use paths::Paths;
 pub(super) use paths::{has_network, network_tensor_names};
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
 use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
@@ -31,7 +34,7 @@ use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
-use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, TimeOrigin};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, propose_proxies};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
@@ -83,16 +86,18 @@ pub(super) struct DeformFolder<L> {
     white_background: bool,
     tensor_bytes: u64,
     notes: Vec<String>,
+    reopener: Reopener,
 }
 
 impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
-    /// Opens the model folder `root`. `make` returns its motion model and notes for the user.
+    /// Opens the model folder `root` of the format `format`. `make` returns its motion model and notes for the user.
     ///
     /// # Errors
     /// Fails if files are missing or damaged, or if `make` refuses the model.
     pub(super) fn open(
         root: &Path,
         options: &OpenOptions,
+        format: &ModelFormat,
         make: impl FnOnce(&ModelParts<'_>) -> Result<(L, Vec<String>)>,
     ) -> Result<Box<dyn InputModel>> {
         let paths = Paths::locate(root, options.iteration)?;
@@ -114,6 +119,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
             white_background,
             tensor_bytes: 4 * values as u64,
             notes,
+            reopener: Reopener::new(format.open, options),
         }))
     }
 
@@ -281,7 +287,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Model => Ok(()),
+            OutputKind::Model | OutputKind::Archive => Ok(()),
             _ => check_output(self.model.info().times.len(), kind, path),
         }
     }
@@ -290,6 +296,14 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule)
         })
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, reduction, (self.own_output(), "model"), FileContent::from_name)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener.frames(content, &self.model.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

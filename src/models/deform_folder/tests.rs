@@ -16,6 +16,7 @@ use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{AttributeValues, Attributes, Gaussians, opacity};
 use crate::models;
+use crate::models::archive::checks::check_round_trip;
 use crate::models::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
@@ -559,5 +560,18 @@ fn truncated_network_is_refused() {
         fs::write(&path, &whole[..whole.len() * k / 40]).unwrap();
         let message = open(&made.path()).err().expect("it must be refused").to_string();
         assert!(message.contains("deform.pth"), "{message}");
+    }
+}
+
+#[test]
+fn archives_restore_model_folders() {
+    let rule = Recipe::preset("default").unwrap().merge;
+    let kept = CompressedModel::pruned((0..COUNT as u32).step_by(2).collect(), &rule);
+    for kind in ALL_VARIANTS {
+        for model in [TestModel::deformable(kind), TestModel::sc_gs(kind)] {
+            let opened = model.open();
+            let restored = check_round_trip(&*opened, &kept, &OpenOptions::default(), 2e-2);
+            assert_eq!(restored, OutputKind::Model);
+        }
     }
 }

@@ -21,7 +21,7 @@ use crate::models::motion_model::{MotionModel, copy_stored};
 /// Model format of Deformable-3D-Gaussians: recognizes and opens a model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_network(found.path),
-    open: |path, options| DeformFolder::open(path, options, DeformableMotion::new),
+    open: |path, options| DeformFolder::open(path, options, &ENTRY, DeformableMotion::new),
 };
 
 /// Attributes that are computed from the covariance of a deformed Gaussian: rotation and scales.

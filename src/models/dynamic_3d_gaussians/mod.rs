@@ -8,8 +8,11 @@ mod proxies;
 
 use std::path::{Path, PathBuf};
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::size::bytes_read_for;
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::Result;
 use crate::files::digest::digest_of_files;
@@ -41,7 +44,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
         options.refuse_for(path)?;
         let file = if path.is_dir() { path.join(FILE) } else { path.to_owned() };
         let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
-        Ok(Box::new(Params::open(&file, &scratch)?))
+        Ok(Box::new(Params::open(&file, &scratch, Reopener::new(ENTRY.open, options))?))
     },
 };
 
@@ -104,13 +107,21 @@ impl InputModel for Params {
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Model => Ok(()),
+            OutputKind::Model | OutputKind::Archive => Ok(()),
             _ => check_output(self.info().times.len(), kind, path),
         }
     }
 
     fn solve(&self, clusters: &[Cluster], _: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         proxies::solve(self, clusters, rule)
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener().content(self, reduction, (self.own_output(), "model"), |_| FileContent::Npz(Params::archived))
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener().frames(content, &self.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

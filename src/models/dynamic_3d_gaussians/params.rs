@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::files::npz::write::GaussianAxis;
 use crate::files::npz::{Floats, Npz, NpzArray};
 use crate::model::{Attributes, Gaussians, SequenceInfo, sh_from_color};
+use crate::models::archive::reopen::Reopener;
 use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
 
 /// Name of the array of positions.
@@ -42,16 +43,17 @@ pub(super) struct Params {
     opacities: Floats,
     segments: Option<Floats>,
     states: SharedCounter,
+    reopener: Reopener,
 }
 
 impl Params {
     /// Opens the file at `path`. Frame i of T frames has the time i / (T − 1). Arrays that are compressed or not f32
-    /// are decoded into temporary files in the folder `scratch`.
+    /// are decoded into temporary files in the folder `scratch`. `reopener` opens archives of the model.
     ///
     /// # Errors
     /// Fails if the file is not an `.npz` archive, if arrays are missing or have other shapes, or if the model is
     /// static.
-    pub(super) fn open(path: &Path, scratch: &Path) -> Result<Params> {
+    pub(super) fn open(path: &Path, scratch: &Path, reopener: Reopener) -> Result<Params> {
         let npz = Npz::open(path)?;
         let [frames, count] = match npz.entry(MEANS).map(|entry| &entry.shape[..]) {
             Some(&[frames, count, 3]) if frames > 0 => [frames, count],
@@ -103,6 +105,7 @@ impl Params {
             npz,
             info,
             states: SharedCounter::default(),
+            reopener,
         })
     }
 
@@ -118,6 +121,24 @@ impl Params {
     /// Returns the opened file with its arrays.
     pub(super) fn npz(&self) -> &Npz {
         &self.npz
+    }
+
+    /// Returns how archives of the model are opened.
+    pub(super) fn reopener(&self) -> &Reopener {
+        &self.reopener
+    }
+
+    /// Returns the axis of the array `entry` that counts the Gaussians, and the attribute that its first frame holds.
+    pub(super) fn archived(entry: &NpzArray) -> (GaussianAxis, Option<Attributes>) {
+        let attribute = match entry.name.as_str() {
+            MEANS => Some(Attributes::POSITION),
+            ROTATIONS => Some(Attributes::ROTATION),
+            COLORS => Some(Attributes::SH),
+            LOG_SCALES => Some(Attributes::LOG_SCALE),
+            OPACITIES => Some(Attributes::OPACITY),
+            _ => None,
+        };
+        (Params::axis(entry), attribute)
     }
 
     /// Returns the path of the `params.npz` file.

@@ -10,6 +10,7 @@ use super::*;
 use crate::compressed_model::ParamDelta;
 use crate::models;
 use crate::models::OpenOptions;
+use crate::models::archive::checks::check_round_trip;
 use crate::passes::gather_all;
 use crate::progress::Events;
 use crate::recipe::Recipe;
@@ -225,5 +226,17 @@ proptest! {
         if let Ok(model) = open(&path) {
             states(&*model);
         }
+    }
+}
+
+#[test]
+fn archives_restore_model_folders() {
+    let folder = tempfile::tempdir().unwrap();
+    let rule = Recipe::preset("default").unwrap().merge;
+    for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
+        write(&folder.path().join("params.npz"), &arrays(), method);
+        let model = open(folder.path()).unwrap();
+        let kept = CompressedModel::pruned(vec![0, 2, 4], &rule);
+        assert_eq!(check_round_trip(&*model, &kept, &OpenOptions::default(), 1e-4), OutputKind::Model);
     }
 }

@@ -10,6 +10,7 @@ pub(super) mod frame_state;
 
 use std::path::{Path, PathBuf};
 
+use super::archive::reopen::Reopener;
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{
     CheckpointModel, CheckpointReader, ModelDescription, RowElement, numbered_files, row_count,
@@ -92,6 +93,8 @@ fn splats_in(path: &Path, memory: ReadLimit) -> bool {
 
 /// Opens a checkpoint as FreeTimeGS if it has velocities, else as a static model.
 fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+    let reopener = Some(Reopener::new(ENTRY.open, options));
+    let description = ModelDescription { reopener, ..description };
     let checkpoint = Checkpoint::open(&description.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {

@@ -7,6 +7,7 @@ use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 use crate::models;
+use crate::models::archive::checks::check_round_trip;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::progress::Events;
@@ -216,4 +217,12 @@ fn errors_name_the_tensor_and_the_problem() {
     fs::rename(&path, folder.path("result/ckpts/ckpt_59999_rank0.pt")).unwrap();
     let message = open(&folder.path("result")).err().unwrap().to_string();
     assert!(message.contains("ranks"), "{message}");
+}
+
+#[test]
+fn archives_restore_checkpoints() {
+    let folder = ResultFolder::put(&splats());
+    let model = open(&folder.path("result")).unwrap();
+    let kept = CompressedModel::pruned(vec![0, 2, 3], &rule());
+    assert_eq!(check_round_trip(&*model, &kept, &OpenOptions::default(), 1e-3), OutputKind::Model);
 }

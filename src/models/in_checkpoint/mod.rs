@@ -4,7 +4,7 @@
 //! The output is the same checkpoint with fewer rows, and copies of the small files beside it.
 
 pub(super) mod linear;
-mod rows;
+pub(super) mod rows;
 pub(super) mod still;
 
 use std::fs;
@@ -12,9 +12,12 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::files::copy;
 use super::size::{ModelSize, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
@@ -86,6 +89,8 @@ pub(super) struct ModelDescription {
     pub(super) root: Option<PathBuf>,
     /// Path of the checkpoint file.
     pub(super) file: PathBuf,
+    /// How the model was opened.
+    pub(super) reopener: Option<Reopener>,
     /// Notes for the user.
     pub(super) notes: Vec<String>,
     /// Path of the folder with the training data.
@@ -127,6 +132,11 @@ impl<L: ProxyRule> CheckpointModel<L> {
         let mut found: Vec<PathBuf> = named.chain(yaml_files_in(root)).collect();
         found.sort();
         found
+    }
+
+    /// Returns how the model was opened.
+    fn reopener(&self) -> Result<&Reopener> {
+        self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
     }
 
     /// Returns the path of the checkpoint relative to the output folder.
@@ -248,7 +258,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Model => Ok(()),
+            OutputKind::Model | OutputKind::Archive => Ok(()),
             _ => check_output(self.model.info().times.len(), kind, path),
         }
     }
@@ -261,6 +271,20 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         motion_model::propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             L::propose(&self.model, clusters, rule)
         })
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        let checkpoint = self.relative_path();
+        self.reopener()?.content(self, reduction, (self.own_output(), "model"), |name| {
+            match Path::new(name) == checkpoint {
+                true => FileContent::Checkpoint(&self.tensors),
+                false => FileContent::Other,
+            }
+        })
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener()?.frames(content, &self.model.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

@@ -149,6 +149,17 @@ pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &s
 }
 
 impl RowTensors {
+    /// Returns name, node in the checkpoint and meaning of the values of a row, of every tensor that holds parameters of
+    /// Gaussians.
+    pub(in crate::models) fn params(&self) -> impl Iterator<Item = (&str, NodeId, &[RowElement])> {
+        self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.planes[..]))
+    }
+
+    /// Returns the nodes in the checkpoint of the tensors with one row per Gaussian that only the training reads.
+    pub(in crate::models) fn training_only(&self) -> impl Iterator<Item = NodeId> {
+        self.training_only.iter().map(|tensor| tensor.id)
+    }
+
     /// Writes the checkpoint of the compressed model to `path`. `raw_left` holds the parameters of the compressed
     /// model, `before` the original ones; values are copied byte for byte where both agree. In tensors that only the
     /// training reads, the rows of merged Gaussians become zero.

@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
+use super::archive::reopen::Reopener;
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{
     CheckpointModel, CheckpointReader, ModelDescription, ProxyRule, RowElement, numbered_files, row_count,
@@ -168,6 +169,8 @@ fn place(i: usize, name: &str) -> String {
 
 /// Opens a checkpoint as a 4D or a static model.
 fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+    let reopener = Some(Reopener::new(ENTRY.open, options));
+    let description = ModelDescription { reopener, ..description };
     let conventions = options.conventions;
     let checkpoint = Checkpoint::open(&description.file, options.memory)?;
     let pickle = checkpoint.pickle();

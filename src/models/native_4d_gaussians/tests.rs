@@ -12,6 +12,7 @@ use crate::model::{Gaussians, opacity};
 use crate::models;
 use crate::models::OpenOptions;
 use crate::models::TrainingConventions;
+use crate::models::archive::checks::check_round_trip;
 use crate::models::in_checkpoint::linear::covariance;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
@@ -358,5 +359,17 @@ fn errors_name_the_tensor_and_the_problem() {
         fs::write(folder.path("model/chkpnt30000.pth"), &whole[..length]).unwrap();
         let message = open_as(&folder.path("model"), false).err().unwrap().to_string();
         assert!(message.contains("chkpnt30000.pth"), "{message}");
+    }
+}
+
+#[test]
+fn archives_restore_checkpoints() {
+    for turns in [false, true] {
+        let folder = CheckpointFolder::new();
+        let root = folder.put(capture(turns));
+        let conventions = TrainingConventions { time_duration: Some(2.0), ..TrainingConventions::default() };
+        let options = OpenOptions { conventions, ..OpenOptions::default() };
+        let kept = CompressedModel::pruned(vec![0, 2, 3], &rule());
+        assert_eq!(check_round_trip(&*open(&root), &kept, &options, 5e-3), OutputKind::Model);
     }
 }

@@ -37,7 +37,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
             && has_network(found.path)
             && (typed() || network_tensor_names(found.path, found.memory).iter().any(|name| name == "nodes"))
     },
-    open: |path, options| DeformFolder::open(path, options, NodeMotion::new),
+    open: |path, options| DeformFolder::open(path, options, &ENTRY, NodeMotion::new),
 };
 
 /// Maximum bytes of cached network outputs; each output is for all nodes at one time.

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::model::{Attributes, Jacobian};
 use crate::models::input_model::MemoryProfile;
-use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
+use crate::models::trajectories::state_bytes;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
@@ -32,7 +32,6 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
 /// parameters. `is_full` states that it is a full model, not a lite one.
 pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
-        OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         OutputKind::Splatv if is_full => Err(Error::usage(
             "a .splatv stores colors, not features: it holds only lite models of SpacetimeGaussians\n  write a model \
              folder or a .gseq",

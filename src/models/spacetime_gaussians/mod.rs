@@ -18,10 +18,13 @@ use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::files::copy;
 use super::iterations::find_iteration;
 use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::{NO_ARCHIVE, write_sequence};
+use super::trajectories::write_sequence;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result, quoted};
 use crate::files::cameras::TimeConvention;
@@ -147,6 +150,7 @@ struct SpacetimeGaussians {
     configuration: SpacetimeConfig,
     activation: ColorActivation,
     notes: Vec<String>,
+    reopener: Reopener,
 }
 
 impl SpacetimeGaussians {
@@ -199,7 +203,8 @@ impl SpacetimeGaussians {
         let raw = cloud.raw(activation)?;
         notes.extend(negative_color_note(&raw));
         let model = MotionModelFrames::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
-        Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes })
+        let reopener = Reopener::new(ENTRY.open, options);
+        Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes, reopener })
     }
 
     /// Writes the compressed model as a model folder at `path`.
@@ -322,6 +327,14 @@ impl InputModel for SpacetimeGaussians {
         })
     }
 
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, reduction, (self.own_output(), "model.ply"), FileContent::from_name)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener.frames(content, &self.model.info().times)
+    }
+
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.model.compressed_frames(reduction)))
     }
@@ -349,7 +362,6 @@ impl InputModel for SpacetimeGaussians {
                 };
                 splatv::write(&raw, known, self.files.root_file(CAMERAS).as_deref(), path)?;
             }
-            OutputKind::Archive => return Err(Error::usage(NO_ARCHIVE)),
             _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.max_kept_frames, events),
         }
         Ok(Vec::new())

@@ -11,6 +11,7 @@ use super::common::{check_kind, residence};
 use super::decoder::ColorActivation;
 use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::accuracy::CodingErrors;
@@ -25,6 +26,8 @@ use crate::limits::Limits;
 use crate::model::{
     AttributeValues, Attributes, Gaussians, StoredParams, color_from_sh, logit, opacity, sh_from_color,
 };
+use crate::models::archive::pack::FileContent;
+use crate::models::archive::reopen::Reopener;
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
 use crate::models::motion_model::window::MAX_LOGIT;
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, propose_proxies};
@@ -62,6 +65,7 @@ struct SplatvModel {
     /// Gaussians of the file that were repaired or left out.
     defects: Defects,
     model: MotionModelFrames<Spacetime>,
+    reopener: Reopener,
 }
 
 impl SplatvModel {
@@ -82,7 +86,7 @@ impl SplatvModel {
             set_from_row(&mut raw, i, &SplatvGaussian::from_words(&file.words(file_row(rows.as_deref(), i))));
         }
         let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
-        Ok(SplatvModel { file, rows, defects, model })
+        Ok(SplatvModel { file, rows, defects, model, reopener: Reopener::new(SPLATV.open, options) })
     }
 }
 
@@ -224,6 +228,14 @@ impl InputModel for SplatvModel {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, ColorActivation::None)
         })
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        self.reopener.content(self, reduction, (self.own_output(), "model.splatv"), FileContent::from_name)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener.frames(content, &self.model.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

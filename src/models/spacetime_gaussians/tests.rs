@@ -6,6 +6,7 @@ use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
 use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::models;
 use crate::models::OpenOptions;
+use crate::models::archive::checks::check_round_trip;
 use crate::passes::gather_all;
 use crate::progress::Events;
 use crate::recipe::Recipe;
@@ -436,5 +437,29 @@ fn truncated_and_invalid_files_are_refused() {
         fs::write(root.path().join(CFG_ARGS), arguments).unwrap();
         let message = refusal(root.path());
         assert!(message.contains(expected), "{message}");
+    }
+}
+
+#[test]
+fn archives_restore_folders_and_splatv_files() {
+    let options = OpenOptions::default();
+    for is_full in [false, true] {
+        let root = folder(is_full);
+        let model = open_with_frames(root.path());
+        let kind = check_round_trip(&*model, &reduction(&*model), &options, 1e-3);
+        assert_eq!(kind, OutputKind::Model);
+        let alone = root.path().join("alone.ply");
+        fs::copy(root.path().join("point_cloud/iteration_300").join(POINT_CLOUD_FILE), &alone).unwrap();
+        if !is_full {
+            let alone = open_with_frames(&alone);
+            assert_eq!(check_round_trip(&*alone, &reduction(&*alone), &options, 1e-3), OutputKind::Ply);
+            let path = root.path().join("a.splatv");
+            let all = CompressedModel::pruned((0..COUNT as u32).collect(), &Recipe::preset("default").unwrap().merge);
+            model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();
+            // Some values of the file are halves, which the merged Gaussian of the compressed model is not.
+            let kept = CompressedModel::pruned(vec![0, 3, 6], &Recipe::preset("default").unwrap().merge);
+            let kind = check_round_trip(&*open_with_frames(&path), &kept, &options, 2e-3);
+            assert_eq!(kind, OutputKind::Splatv);
+        }
     }
 }

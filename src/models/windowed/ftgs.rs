@@ -6,6 +6,7 @@ use std::path::Path;
 use super::WindowedModel;
 use crate::files::ftgs::{Ftgs, MARKER_COMMENT};
 use crate::files::open::open_file;
+use crate::models::archive::reopen::Reopener;
 use crate::models::free_time_gs::frame_state::FreeTime;
 use crate::models::input_model::{ModelFormat, TimeOrigin};
 use crate::models::motion_model::MotionModelFrames;
@@ -33,6 +34,7 @@ pub(in crate::models) const FTGS: ModelFormat = ModelFormat {
             timing: TimeOrigin::Continuous,
             notes: file.defects.notes(),
             model: MotionModelFrames::new(motion, file.params, sh_degree),
+            reopener: Some(Reopener::new(FTGS.open, options)),
         }))
     },
 };

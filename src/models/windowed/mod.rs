@@ -9,10 +9,13 @@ mod tsog;
 
 use std::path::{Path, PathBuf};
 
+use super::archive::pack::FileContent;
+use super::archive::reopen::Reopener;
 use super::in_checkpoint::{ProxyRule, write_frames};
 use super::motion_model::{MotionModelFrames, propose_proxies};
 use super::size::{ModelSize, bytes_below, bytes_read_for};
-use super::trajectories::{NO_ARCHIVE, state_bytes};
+use super::trajectories::state_bytes;
+use crate::archive::ArchiveContent;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, ReferenceFrame};
 use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
@@ -41,6 +44,16 @@ struct WindowedModel<L: ProxyRule> {
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
+    /// How the `.ftgs.ply` in an archive of this file is opened. `None` for Gaussians without windows of time, which a
+    /// `.ftgs.ply` cannot hold; their archives hold frames.
+    reopener: Option<Reopener>,
+}
+
+impl<L: ProxyRule> WindowedModel<L> {
+    /// Returns how the `.ftgs.ply` in an archive of this file is opened.
+    fn reopener(&self) -> Result<&Reopener> {
+        self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
+    }
 }
 
 impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
@@ -128,13 +141,25 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
                 "a file of a player cannot be written as a trained model\n  write its own format, a .gseq or --as \
                  ply-sequence",
             )),
-            OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
             _ => Ok(()),
         }
     }
 
     fn solve(&self, clusters: &[Cluster], reference: ReferenceFrame, rule: &MergeParams) -> Result<Proxies> {
         propose_proxies(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
+    }
+
+    fn archives_as_frames(&self) -> bool {
+        self.reopener.is_none()
+    }
+
+    fn archive_content(&self, reduction: &CompressedModel) -> Result<ArchiveContent> {
+        let written = (OutputKind::Ftgs, "model.ftgs.ply");
+        self.reopener()?.content(self, reduction, written, FileContent::from_name)
+    }
+
+    fn decode_frames<'a>(&'a self, content: &ArchiveContent) -> Result<Box<dyn FrameSource + 'a>> {
+        self.reopener()?.frames(content, &self.model.info().times)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

@@ -13,6 +13,7 @@ use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
 use crate::models;
 use crate::models::OpenOptions;
+use crate::models::archive::checks::check_round_trip;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
 
@@ -142,7 +143,7 @@ fn player_files_are_no_trained_models() {
     let path = folder.path().join("a.ftgs.ply");
     write_ftgs(&params(), &ClipTimes::UNIT_INTERVAL, &path).unwrap();
     let model = open_at(&path, &TIMES);
-    for kind in [OutputKind::Model, OutputKind::Ply, OutputKind::Archive] {
+    for kind in [OutputKind::Model, OutputKind::Ply] {
         assert!(model.check_output(kind, Path::new("x")).is_err(), "{kind:?}");
     }
     for kind in [OutputKind::Ftgs, OutputKind::Splatv, OutputKind::Gseq] {
@@ -210,4 +211,23 @@ fn a_still_tsog_is_one_frame() {
     let model = models::open(&path, &OpenOptions::default()).unwrap();
     assert_eq!((model.source().info().times.len(), model.source().info().varying), (1, Attributes::empty()));
     assert_eq!(states(&*model)[0].len(), COUNT);
+}
+
+#[test]
+fn archives_hold_windows_as_ftgs_and_single_frames_as_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    let [ftgs, tsog] = ["a.ftgs.ply", "a.tsog"].map(|name| folder.path().join(name));
+    write_ftgs(&params(), &ClipTimes::UNIT_INTERVAL, &ftgs).unwrap();
+    write_tsog(&timed(Timeline::Windows), &tsog).unwrap();
+    for path in [&ftgs, &tsog] {
+        let model = open_at(path, &TIMES);
+        assert!(!model.archives_as_frames());
+        let kind = check_round_trip(&*model, &pruned(vec![2, 3, 9]), &OpenOptions::default(), 1e-3);
+        assert_eq!(kind, OutputKind::Ftgs);
+    }
+    for timeline in [Timeline::Frames(4), Timeline::Still] {
+        write_tsog(&timed(timeline), &tsog).unwrap();
+        let model = models::open(&tsog, &OpenOptions::default()).unwrap();
+        assert!(model.archives_as_frames() && model.check_output(OutputKind::Archive, Path::new("a.gsz")).is_ok());
+    }
 }

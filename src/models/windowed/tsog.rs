@@ -4,10 +4,11 @@ use std::path::Path;
 
 use super::WindowedModel;
 use super::frame_by_frame::FrameByFrame;
-use super::ftgs::SMALLEST_DEVIATION;
+use super::ftgs::{FTGS, SMALLEST_DEVIATION};
 use crate::error::Result;
 use crate::files::tsog::read::{is_tsog, read_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
+use crate::models::archive::reopen::Reopener;
 use crate::models::free_time_gs::frame_state::FreeTime;
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::still::Still;
@@ -26,7 +27,9 @@ pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
         match timeline {
             Timeline::Windows => {
                 let motion = FreeTime { clip, deviation_floor: [SMALLEST_DEVIATION, 0.0], min_opacity: 0.0 };
-                opened(path, TimeOrigin::Continuous, MotionModelFrames::new(motion, params, sh_degree), Vec::new())
+                let model = MotionModelFrames::new(motion, params, sh_degree);
+                let archived = Some(Reopener::new(FTGS.open, options));
+                opened(path, TimeOrigin::Continuous, model, archived, Vec::new())
             }
             Timeline::Frames(frames) => {
                 let motion = FrameByFrame::new(frames, clip);
@@ -37,11 +40,11 @@ pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
                 );
                 let times = motion.times().to_vec();
                 let model = MotionModelFrames::new(motion, params, sh_degree).with_times(times)?;
-                opened(path, TimeOrigin::Numbered, model, vec![note])
+                opened(path, TimeOrigin::Numbered, model, None, vec![note])
             }
             Timeline::Still => {
                 let model = MotionModelFrames::new(Still, params, sh_degree).with_times(vec![0.0])?;
-                opened(path, TimeOrigin::Numbered, model, Vec::new())
+                opened(path, TimeOrigin::Numbered, model, None, Vec::new())
             }
         }
     },
@@ -54,13 +57,14 @@ fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
 }
 
 /// Returns the opened `.tsog` file at `path`, whose frames `model` computes. `timing` states whether frames can be at
-/// any time.
+/// any time, `reopener` how the `.ftgs.ply` in an archive of the file is opened.
 fn opened<L: ProxyRule + 'static>(
     path: &Path,
     timing: TimeOrigin,
     model: MotionModelFrames<L>,
+    reopener: Option<Reopener>,
     notes: Vec<String>,
 ) -> Result<Box<dyn InputModel>> {
     let (path, own) = (path.to_owned(), OutputKind::Tsog);
-    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model }))
+    Ok(Box::new(WindowedModel { path, name: "TSOG model", own, timing, notes, model, reopener }))
 }

@@ -33,12 +33,16 @@ use crate::pipeline::summary::ArchiveSummary;
 use crate::progress::Progress;
 use crate::render;
 use crate::scene::Scene;
+use crate::source::FrameSource;
 
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would erase the values.
 const MAX_STEP: f64 = 4.0;
+/// Minimum standard deviation of the values of a column from which its quantization step follows, as a fraction of the
+/// largest magnitude of the values.
+const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
 /// value, quantization then costs 0.5 and 1.2 dB PSNR on two trained models.
@@ -84,11 +88,12 @@ impl Stage for ArchiveStage {
     }
 }
 
-/// Group of values that share one quantization step: an attribute (by index) or a tensor of the deformation field (by
-/// name).
+/// Group of values that share one quantization step: an attribute (by index), a further column of the Gaussians (by
+/// index and name) or a tensor of the deformation field (by name).
 #[derive(Debug, Clone)]
 enum ValueGroup {
     Attribute(usize),
+    Column(usize, String),
     Tensor(String),
 }
 
@@ -96,7 +101,7 @@ impl ValueGroup {
     fn name(&self) -> &str {
         match self {
             ValueGroup::Attribute(k) => ATTRIBUTES[*k],
-            ValueGroup::Tensor(name) => name,
+            ValueGroup::Column(_, name) | ValueGroup::Tensor(name) => name,
         }
     }
 
@@ -106,6 +111,7 @@ impl ValueGroup {
         match self {
             ValueGroup::Attribute(0) => 512.0,
             ValueGroup::Attribute(_) => 24.0,
+            ValueGroup::Column(..) => 64.0,
             ValueGroup::Tensor(name) if name.ends_with("bias") => 64.0,
             ValueGroup::Tensor(_) => 16.0,
         }
@@ -196,10 +202,16 @@ impl ArchiveStage {
             progress.advance(1);
             archive::encode(&content, &grids.steps(added))
         };
-        let measure_views = |encoded: EncodedArchive| -> Result<(EncodedArchive, [f64; 2])> {
-            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
-            let shown = scene.input.decode_frames(&decoded)?;
+        let measure_frames = |encoded: EncodedArchive, shown: Box<dyn FrameSource + '_>| -> Result<_> {
             Ok((encoded, [reference_views.psnr(&*shown)?, level - original.psnr(&*shown)?]))
+        };
+        let decoded = |encoded: &EncodedArchive| -> Result<Box<dyn FrameSource + '_>> {
+            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
+            scene.input.decode_frames(&decoded)
+        };
+        let measure_views = |encoded: EncodedArchive| {
+            let shown = decoded(&encoded)?;
+            measure_frames(encoded, shown)
         };
         let (encoded, [psnr, loss]) = match quality_target {
             QualityTarget::Bytes(most) => {
@@ -212,7 +224,10 @@ impl ArchiveStage {
             }
             QualityTarget::Close(_) | QualityTarget::Loss(_) => {
                 let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
-                    Ok(Some(measure_views(encoded(added)?)?)
+                    let encoded = encoded(added)?;
+                    // The reader of a model format may refuse values that coarse steps have made zero.
+                    let Ok(shown) = decoded(&encoded) else { return Ok(None) };
+                    Ok(Some(measure_frames(encoded, shown)?)
                         .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
                 })?;
                 best.map_or_else(|| measure_views(encoded(OCTAVE_RANGE[0])?), Ok)?
@@ -280,6 +295,8 @@ impl Grids {
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
                 ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
+                // The groups hold the columns in their order.
+                ValueGroup::Column(..) => steps.columns.push(nearest_step(octave + added)),
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
@@ -345,6 +362,13 @@ impl Grids {
                     content.cloud = before;
                     found
                 }
+                ValueGroup::Column(k, _) => {
+                    let before = content.columns[*k].clone();
+                    archive::round_column(&mut content.columns[*k], nearest_step(octave));
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
+                    content.columns[*k] = before;
+                    found
+                }
                 ValueGroup::Tensor(name) => {
                     let (before, role) = (content.tensors[name].clone(), content.field[name]);
                     let steps = self.tensor(name, octave);
@@ -363,8 +387,10 @@ impl Grids {
 fn groups(content: &ArchiveContent) -> Vec<ValueGroup> {
     let attributes = 4 + content.cloud.sh_degree() + 1;
     let tensors = content.field.iter().filter(|(_, role)| !matches!(role, TensorRole::Exact | TensorRole::Unread));
+    let columns = content.columns.iter().enumerate().map(|(k, column)| ValueGroup::Column(k, column.name.clone()));
     (0..attributes)
         .map(ValueGroup::Attribute)
+        .chain(columns)
         .chain(tensors.map(|(name, _)| ValueGroup::Tensor(name.clone())))
         .collect()
 }
@@ -384,6 +410,12 @@ fn deviation(content: &ArchiveContent, group: &ValueGroup) -> f64 {
     let found = match group {
         ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
         ValueGroup::Attribute(k) => deviation(&mut archive::attribute_values(&content.cloud, *k)),
+        ValueGroup::Column(k, _) => {
+            let values = content.columns[*k].values.planes();
+            let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
+            // Values that are all equal keep about the precision of f32.
+            deviation(&mut values.iter().copied()).max(f64::from(largest) * MIN_RELATIVE_DEVIATION)
+        }
     };
     found.max(1e-9)
 }

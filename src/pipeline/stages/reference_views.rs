@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::metrics::{decibels_text, psnr};
 use crate::model::FrameView;
 use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch, select_evenly};
-use crate::render::{Image, render};
+use crate::render::Image;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
@@ -148,7 +148,7 @@ impl ReferenceViews<'_> {
             |views| {
                 let first = rendered.len();
                 let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
-                    finish(first + k, render(view.states[0], view.camera, self.scene.background))
+                    finish(first + k, view.render(0, self.scene.background))
                 };
                 rendered.par_extend(views.par_iter().enumerate().map(view));
                 Ok(())

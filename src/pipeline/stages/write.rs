@@ -349,9 +349,9 @@ pub fn write_without_companions(
     Ok(input.size_written(kind, path)?.total())
 }
 
-/// Writes the frames of `source` as a container to `path`, with values that differ from the exact ones by at most
-/// `bounds`.
-fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
+/// Writes the frames of `source` as a container to `path`, with values that differ from the exact ones by at
+/// most `bounds`.
+pub(crate) fn write_within(source: &dyn FrameSource, bounds: ErrorBounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
     let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);
     write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))

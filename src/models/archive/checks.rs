@@ -1,0 +1,106 @@
+//! Check that an archive restores a model of any format. The tests of the formats call it with their synthetic models.
+
+use std::fs;
+use std::path::Path;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::{kind_with_layout, read_archive, unpack};
+use crate::archive::{self, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorSteps};
+use crate::compressed_model::CompressedModel;
+use crate::limits::ReadLimit;
+use crate::model::{Attributes, Gaussians, opacity};
+use crate::models::input_model::{InputModel, OpenOptions};
+use crate::outputs::kind::OutputKind;
+use crate::passes::gather_all;
+use crate::source::FrameSource;
+
+/// Quantization step of all values: 2^-16.
+const STEP: i32 = -8 * 16;
+
+/// Returns the states of all frames.
+fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
+    (0..source.info().times.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
+}
+
+/// Returns steps of 2^-16 for all values of `content`.
+pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
+    let step = |name: &String| (name.clone(), TensorSteps { step: STEP, channels: Vec::new() });
+    QuantizationSteps {
+        cloud: [STEP; 8],
+        columns: vec![STEP; content.columns.len()],
+        field: FieldSteps(content.field.keys().map(step).collect()),
+    }
+}
+
+/// Encodes the compressed model `reduction` of `model` as an archive with steps of 2^-16, restores it, and returns the
+/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the frames
+/// of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
+///
+/// # Panics
+/// Panics if a check fails.
+pub(in crate::models) fn check_round_trip(
+    model: &dyn InputModel,
+    reduction: &CompressedModel,
+    options: &OpenOptions,
+    tolerance: f64,
+) -> OutputKind {
+    let content = model.archive_content(reduction).unwrap();
+    let EncodedArchive { bytes, order, .. } = archive::encode(&content, &fine_steps(&content)).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a.gsz");
+    fs::write(&file, &bytes).unwrap();
+    let (decoded, _) = read_archive(&file, ReadLimit::NONE).unwrap();
+    let kind = kind_with_layout(&decoded, &file).unwrap().expect("a layout");
+
+    let times = &model.source().info().times;
+    let open = |path: &Path| crate::models::open(path, options).unwrap().with_times(times.clone()).unwrap();
+    let restored =
+        folder.path().join(if kind == OutputKind::Model { "back".into() } else { format!("back.{}", extension(kind)) });
+    if kind == OutputKind::Model {
+        fs::create_dir(&restored).unwrap();
+    }
+    unpack(&decoded, &file, &restored).unwrap();
+    let [restored, opened] = [&restored, &file].map(|path| open(path));
+    assert_eq!(restored.kind(), if kind == model.own_output() { model.kind() } else { restored.kind() });
+    assert_eq!((opened.kind(), opened.own_output()), ("gsz archive", kind));
+
+    let expected = states(&*model.reduced(reduction).unwrap());
+    let shown = states(&*model.decode_frames(&decoded).unwrap());
+    let found = states(restored.source());
+    assert!(found == shown && found == states(opened.source()), "a restored model has other frames than its archive");
+    for (frame, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        let expected = expected.pick(&order);
+        assert_eq!((found.len(), found.sh_degree()), (expected.len(), expected.sh_degree()));
+        for i in 0..found.len() {
+            let [found, expected] = [found, &expected].map(|state| values(state, i));
+            let off = found.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(off <= tolerance, "Gaussian {i} in frame {frame} is off by {off}");
+        }
+    }
+    kind
+}
+
+/// Returns what renders of Gaussian `i` depend on: position, opacity, SH coefficients, and its covariance as a fraction
+/// of the largest entry. Several rotations and scales may have almost the same covariance.
+fn values(state: &Gaussians, i: usize) -> Vec<f64> {
+    let [w, x, y, z] = state.rotation.row(i).map(f64::from);
+    let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+    let axes = turn * DMat3::from_diagonal(DVec3::from(state.log_scale.row(i).map(|scale| f64::from(scale).exp())));
+    let covariance = (axes * axes.transpose()).to_cols_array();
+    let largest = covariance.iter().fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
+    let mut values: Vec<f64> = state.position.row::<3>(i).map(f64::from).to_vec();
+    values.push(opacity(state.opacity_logit.plane(0)[i]));
+    values.extend((0..state.sh.width()).map(|c| f64::from(state.sh.plane(c)[i])));
+    values.extend(covariance.map(|entry| entry / largest));
+    values
+}
+
+/// Returns the ending of the names of files of this kind.
+fn extension(kind: OutputKind) -> &'static str {
+    match kind {
+        OutputKind::Splatv => "splatv",
+        OutputKind::Ftgs => "ftgs.ply",
+        _ => "ply",
+    }
+}

@@ -1,0 +1,413 @@
+//! Layout of the files of a model in an archive: which bytes of each file are values that the archive stores quantized,
+//! and which are stored as they are.
+//!
+//! The layout is the part [`LAYOUT`] of the archive, as JSON. The bytes of file k that are no values are the part
+//! `file.k`. Everything read from an archive is checked before it is used: paths stay inside the output folder, and the
+//! restored files have at most [`MAX_GROWTH`] times the bytes of the decoded archive.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use flate2::Crc;
+use half::f16;
+use serde::{Deserialize, Serialize};
+use zip::ZipArchive;
+
+use crate::archive::ArchiveContent;
+use crate::error::{Error, Result, quoted};
+use crate::model::{Attributes, sh_coefficients};
+
+/// Name of the archive part with the layout.
+pub(super) const LAYOUT: &str = "layout";
+/// Maximum size of all restored files, as a multiple of the bytes of the decoded archive. Training checkpoints hold two
+/// optimizer values per parameter, which an archive does not store.
+const MAX_GROWTH: u64 = 4;
+/// Number of bytes that the restored files may have in addition to [`MAX_GROWTH`] times the decoded archive.
+const BASE_BYTES: u64 = 1 << 20;
+/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per frame.
+const MAX_LAYOUT_BYTES: usize = 4 << 20;
+/// Maximum length in bytes of a path in an archive.
+const MAX_PATH: usize = 256;
+/// Names, without the part after the first period, that Windows reserves for devices.
+const DEVICES: [&str; 4] = ["con", "prn", "aux", "nul"];
+/// Names of devices of Windows that end in a digit.
+const NUMBERED_DEVICES: [&str; 2] = ["com", "lpt"];
+/// Bits of a half-precision number per octave (doubling) of its value.
+const BITS_PER_OCTAVE: f32 = 1024.0;
+
+/// Files of a model and the places of values in them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Layout {
+    /// Whether the model is a folder; otherwise it is the only file.
+    pub(super) folder: bool,
+    pub(super) files: Vec<FileLayout>,
+}
+
+/// File of a model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct FileLayout {
+    /// Path relative to the model folder, with `/` between names; the name of the file if it is the only one.
+    pub(super) path: String,
+    /// Parts of the file that hold values, in order and without overlap.
+    pub(super) spans: Vec<Span>,
+}
+
+impl FileLayout {
+    /// Returns whether the file is at `path` on a file system that ignores case.
+    pub(super) fn has_path(&self, path: &str) -> bool {
+        self.path.eq_ignore_ascii_case(path)
+    }
+}
+
+/// Part of a file that holds values.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Span {
+    /// Offset in the file, in bytes.
+    pub(super) at: u64,
+    pub(super) of: Values,
+}
+
+/// Values of a [`Span`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Values {
+    /// One row per Gaussian, in the order of the archive; each row consists of these fields.
+    Rows(Vec<Field>),
+    /// All values of the tensor with this name, as f32.
+    Tensor(String),
+    /// This many zero bytes.
+    Zeros(u64),
+}
+
+/// Field of a row. Planes are counted through the components of position, rotation, log scale, opacity logit and SH
+/// coefficients, and then through those of all columns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Field {
+    /// Value of a plane as f32.
+    F32(usize),
+    /// Value of a plane in half precision.
+    Half(usize),
+    /// Nonnegative half-precision number whose bits are 1024 times the value of a plane, which is about its binary
+    /// logarithm.
+    Octaves(usize),
+    /// Byte that is 255 times the value of a plane.
+    Byte(usize),
+    /// The next of the bytes that the archive holds per Gaussian beside its values, this many.
+    Bytes(usize),
+    /// This many zero bytes.
+    Zeros(usize),
+}
+
+impl Field {
+    /// Returns the number of bytes of the field.
+    pub(super) fn bytes(self) -> usize {
+        match self {
+            Field::F32(_) => 4,
+            Field::Half(_) | Field::Octaves(_) => 2,
+            Field::Byte(_) => 1,
+            Field::Bytes(count) | Field::Zeros(count) => count,
+        }
+    }
+
+    /// Decodes the value of the field from its bytes `stored`; `None` for fields without a plane.
+    pub(super) fn decode(self, stored: &[u8]) -> Option<f32> {
+        let half = || Some(f16::from_le_bytes(stored.try_into().ok()?));
+        match self {
+            Field::F32(_) => Some(f32::from_le_bytes(stored.try_into().ok()?)),
+            Field::Half(_) => Some(half()?.to_f32()),
+            // The sign of scales and widths has no effect on renders.
+            Field::Octaves(_) => Some(f32::from(half()?.to_bits() & 0x7fff) / BITS_PER_OCTAVE),
+            Field::Byte(_) => Some(f32::from(*stored.first()?) / 255.0),
+            Field::Bytes(_) | Field::Zeros(_) => None,
+        }
+    }
+
+    /// Encodes `value` into the bytes `stored` of the field.
+    fn encode(self, value: f32, stored: &mut [u8]) {
+        let limit = f16::MAX.to_f32();
+        match self {
+            Field::F32(_) => stored.copy_from_slice(&value.to_le_bytes()),
+            Field::Half(_) => stored.copy_from_slice(&f16::from_f32(value.clamp(-limit, limit)).to_le_bytes()),
+            Field::Octaves(_) => {
+                let most = f32::from(f16::MAX.to_bits());
+                let bits = (value * BITS_PER_OCTAVE).round_ties_even().clamp(0.0, most) as u16;
+                stored.copy_from_slice(&bits.to_le_bytes());
+            }
+            Field::Byte(_) => stored.fill((value * 255.0).round_ties_even().clamp(0.0, 255.0) as u8),
+            Field::Bytes(_) | Field::Zeros(_) => stored.fill(0),
+        }
+    }
+}
+
+/// Returns the number of the first plane of the columns in a model of this SH degree.
+pub(super) fn first_column_plane(sh_degree: usize) -> usize {
+    first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
+}
+
+/// Returns the number of the first plane of an attribute.
+pub(super) fn first_plane(attribute: Attributes) -> usize {
+    match attribute {
+        Attributes::POSITION => 0,
+        Attributes::ROTATION => 3,
+        Attributes::LOG_SCALE => 7,
+        Attributes::OPACITY => 10,
+        _ => 11,
+    }
+}
+
+/// Returns the values of the plane with number `plane`; `None` if there is no such plane.
+fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
+    let cloud = &content.cloud;
+    let all = Attributes::all();
+    if let Some(attribute) = all.iter().filter(|&attribute| first_plane(attribute) <= plane).last() {
+        let (values, c) = (cloud.column(attribute), plane - first_plane(attribute));
+        if c < values.width() {
+            return Some(values.plane(c));
+        }
+    }
+    let mut c = plane.checked_sub(first_column_plane(cloud.sh_degree()))?;
+    for column in &content.columns {
+        if c < column.values.width() {
+            return Some(column.values.plane(c));
+        }
+        c -= column.values.width();
+    }
+    None
+}
+
+/// Returns the name of the archive part with the bytes of file `k` that are no values.
+pub(super) fn rest_name(k: usize) -> String {
+    format!("file.{k}")
+}
+
+/// Returns whether a name of a file or folder in an archive may contain `c`.
+fn is_plain_char(c: char) -> bool {
+    c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+')
+}
+
+/// Returns `path` with `_` in place of characters that paths in an archive may not have; `None` if that does not make
+/// it a path of plain names ([`is_plain`]).
+pub(super) fn plain_path(path: &str) -> Option<String> {
+    let plain: String = path.chars().map(|c| if c == '/' || is_plain_char(c) { c } else { '_' }).collect();
+    is_plain(&plain).then_some(plain)
+}
+
+/// Returns whether `path` is a relative path of plain names, so that it stays inside a folder on every system.
+fn is_plain(path: &str) -> bool {
+    let is_plain_name = |name: &str| {
+        let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
+        let is_numbered = NUMBERED_DEVICES
+            .iter()
+            .any(|device| stem.strip_prefix(device).is_some_and(|rest| rest.len() == 1 && rest != "0"));
+        !name.is_empty()
+            && !name.starts_with(['.', ' '])
+            && !name.ends_with(['.', ' '])
+            && name.chars().all(is_plain_char)
+            && !DEVICES.contains(&&*stem)
+            && !is_numbered
+    };
+    path.len() <= MAX_PATH && path.split('/').all(is_plain_name)
+}
+
+/// Returns an error about the layout in the archive at `path`.
+fn damaged(path: &Path, expected: &str, found: impl Into<String>) -> Error {
+    Error::input(path, LAYOUT, expected, found.into()).hint("the archive is damaged; copy it again")
+}
+
+impl Layout {
+    /// Reads the layout of the archive at `path` from its content; `None` if it holds a model without a layout.
+    ///
+    /// # Errors
+    /// Fails if the layout is malformed.
+    pub(super) fn read(content: &ArchiveContent, path: &Path) -> Result<Option<Layout>> {
+        let Some(text) = content.files.get(LAYOUT) else { return Ok(None) };
+        if text.len() > MAX_LAYOUT_BYTES {
+            let found = format!("{} bytes", text.len());
+            return Err(damaged(path, &format!("at most {MAX_LAYOUT_BYTES} bytes"), found));
+        }
+        let layout: Layout = serde_json::from_slice(text)
+            .map_err(|error| damaged(path, "the files of a model as JSON", error.to_string()))?;
+        if let Some(file) = layout.files.iter().find(|file| !is_plain(&file.path)) {
+            let found = quoted(&file.path);
+            return Err(damaged(path, "relative paths of letters, digits, _, -, +, . and spaces", found));
+        }
+        // Some file systems ignore case.
+        let mut names = BTreeSet::new();
+        if let Some(file) = layout.files.iter().find(|file| !names.insert(file.path.to_ascii_lowercase())) {
+            return Err(damaged(path, "one file for each path", format!("two files at {}", file.path)));
+        }
+        let is_single = layout.files.len() == 1 && layout.files.iter().all(|file| !file.path.contains('/'));
+        if !layout.folder && !is_single {
+            return Err(damaged(path, "one file", format!("{} files outside a folder", layout.files.len())));
+        }
+        Ok(Some(layout))
+    }
+
+    /// Writes the files of the model into the folder `folder`. Returns the path of the model: the folder itself, or
+    /// the only file in it. `path` is the path of the archive, for messages.
+    ///
+    /// # Errors
+    /// Fails if the content does not match the layout or a write fails.
+    pub(super) fn restore(&self, content: &ArchiveContent, path: &Path, folder: &Path) -> Result<PathBuf> {
+        let name =
+            self.files.first().filter(|_| !self.folder).map_or(folder.to_owned(), |file| folder.join(&file.path));
+        self.write(content, path, &name)?;
+        Ok(name)
+    }
+
+    /// Writes the model to `to`, a folder or, if the model is a single file, a file.
+    ///
+    /// # Errors
+    /// Fails if the content does not match the layout or a write fails.
+    pub(super) fn write(&self, content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
+        self.check_size(content, path)?;
+        // Offset of the next bytes beside the values, in the bytes of a Gaussian.
+        let mut beside = 0;
+        for (k, file) in self.files.iter().enumerate() {
+            let bytes = assemble(content, k, file, &mut beside)
+                .ok_or_else(|| damaged(path, "places of values that match the archive", file.path.clone()))?;
+            let target = if self.folder { to.join(&file.path) } else { to.to_owned() };
+            if let Some(parent) = target.parent().filter(|_| self.folder) {
+                fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
+            }
+            fs::write(&target, bytes).map_err(Error::io("write", &target))?;
+        }
+        Ok(())
+    }
+
+    /// Fails if the restored files would be far larger than the decoded archive, which only damage can cause.
+    fn check_size(&self, content: &ArchiveContent, path: &Path) -> Result<()> {
+        let count = content.cloud.len() as u64;
+        let values = Attributes::all().iter().map(|attribute| content.cloud.column(attribute).planes().len());
+        let columns = content.columns.iter().map(|column| column.values.planes().len());
+        let tensors = content.tensors.values().map(|tensor| tensor.data.len());
+        let values: usize = values.chain(columns).chain(tensors).sum();
+        let files: usize = content.files.values().map(Vec::len).sum();
+        let stored = 4 * values as u64 + (files + content.beside.len()) as u64;
+        let of_span = |span: &Span| match &span.of {
+            Values::Rows(fields) => {
+                fields.iter().fold(0u64, |sum, field| sum.saturating_add(field.bytes() as u64)).saturating_mul(count)
+            }
+            Values::Tensor(name) => content.tensors.get(name).map_or(0, |tensor| 4 * tensor.data.len() as u64),
+            Values::Zeros(bytes) => *bytes,
+        };
+        let spans = self.files.iter().flat_map(|file| &file.spans).map(of_span);
+        let restored = spans.fold(files as u64, u64::saturating_add);
+        let most = stored.saturating_mul(MAX_GROWTH).saturating_add(BASE_BYTES);
+        match restored <= most {
+            true => Ok(()),
+            false => Err(damaged(path, &format!("files of at most {most} bytes"), format!("{restored} bytes"))),
+        }
+    }
+}
+
+/// Returns the bytes of file `k`; `None` if its layout does not match the content. `beside` is the offset of the next
+/// bytes beside the values, and is advanced.
+fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut usize) -> Option<Vec<u8>> {
+    let mut rest = content.files.get(&rest_name(k))?.as_slice();
+    let mut out = Vec::new();
+    for span in &file.spans {
+        let (before, after) = rest.split_at_checked(usize::try_from(span.at).ok()?.checked_sub(out.len())?)?;
+        out.extend_from_slice(before);
+        rest = after;
+        match &span.of {
+            Values::Zeros(bytes) => out.resize(out.len() + usize::try_from(*bytes).ok()?, 0),
+            Values::Tensor(name) => {
+                out.extend(content.tensors.get(name)?.data.iter().flat_map(|value| value.to_le_bytes()));
+            }
+            Values::Rows(fields) => add_rows(content, fields, beside, &mut out)?,
+        }
+    }
+    out.extend_from_slice(rest);
+    if !file.spans.is_empty() && out.starts_with(b"PK\x03\x04") {
+        repair_checksums(&mut out)?;
+    }
+    Some(out)
+}
+
+/// Appends one row of `fields` per Gaussian to `out`; `None` if a field has no values.
+fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out: &mut Vec<u8>) -> Option<()> {
+    let (count, start) = (content.cloud.len(), out.len());
+    if count == 0 {
+        return Some(());
+    }
+    let stride: usize = fields.iter().map(|field| field.bytes()).sum();
+    let bytes_beside = content.beside.len() / count;
+    out.resize(start + stride * count, 0);
+    let rows = &mut out[start..];
+    let mut at = 0;
+    for &field in fields.iter().filter(|field| field.bytes() > 0) {
+        let bytes = field.bytes();
+        match field {
+            Field::F32(plane) | Field::Half(plane) | Field::Octaves(plane) | Field::Byte(plane) => {
+                let values = values_of(content, plane)?;
+                for (row, &value) in rows.chunks_exact_mut(stride).zip(values) {
+                    field.encode(value, &mut row[at..at + bytes]);
+                }
+            }
+            Field::Bytes(_) => {
+                let from = *beside..beside.checked_add(bytes)?;
+                if from.end > bytes_beside {
+                    return None;
+                }
+                for (row, stored) in rows.chunks_exact_mut(stride).zip(content.beside.chunks_exact(bytes_beside)) {
+                    row[at..at + bytes].copy_from_slice(&stored[from.clone()]);
+                }
+                *beside += bytes;
+            }
+            Field::Zeros(_) => (),
+        }
+        at += bytes;
+    }
+    Some(())
+}
+
+/// Sets the checksums in the zip archive `bytes` to those of its uncompressed files. A checksum of 0, which PyTorch
+/// writes if it did not compute one, stays 0. Returns `None` if the bytes are no zip archive.
+fn repair_checksums(bytes: &mut [u8]) -> Option<()> {
+    /// Offset of the checksum in the header before a file, and in its entry in the list of files.
+    const CHECKSUM_AT: [usize; 2] = [14, 16];
+    /// Bit of the flags that says that a record with the checksum follows the file.
+    const RECORD_FOLLOWS: u8 = 1 << 3;
+    const RECORD_MAGIC: &[u8] = b"PK\x07\x08";
+    let mut sums = Vec::new();
+    // Files in an archive do not overlap. The sum of their lengths bounds the time that the checksums take.
+    let mut unread = bytes.len();
+    let mut archive = ZipArchive::new(Cursor::new(&bytes[..])).ok()?;
+    for index in 0..archive.len() {
+        let entry = archive.by_index_raw(index).ok()?;
+        let start = usize::try_from(entry.data_start()).ok()?;
+        let data = bytes.get(start..start.checked_add(usize::try_from(entry.compressed_size()).ok()?)?)?;
+        unread = unread.checked_sub(data.len())?;
+        if entry.crc32() == 0 || entry.compression() != zip::CompressionMethod::Stored {
+            continue;
+        }
+        let mut sum = Crc::new();
+        sum.update(data);
+        let header = usize::try_from(entry.header_start()).ok()?;
+        let listed = usize::try_from(entry.central_header_start()).ok()?;
+        let mut places = vec![listed.checked_add(CHECKSUM_AT[1])?];
+        match bytes.get(header.checked_add(6)?)? & RECORD_FOLLOWS {
+            0 => places.push(header + CHECKSUM_AT[0]),
+            _ => {
+                let after = start + data.len();
+                let has_magic = bytes.get(after..after + 4) == Some(RECORD_MAGIC);
+                places.push(if has_magic { after + 4 } else { after });
+            }
+        }
+        sums.push((places, sum.sum()));
+    }
+    drop(archive);
+    for (places, sum) in sums {
+        for place in places {
+            bytes.get_mut(place..place + 4)?.copy_from_slice(&sum.to_le_bytes());
+        }
+    }
+    Some(())
+}

@@ -1,0 +1,109 @@
+//! Archives of models that are stored as files of their own format: the content of an archive, and the frames of a
+//! decoded archive.
+
+use std::path::Path;
+
+use super::layout::Layout;
+use super::pack::{FileContent, Packer};
+use crate::archive::ArchiveContent;
+use crate::compressed_model::CompressedModel;
+use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::limits::Limits;
+use crate::model::SequenceInfo;
+use crate::models::input_model::{InputModel, OpenOptions};
+use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
+
+/// How the files in an archive of a model are opened: as the model itself was opened.
+#[derive(Debug, Clone)]
+pub(in crate::models) struct Reopener {
+    open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
+    options: OpenOptions,
+}
+
+impl Reopener {
+    /// Creates a record of opening a model by `open` with `options`.
+    pub(in crate::models) fn new(
+        open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
+        options: &OpenOptions,
+    ) -> Reopener {
+        // An archive holds one training iteration.
+        let options = OpenOptions { iteration: None, events: Events::default(), ..options.clone() };
+        Reopener { open, options }
+    }
+
+    /// Returns the content of an archive of the compressed model `reduction` of `model`, which is written as `kind`.
+    /// `name` is the name of the model if it is a single file. `holds` returns what a file of the model holds, by its
+    /// path relative to the model folder.
+    ///
+    /// # Errors
+    /// Fails if the model cannot be written, or if an archive cannot hold its files.
+    pub(in crate::models) fn content<'a>(
+        &self,
+        model: &dyn InputModel,
+        reduction: &CompressedModel,
+        (kind, name): (OutputKind, &str),
+        holds: impl Fn(&str) -> FileContent<'a>,
+    ) -> Result<ArchiveContent> {
+        let scratch = ScratchFolder::new(&self.options.scratch())?;
+        let path = scratch.path().join(name);
+        if kind == OutputKind::Model {
+            std::fs::create_dir(&path).map_err(Error::io("create", &path))?;
+        }
+        model.write(reduction, kind, &path, &Limits::NONE, &Events::default())?;
+        let degree = model.source().info().sh_degree.min(reduction.sh_degree);
+        Packer::new(reduction.len(), degree, self.options.memory).add(&path, holds)
+    }
+
+    /// Returns the frames at `times` of the model in `content`.
+    ///
+    /// # Errors
+    /// Fails if `content` is not a complete model.
+    pub(in crate::models) fn frames(&self, content: &ArchiveContent, times: &[f64]) -> Result<Box<dyn FrameSource>> {
+        let scratch = ScratchFolder::new(&self.options.scratch())?;
+        let archive = Path::new("archive");
+        let layout = Layout::read(content, archive)?;
+        let layout = layout.ok_or_else(|| Error::internal("an archive of another kind of model was given"))?;
+        let model = (self.open)(&layout.restore(content, archive, scratch.path())?, &self.options)?;
+        let model = if model.source().info().times == times { model } else { model.with_times(times.to_vec())? };
+        Ok(Box::new(RestoredFrames { model, _scratch: scratch }))
+    }
+}
+
+/// Frames of a model whose files are in a temporary folder.
+struct RestoredFrames {
+    model: Box<dyn InputModel>,
+    _scratch: ScratchFolder,
+}
+
+impl FrameSource for RestoredFrames {
+    fn info(&self) -> &SequenceInfo {
+        self.model.source().info()
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        self.model.source().open(ids)
+    }
+
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        self.model.source().open_all(wanted)
+    }
+
+    fn deformation(&self) -> Option<&dyn Deformation> {
+        self.model.source().deformation()
+    }
+
+    fn decoder(&self) -> Option<&dyn FeatureDecoder> {
+        self.model.source().decoder()
+    }
+
+    fn reads(&self) -> Reads {
+        self.model.source().reads()
+    }
+
+    fn ahead(&self) -> Option<&dyn Prefetch> {
+        self.model.source().ahead()
+    }
+}
