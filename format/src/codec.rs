@@ -221,8 +221,8 @@ pub(crate) struct StoredTile<'a> {
 }
 
 impl TileDecoder {
-    /// Decompresses a tile that is not raw, so that [`TileDecoder::frame`] can decode its frames. An error says what
-    /// was found instead of the values.
+    /// Decompresses a tile that is not raw, so that [`TileDecoder::frame`] can decode its frames. Fails if the bytes of
+    /// the tile are invalid; the error describes them.
     pub(crate) fn load(
         &mut self,
         stored: StoredTile<'_>,

@@ -144,11 +144,11 @@ pub const ADDED_ERROR: &str = "added";
 /// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
 /// keeps.
 pub const SELECTION_DISTANCE: &str = "kept";
-/// Error name: relative error, against the finest setting, of the number of Gaussians that the thresholds of the recipe
-/// keep.
+/// Name of an error: the relative error of the number of Gaussians that the thresholds of the recipe keep, compared with
+/// the finest setting.
 pub const COUNT_ERROR: &str = "staying";
-/// Error name: largest relative error, against exact percentiles, of the percentiles P1 and P99 by which scores are
-/// normalized.
+/// Name of an error: the largest relative error of the approximate percentiles P1 and P99, compared with the exact ones.
+/// Scores are normalized by these percentiles.
 pub const PERCENTILE_ERROR: &str = "percentiles";
 /// Error name: 1 if the result with a setting differs in any byte from the result with the first setting, else 0.
 pub const DIFFERENT_BYTES: &str = "bytes";

@@ -112,7 +112,8 @@ fn hash(number: u64) -> u64 {
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Query object, which remembers the neighborhood of the voxel queried last.
+/// Search for the points of a [`PointIndex`] near a given point. Keeps the neighborhood of the voxel searched last, so
+/// that another search in the same voxel is fast.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,

@@ -64,9 +64,9 @@ pub enum Verdict {
     Unseen,
     /// No Gaussian of this kind was dropped or merged, or almost none.
     Untouched,
-    /// Where this kind is visible, the error is invisible or not much larger than elsewhere.
+    /// In renders where Gaussians of this kind are visible, the error is imperceptible or not much larger than elsewhere.
     Passed,
-    /// Where this kind is visible, the error is visible and much larger than elsewhere.
+    /// In renders where Gaussians of this kind are visible, the error is perceptible and much larger than elsewhere.
     Flagged,
 }
 

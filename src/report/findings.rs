@@ -24,7 +24,7 @@ pub struct ReportData {
     pub shown: Vec<ChosenRender>,
     /// Animations that the page shows.
     pub films: Vec<FilmPanel>,
-    /// Result of the command `sweep` for the original, if one was given.
+    /// Result of the command `sweep` for the original; `None` if the user gave none.
     pub trade_off: Option<TradeOff>,
     /// Result of the command `precision` for the original, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]

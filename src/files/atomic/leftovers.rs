@@ -23,7 +23,8 @@ const MAX_WAIT: Duration = Duration::from_secs(60);
 /// Maximum time to wait while another run inspects an unfinished workspace (hidden folder of a killed run), which takes
 /// microseconds.
 const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
-/// Maximum length in bytes of a journal (list of the files of one result that get their names together).
+/// Maximum length in bytes of a journal: the list of the temporary files of one result that are renamed to their final
+/// names as a unit.
 const MAX_JOURNAL: u64 = 1 << 20;
 
 /// Lock that a run holds while it moves a result to its final name or repairs an interrupted move to that name.

@@ -2,7 +2,7 @@
 //! its derivatives ∂L/∂pixel with respect to the pixels.
 //!
 //! The steps are: the render as in [`render`](super::render), a loss of the caller, a backward pass over the splats of
-//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a [`Camera`]. Output:
+//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a camera. Output:
 //! [`Gradients`]. Memory in addition to that of the render: 72 bytes per visible Gaussian
 //! ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat, tile) pair of a part of a strip
 //! ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et
