@@ -18,6 +18,9 @@ pub(super) type Colors = [[f32; BLOCK]; 3];
 #[inline(always)]
 pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colors) {
     let n = ids.len().min(BLOCK);
+    for channel in out.iter_mut() {
+        channel[..n].fill(0.5);
+    }
     let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
     let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
     for i in 0..n {
@@ -26,43 +29,17 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
             values[i] = value;
         }
     }
-    let values = &values[..coefficients(gaussians)];
-    let whole = n - n % COLOR_LANES;
-    for first in (0..whole).step_by(COLOR_LANES) {
-        add_terms::<COLOR_LANES>(gaussians, ids.start, first, values, out);
-    }
-    for first in whole..n {
-        add_terms::<1>(gaussians, ids.start, first, values, out);
-    }
-}
-
-/// Number of Gaussians whose color sums are in registers at once.
-const COLOR_LANES: usize = 16;
-
-/// Computes into `out` the colors of the `N` Gaussians of a block from place `first` on. The block begins at Gaussian
-/// `start` of the frame. `values` holds each SH basis function for all Gaussians of the block.
-#[inline(always)]
-fn add_terms<const N: usize>(
-    gaussians: &Gaussians,
-    start: usize,
-    first: usize,
-    values: &[[f32; BLOCK]],
-    out: &mut Colors,
-) {
-    let mut sums = [[0.5; N]; 3];
-    for (k, values) in values.iter().enumerate() {
-        let Some(values) = values[first..].first_chunk::<N>() else { return };
-        for (channel, sum) in sums.iter_mut().enumerate() {
-            let plane = &gaussians.sh.plane(3 * k + channel)[start + first..];
-            let Some(plane) = plane.first_chunk::<N>() else { return };
-            for i in 0..N {
+    for (k, values) in values.iter().enumerate().take(coefficients(gaussians)) {
+        for (channel, sum) in out.iter_mut().enumerate() {
+            let plane = &gaussians.sh.plane(3 * k + channel)[ids.clone()][..n];
+            for i in 0..n {
                 sum[i] += values[i] * plane[i];
             }
         }
     }
-    for (out, sum) in out.iter_mut().zip(sums) {
-        for i in 0..N {
-            out[first + i] = sum[i].max(0.0);
+    for channel in out.iter_mut() {
+        for value in &mut channel[..n] {
+            *value = value.max(0.0);
         }
     }
 }

@@ -3,6 +3,7 @@
 use std::num::NonZeroU32;
 
 use super::convention::TILE;
+use super::project::TileRect;
 use splat_core::Camera;
 
 /// Grid of pixels of an image: the pixels whose column and row have given remainders when divided by the stride.
@@ -52,29 +53,33 @@ impl PixelGrid {
         SampledView { camera, grid: self }
     }
 
-    /// Converts the range `[start, end]` of tiles of the image along one axis (0: columns, 1: rows) to tiles of the
-    /// grid, which have 16×16 pixels of the grid each; ends are exclusive. Returns the tiles that contain a pixel of the
-    /// grid that lies in the range and at most `half` pixels from `at`. `size` is the size of the image along the axis,
-    /// in pixels. The result is empty if its end does not exceed its start.
-    ///
-    /// Tiles are integers, given as f64 so that the compiler vectorizes the calling loop.
-    #[inline(always)]
-    pub(super) fn tiles(self, axis: usize, [start, end]: [f64; 2], at: f64, half: f64, size: u32) -> [f64; 2] {
-        let tile = f64::from(TILE);
-        // NaN becomes 0.
-        let first_pixel = (at - half).ceil().max(start * tile);
-        let end_pixel = ((at + half).floor().max(0.0) + 1.0).min(end * tile).min(f64::from(size));
-        let [first, end] = [first_pixel, end_pixel].map(|pixel| self.count_before(axis, pixel));
-        let first_tile = (first / tile).floor();
-        [first_tile, if first < end { (end / tile).ceil() } else { first_tile }]
+    /// Returns the rectangle of tiles of the grid (16×16 pixels of the grid each) that a splat can change; it may be
+    /// empty. `rect` are the tiles of the full image that the splat can change, `at` is its center, `half` half its
+    /// width and height, and `size` the size of the image, in pixels. The result contains every pixel of the grid that
+    /// lies in `rect` and at most `half` from `at` on each axis.
+    pub(super) fn tiles(self, rect: TileRect, at: [f64; 2], half: [f64; 2], size: [u32; 2]) -> TileRect {
+        if self.stride == 1 {
+            return rect;
+        }
+        let range = |axis: usize, start: u32, end: u32| {
+            // A float-to-integer cast saturates: values below 0 become 0.
+            let first = start.saturating_mul(TILE).max((at[axis] - half[axis]).ceil() as u32);
+            let last = end
+                .saturating_mul(TILE)
+                .min(size[axis])
+                .min(((at[axis] + half[axis]).floor() as u32).saturating_add(1));
+            let [first, last] = [first, last].map(|pixel| self.count_before(axis, pixel));
+            (first / TILE, if first < last { last.div_ceil(TILE) } else { first / TILE })
+        };
+        let (x0, x1) = range(0, rect.x0, rect.x1);
+        let (y0, y1) = range(1, rect.y0, rect.y1);
+        TileRect { x0, x1, y0, y1 }
     }
 
     /// Returns the number of columns of the grid to the left of column `pixel` of the image (`axis` 0), or the number
-    /// of rows of the grid above row `pixel` of the image (`axis` 1). `pixel` is an integer; the result is exact below
-    /// 2⁵².
-    #[inline(always)]
-    fn count_before(self, axis: usize, pixel: f64) -> f64 {
-        ((pixel - f64::from(self.phase[axis])) / f64::from(self.stride)).ceil().max(0.0)
+    /// of rows of the grid above row `pixel` of the image (`axis` 1).
+    fn count_before(self, axis: usize, pixel: u32) -> u32 {
+        pixel.saturating_sub(self.phase[axis]).div_ceil(self.stride)
     }
 }
 

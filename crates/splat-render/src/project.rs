@@ -141,6 +141,14 @@ pub(super) struct TileRect {
     pub(super) y1: u32,
 }
 
+impl TileRect {
+    /// Returns the range of columns and the range of rows of tiles, `[x0, x1, y0, y1]`, as 16-bit integers. Larger
+    /// values become 65,535.
+    fn narrow(self) -> [u16; 4] {
+        [self.x0, self.x1, self.y0, self.y1].map(|tile| tile.try_into().unwrap_or(u16::MAX))
+    }
+}
+
 /// Footprints (splats) of the visible Gaussians of a range, by increasing index. Entry i of both lists belongs to the
 /// same Gaussian.
 #[derive(Debug, Default)]
@@ -174,24 +182,6 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTer
         #[target_feature(enable = "avx2")]
         fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
             project_blocks(gaussians, ids, view, colored, out);
-        }
-        /// Calls [`project_blocks`], compiled for AVX-512. Operations are not fused, so results have the same bits.
-        #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
-        fn project_avx512(
-            gaussians: &Gaussians,
-            ids: Range<usize>,
-            view: &CameraTerms,
-            colored: bool,
-            out: &mut Splats,
-        ) {
-            project_blocks(gaussians, ids, view, colored, out);
-        }
-        if is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512dq")
-            && is_x86_feature_detected!("avx512vl")
-        {
-            // SAFETY: the features were detected on the lines above.
-            return unsafe { project_avx512(gaussians, ids, view, colored, out) };
         }
         if is_x86_feature_detected!("avx2") {
             // SAFETY: AVX2 was detected on the line above.
@@ -245,16 +235,13 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Limit of the exponent of alpha: [`Splat::cutoff`]. NaN if the opacity is less than [`MIN_ALPHA`].
-    cutoff: [f64; BLOCK],
-    /// Half the width in pixels of the ellipse on which alpha is [`MIN_ALPHA`].
+    /// Half the width in pixels of the ellipse on which alpha is half its maximum. Multiplied by the square root of
+    /// [`Splat::cutoff`], it bounds the ellipse alpha ≥ 1/255.
     half_u: [f64; BLOCK],
-    /// Half the height in pixels of the ellipse on which alpha is [`MIN_ALPHA`].
+    /// Half the height in pixels of the ellipse on which alpha is half its maximum, used like `half_u`.
     half_v: [f64; BLOCK],
-    /// Tiles of the full image that the Gaussian can change: first and end column, then first and end row.
-    image_rect: [[f64; BLOCK]; 4],
-    /// Tiles of the render that the Gaussian can change, in the order of `image_rect`.
-    rect: [[f64; BLOCK]; 4],
+    /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
+    radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
 }
 
@@ -269,11 +256,9 @@ impl Default for ProjectedSplats {
             falloff_x: zero,
             shear: zero,
             falloff_y: zero,
-            cutoff: zero,
             half_u: zero,
             half_v: zero,
-            image_rect: [zero; 4],
-            rect: [zero; 4],
+            radius: zero,
             opacity: zero,
         }
     }
@@ -306,28 +291,10 @@ impl ProjectedSplats {
             self.falloff_x[i] = 0.5 * LOG2_E * yy / det;
             self.shear[i] = xy / yy;
             self.falloff_y[i] = 0.5 * LOG2_E / yy;
+            self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
+            self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
+            self.radius[i] = (3.0 * largest.sqrt()).ceil();
             self.opacity[i] = opacity(logit[i]);
-            self.cutoff[i] = log2_bound(self.opacity[i] / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
-            // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255
-            // can touch.
-            let (radius, root) = ((3.0 * largest.sqrt()).ceil(), self.cutoff[i].sqrt());
-            self.half_u[i] = root * (2.0 * LN_2 * xx).sqrt();
-            self.half_v[i] = root * (2.0 * LN_2 * yy).sqrt();
-            [self.image_rect[0][i], self.image_rect[1][i]] =
-                tile_range(self.u[i], radius, self.half_u[i], view.image_tiles[0]);
-            [self.image_rect[2][i], self.image_rect[3][i]] =
-                tile_range(self.v[i], radius, self.half_v[i], view.image_tiles[1]);
-        }
-        if view.grid.stride() == 1 {
-            self.rect = self.image_rect;
-            return;
-        }
-        for (axis, (at, half)) in [(&self.u, &self.half_u), (&self.v, &self.half_v)].into_iter().enumerate() {
-            for i in 0..n {
-                let image_range = [self.image_rect[2 * axis][i], self.image_rect[2 * axis + 1][i]];
-                [self.rect[2 * axis][i], self.rect[2 * axis + 1][i]] =
-                    view.grid.tiles(axis, image_range, at[i], half[i], view.image_size[axis]);
-            }
         }
     }
 
@@ -340,35 +307,43 @@ impl ProjectedSplats {
         if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
             return None;
         }
-        let [image_rect, rect] =
-            [&self.image_rect, &self.rect].map(|rect| [rect[0][i], rect[1][i], rect[2][i], rect[3][i]]);
-        let is_empty = |rect: [f64; 4]| rect[0] >= rect[1] || rect[2] >= rect[3];
-        if is_empty(image_rect) || is_empty(rect) {
+        let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
+        // The square of tiles of the original CUDA rasterizer, reduced to the tiles that the ellipse alpha ≥ 1/255 can
+        // touch.
+        let root = cutoff.sqrt();
+        let (radius, half) = (self.radius[i], [root * self.half_u[i], root * self.half_v[i]]);
+        let image_tiles = view.image_tiles;
+        let (x0, x1) = tile_range(u, radius, half[0], image_tiles[0]);
+        let (y0, y1) = tile_range(v, radius, half[1], image_tiles[1]);
+        if x0 >= x1 || y0 >= y1 {
+            return None;
+        }
+        let image_rect = TileRect { x0, x1, y0, y1 };
+        let rect = view.grid.tiles(image_rect, [u, v], half, view.image_size);
+        if rect.x0 >= rect.x1 || rect.y0 >= rect.y1 {
             return None;
         }
         // Only a splat whose ellipse alpha ≥ 1/255 has a pixel beyond its tiles, inside the image, is cut off.
-        let is_cut = |at: f64, half: f64, start: f64, end: f64, tiles: u32| {
-            let [start_pixel, end_pixel] = [start, end].map(|tile| tile * f64::from(TILE));
-            (start > 0.0 && at - half <= start_pixel - 1.0) || (end < f64::from(tiles) && at + half >= end_pixel)
+        let is_cut = |at: f64, half: f64, (start, end): (u32, u32), tiles: u32| {
+            let [start_pixel, end_pixel] = [start, end].map(|tile| f64::from(tile) * f64::from(TILE));
+            (start > 0 && at - half <= start_pixel - 1.0) || (end < tiles && at + half >= end_pixel)
         };
         let is_cut_off = view.grid.stride() > 1
-            && (is_cut(u, self.half_u[i], image_rect[0], image_rect[1], view.image_tiles[0])
-                || is_cut(v, self.half_v[i], image_rect[2], image_rect[3], view.image_tiles[1]));
+            && (is_cut(u, half[0], (x0, x1), image_tiles[0]) || is_cut(v, half[1], (y0, y1), image_tiles[1]));
         let splat = Splat {
             u,
             v,
             falloff_x: self.falloff_x[i] as f32,
             shear: self.shear[i] as f32,
             falloff_y: self.falloff_y[i] as f32,
-            cutoff: self.cutoff[i] as f32,
+            cutoff: cutoff as f32,
             opacity: opacity as f32,
             sort_depth: self.sort_depth[i],
             color: [0.0; 3],
             id,
-            drawn_tiles: if is_cut_off { image_rect.map(|tile| tile as u16) } else { Splat::UNBOUNDED },
+            drawn_tiles: if is_cut_off { image_rect.narrow() } else { Splat::UNBOUNDED },
         };
-        let [x0, x1, y0, y1] = rect.map(|tile| tile as u32);
-        Some((splat, TileRect { x0, x1, y0, y1 }))
+        Some((splat, rect))
     }
 }
 
@@ -447,18 +422,17 @@ pub(super) fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Returns the range of tiles along one axis that a splat centered at `at` (pixels) can change: the tiles that the
-/// original CUDA rasterizer counts for `at ± radius`, without those whose pixels are all further than `half` from `at`.
-/// `tiles` is the number of tiles of the image. The range is empty if its end does not exceed its start.
-///
-/// Both are integers from 0 to `tiles`, given as f64 so that the compiler vectorizes the calling loop.
+/// Returns the range of tiles (first, end) along one axis that a splat can change. These are the tiles that the
+/// original CUDA rasterizer draws for `at ± radius`, except tiles whose pixels are all further than `half` from `at`.
+/// `at` is the center of the splat along the axis. `at`, `radius` and `half` are in pixels; `tiles` is the number of
+/// tiles of the image.
 #[inline(always)]
-fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> [f64; 2] {
+fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let tile = f64::from(TILE);
     let start = ((at - radius) / tile).floor().max(((at - half - (tile - 1.0)) / tile).ceil());
     let end = ((at + radius + tile - 1.0) / tile).floor().min(((at + half) / tile).floor() + 1.0);
-    // NaN becomes 0.
-    [start, end].map(|tile| tile.max(0.0).min(f64::from(tiles)))
+    // A float-to-integer cast saturates: values below 0 become 0.
+    ((start as u32).min(tiles), (end as u32).min(tiles))
 }
 
 /// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
@@ -529,7 +503,7 @@ mod tests {
             for radius in [1.0f64, 3.0, 17.0, 250.0] {
                 let expected_start = (((at - radius) / 16.0) as i64).clamp(0, 20) as u32;
                 let expected_end = (((at + radius + 15.0) / 16.0) as i64).clamp(0, 20) as u32;
-                let [start, end] = tile_range(at, radius, 1e9, 20).map(|tile| tile as u32);
+                let (start, end) = tile_range(at, radius, 1e9, 20);
                 if expected_start < expected_end {
                     assert_eq!((start, end), (expected_start, expected_end), "at {at} radius {radius}");
                 } else {
