@@ -22,9 +22,9 @@ pub struct StoredResult {
     pub key: String,
     /// Number of shards into which the stage was divided; 1: the result is not divided.
     pub parts: usize,
-    /// Indices of the shards that are not stored, from 1.
+    /// Indices, counted from 1, of the shards that are not stored.
     pub missing: Vec<usize>,
-    /// Indices of the stored shards that are damaged and will be computed again, from 1.
+    /// Indices, counted from 1, of the stored shards that are damaged and will be computed again.
     pub damaged: Vec<usize>,
     /// Number of bytes of all files of the result.
     pub bytes: u64,

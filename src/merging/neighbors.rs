@@ -112,7 +112,8 @@ fn hash(number: u64) -> u64 {
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Query object, which remembers the neighborhood of the voxel queried last.
+/// Search for the points of a [`PointIndex`] that are nearest to a position. Remembers the voxels around the voxel
+/// queried last, so that a further query in the same voxel does not look them up again.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
