@@ -209,9 +209,9 @@ impl Multiples {
         if cost(2) < cost(1) { 2 } else { 1 }
     }
 
-    /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving, the
-    /// multiples of the first frame, and the prediction errors. `order` is the number of earlier frames that predict a
-    /// value.
+    /// Returns the bytes that zstd compresses: a mask with one bit per track that tells which tracks are moving; the
+    /// values of the first frame, as integer multiples of the quantization step; and the prediction errors of moving
+    /// tracks in the later frames. `order` is the number of earlier frames that predict a value.
     fn body(&self, order: u8) -> Vec<u8> {
         let mut out = vec![0; self.plane.div_ceil(8)];
         for (track, _) in self.moves.iter().enumerate().filter(|(_, moves)| **moves) {

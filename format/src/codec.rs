@@ -221,8 +221,9 @@ pub(crate) struct StoredTile<'a> {
 }
 
 impl TileDecoder {
-    /// Decompresses a tile that is not raw, so that [`TileDecoder::frame`] can decode its frames. Fails if the bytes of
-    /// the tile are invalid; the error describes them.
+    /// Decompresses a tile that is not stored raw, so that [`TileDecoder::frame`] can decode its frames. Fails if the
+    /// tile is stored raw or is malformed; the error describes the data that was found where valid values were
+    /// expected.
     pub(crate) fn load(
         &mut self,
         stored: StoredTile<'_>,

@@ -18,12 +18,13 @@ use crate::text::ShowPath;
 /// ([`Writer::write_tile`]); then call [`Writer::finish`].
 ///
 /// Tiles may be written in any order once the time stamps of their frame block have been appended. If all tiles of a
-/// frame block are written before the next one begins, [`crate::recover`] saves the most after a crash. The bytes of
-/// the file depend on the order of writing; its digest and its content do not.
+/// frame block are written before the next one begins, [`crate::recover`] saves the most after a crash. The order of
+/// writing changes the bytes of the file, but not its content, and not the hash of the content
+/// ([`crate::Reader::digest`]).
 ///
 /// A constant tile (all frames equal) is not stored again if its bytes equal those of the last constant tile written
-/// for its column and Gaussian block. A column that never changes therefore takes 64 bytes and an index entry per
-/// further tile.
+/// for its column and Gaussian block. A column that never changes therefore takes 128 bytes per further tile: a record
+/// of 64 bytes before the index, and the same record in the index.
 ///
 /// Memory: 8 bytes per frame, twice as many in [`Writer::finish`]; 80 bytes per column and Gaussian block; the stored
 /// bytes of the largest constant tile. The index (table of tiles), 64 bytes per tile, is kept in an unnamed temporary

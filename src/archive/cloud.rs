@@ -111,7 +111,8 @@ impl PointCloudShape {
             && self.gaussians <= u32::MAX as usize
     }
 
-    /// Returns the number of planes after the three of the position; `None` if it overflows.
+    /// Returns the number of planes (scalar components) other than the three of the position; `None` if the number
+    /// overflows.
     fn plane_count(&self) -> Option<usize> {
         let attributes = Attributes::all().width(self.sh_degree.min(MAX_SH_DEGREE)) - 3;
         self.columns.iter().try_fold(attributes, |sum, column| sum.checked_add(column.planes))

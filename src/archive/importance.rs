@@ -84,8 +84,9 @@ pub fn step_offsets(
     found
 }
 
-/// Adds the offsets of the weights and of the bias of `layer` to `found`. `rows` holds the importance of each output
-/// (effect of its errors on the result), `columns` the mean square of each input.
+/// Adds to `found` the offsets of the quantization steps ([`importance_offsets`]) of the weights and of the bias of
+/// `layer`, by the names of the tensors. `rows` holds the importance of each output (effect of its errors on the
+/// result), `columns` the mean square of each input.
 fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));

@@ -39,7 +39,8 @@ impl<const N: usize> PredictorFit<N> {
         PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }
 
-    /// Adds a sample: `value`, from which its mean has been subtracted, and the `differences` that predict it.
+    /// Adds a sample to the least-squares fit: `value`, the value to predict less the mean of all such values, and the
+    /// `differences` from which it is predicted.
     #[inline(always)]
     pub(super) fn add(&mut self, differences: &[f32; N], value: f32) {
         for i in 0..N {

@@ -64,8 +64,9 @@ impl Residuals {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
     }
 
-    /// Writes the multiple `multiple`, which was predicted as `predicted`, to `to`. `size` is the expected magnitude of
-    /// the prediction error, in quantization steps, which selects the entropy model. Returns the prediction error.
+    /// Encodes the value `multiple`, an integer multiple of the quantization step, into `to`. `predicted` is its
+    /// prediction. `size`, the expected magnitude of the prediction error in quantization steps, selects the entropy
+    /// model. Returns the prediction error in quantization steps.
     pub(super) fn encode(
         &mut self,
         multiple: i64,
@@ -89,8 +90,9 @@ impl Residuals {
         residual
     }
 
-    /// Reads a multiple that was predicted as `predicted`. `size` is the expected magnitude of the prediction error, in
-    /// quantization steps, which selects the entropy model. Returns the multiple and the prediction error.
+    /// Decodes a value, an integer multiple of the quantization step, from `from`. `predicted` is its prediction.
+    /// `size`, the expected magnitude of the prediction error in quantization steps, selects the entropy model. Returns
+    /// the multiple and the prediction error, both in quantization steps.
     #[inline(always)]
     pub(super) fn decode(
         &mut self,

@@ -431,7 +431,7 @@ pub(super) struct Convert {
     /// (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
-    /// The output, as other commands name it
+    /// Path of the output: the same as the argument OUTPUT, in the form that other commands use
     #[arg(
         id = "output_option",
         short = 'o',

@@ -135,22 +135,23 @@ pub struct ObservedOrder {
     pub expected: Option<f64>,
 }
 
-/// Error name: root mean square error of renders of the model that a setting yields, against renders of the whole
-/// model; color values are in [0, 1].
+/// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
+/// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Error name: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
-/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
+/// Name of the error: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the
+/// finest setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
-/// Error name: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest setting
-/// keeps.
+/// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
+/// setting keeps.
 pub const SELECTION_DISTANCE: &str = "kept";
-/// Name of an error: the relative error of the number of Gaussians that the thresholds of the recipe keep, compared with
+/// Name of the error: relative error of the number of Gaussians that the thresholds of the recipe keep, compared with
 /// the finest setting.
 pub const COUNT_ERROR: &str = "staying";
-/// Name of an error: the largest relative error of the approximate percentiles P1 and P99, compared with the exact ones.
-/// Scores are normalized by these percentiles.
+/// Name of the error: largest relative error of the percentiles P1 and P99, compared with exact percentiles. Scores are
+/// normalized by these percentiles.
 pub const PERCENTILE_ERROR: &str = "percentiles";
-/// Error name: 1 if the result with a setting differs in any byte from the result with the first setting, else 0.
+/// Name of the error: 1 if the result with a setting differs in any byte from the result with the first setting, else
+/// 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
 /// Upper limit of a small error [`ADDED_ERROR`]: at [`PrecisionCurve::sufficient_value`] and at all finer values, the

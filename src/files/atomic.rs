@@ -253,8 +253,8 @@ impl StagedFolder {
         &self.content
     }
 
-    /// If the folder has a summary (`summary.json`), adds the list of all files in the folder to it. Then syncs
-    /// everything to disk and gives the folder its final name.
+    /// Syncs everything to disk and gives the folder its final name. Before that, adds the list of all files in the
+    /// folder to its summary (`summary.json`), if it has one.
     ///
     /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
     /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the

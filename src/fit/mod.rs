@@ -58,8 +58,8 @@ impl Default for Tolerance {
 /// and the error of its opacity.
 const FAR: [f64; 2] = [1.0, 0.1];
 
-/// Errors of fits (curves or pieces) against the Gaussians, over all Gaussians and the frames in which they are
-/// visible.
+/// Errors of fitted motions (curves, or pieces of linear motion) compared with the original states of the Gaussians,
+/// over all Gaussians and the frames in which they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct FitError {
     /// Number of compared states (Gaussians × visible frames).

@@ -140,8 +140,9 @@ mod tests {
 
     use super::*;
 
-    /// Slow reference that applies the rule literally: visits the nodes in order of rank, and each free node takes
-    /// every free node that it may take. Returns the leader of every node and the number of joins.
+    /// Slow reference implementation of the sequential greedy rule of this module. Visits the nodes in order of rank. A
+    /// node without a leader becomes a leader, and every node without a leader that forms a pair with it joins it, as
+    /// long as the number of joins is below `limit`. Returns the leader of every node and the number of joins.
     fn sequential_oracle(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> (Vec<u32>, usize) {
         let n = rank.len();
         let mut order: Vec<u32> = (0..n as u32).collect();

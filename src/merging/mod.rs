@@ -129,21 +129,29 @@ pub struct PassCounts {
 }
 
 /// Runs all merging passes of `recipe` over `survivors`. Every pass first merges nodes (Gaussians or merged groups)
-/// that coincide, then neighbors.
+/// that coincide, then neighbors. A merge joins one or more nodes (members) to a leader: the node of the resulting
+/// group that ranks first by its contribution C.
 ///
-/// `measure` provides the values for test 3 (motion): it returns the motion similarity of every requested pair, in the
-/// order of the request. A pair passes if its similarity exceeds the minimum τ_m of the pass. The similarity depends on
-/// the pair alone, so the caller may cache it.
+/// A member must pass three tests with its leader: 1 (place and size), 2 (color) and 3 (motion). `measure` provides the
+/// values for test 3: it returns the motion similarity of every requested pair, in the order of the request. A pair
+/// passes if its similarity exceeds the minimum τ_m of the pass. The similarity depends on the pair alone, so the
+/// caller may cache it.
+///
+/// # Calls of `measure`
 ///
 /// Each pass calls `measure` at most twice: for the pairs of coincident nodes, then for the pairs of neighbors. A call
 /// without pairs is omitted. A call for more than `most_pairs` pairs is replaced by several calls for at most
-/// `most_pairs` pairs each; pairs of neighbors are in the voxel order of their leaders.
+/// `most_pairs` pairs each. Pairs of neighbors are ordered by the voxel that contains their leader.
 ///
-/// In later passes the nodes are groups. A group has the state of the proxy of all its original Gaussians, and the sum
-/// of their contributions C as its size. Trajectory, life span and hash are those of its leader.
+/// # Groups as nodes
+///
+/// In later passes the nodes are groups. A group has the state of the proxy of all its original Gaussians. It is ranked
+/// by the sum of their contributions C. Its trajectory, life span and hash are those of its leader.
+///
+/// # Limit of joins
 ///
 /// With `limit`, merging stops after exactly that many joins over all passes, or earlier if no more are possible. The
-/// joins made are the first ones in the order of the sequential rule ([`greedy`]).
+/// joins made are the first ones that the sequential rule ([`greedy`]) makes.
 ///
 /// # Errors
 /// Returns the first error of `measure`; nothing else fails.

@@ -112,8 +112,8 @@ fn hash(number: u64) -> u64 {
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Search for the points of a [`PointIndex`] near a given point. Keeps the neighborhood of the voxel searched last, so
-/// that another search in the same voxel is fast.
+/// Search for the points of a [`PointIndex`] that are nearest to a position. Remembers the voxels around the voxel
+/// queried last, so that a further query in the same voxel does not look them up again.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,

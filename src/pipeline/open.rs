@@ -41,9 +41,9 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens the scene that `options` describe, and sets limits on what its stages keep in memory, so that the run stays
-/// within the memory budget. `plan` makes the plan of the run from facts about the scene. For a stream it is called
-/// before any frame is read, unless frames have to be linked (see [`is_linked`]).
+/// Opens the scene that `options` describe. Limits what the stages of the run keep in memory, so that the run stays
+/// within the memory budget. The function `plan` makes the plan of the run from facts about the scene. For a stream,
+/// the function is called before any frame is read, unless frames have to be linked (see [`is_linked`]).
 ///
 /// Returns the scene and the plan of the run. Also returns the statistics of the Gaussians if the input is a stream and
 /// they were computed while it arrived (see [`receive_measured`]).

@@ -345,8 +345,8 @@ impl SearchStage {
     }
 
     /// Returns by how much the quality `value` (PSNR or loss of PSNR, dB) is better than the search requires. Unit:
-    /// approximate number of times that this surplus would allow the number of Gaussians to be halved. Negative if the
-    /// quality is worse than required.
+    /// halvings of the number of Gaussians; a surplus of 1 allows about half as many Gaussians. Negative if the quality
+    /// is worse than required.
     fn surplus(&self, value: f64) -> f64 {
         match self.searched {
             // Renders with NaN or infinity never pass.

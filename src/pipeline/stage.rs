@@ -311,7 +311,8 @@ pub struct RunState<'a> {
     pub scene: &'a Scene,
     /// Request of the user.
     pub request: &'a Request,
-    /// Stages of the run, and the numbers of Gaussians that remain after ranking and after refinement.
+    /// Stages of the run, with the plan ([`CountPlan`]) of how many Gaussians remain after ranking and after
+    /// refinement.
     pub stages: &'a StageList,
     /// Journal of the run so far, for the summary.
     pub journal: Journal,

@@ -72,11 +72,16 @@ pub const WORKING_BYTES_PER_GAUSSIAN: usize =
 
 /// Applies stages 1 and 2 to N scored Gaussians, then the user's overrides, and returns which Gaussians stay.
 ///
-/// Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; of equal
-/// scores, the Gaussian with the smaller hash of its id comes first). Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S
-/// or norm(S_dynamic) ≥ τ_D, where norm is the normalized score and τ a threshold of the recipe. It is applied to the
-/// candidates, or under [`LowScorePolicy::Rescue`] to all Gaussians. If both norms are 0 for all Gaussians, as for a
-/// single Gaussian or for copies of one, the scores cannot distinguish them, and stage 2 prunes none.
+/// By default a Gaussian stays if it passes both stages. Under [`LowScorePolicy::Rescue`] it stays if it passes stage
+/// 2, whether or not it passes stage 1.
+///
+/// - Stage 1 takes the best round(`keep_fraction`·N) Gaussians by score S as candidates (halves round up; of equal
+///   scores, the Gaussian with the smaller hash of its id comes first).
+/// - Stage 2 keeps Gaussians with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D. S_static and S_dynamic are the static
+///   and the dynamic score, norm is the normalized score, and τ a threshold of the recipe.
+///
+/// If both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
+/// them, and stage 2 prunes none.
 ///
 /// # Errors
 /// Returns [`Error::Usage`] for an id that is N or larger, and for an id that is to be both kept and dropped.

@@ -27,8 +27,9 @@ pub fn ranking_stride(pixels: u64, count: usize) -> NonZeroU32 {
 /// on the number of threads. Fails if a frame cannot be read.
 ///
 /// Memory per Gaussian of `ids`, where d is the SH degree and a state has 44 + 12·(d + 1)² bytes:
-/// - its reader;
-/// - its state at each frame of a batch (frames that have 4 × threads views together, within `limits`);
+/// - its share of a reader of `source`;
+/// - its state at each frame of a batch; a batch has at most 4 × threads views, of at most [`Limits::frames_together`]
+///   frames;
 /// - its state while its block of Gaussians is read;
 /// - for each view rendered at the same time, 8 bytes of sums and the buffers of the view.
 ///

@@ -107,8 +107,8 @@ impl Recipe {
         recipe
     }
 
-    /// Returns this recipe with `steps` optimization steps. Changes in proportion the number of optimization steps
-    /// before each prune step (removal of the lowest-ranked Gaussians).
+    /// Returns this recipe with `steps` final optimization steps. The number of optimization steps before each prune
+    /// step (removal of the lowest-ranked Gaussians) is multiplied by the same factor and rounded up.
     pub fn with_refinement_steps(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;

@@ -22,9 +22,10 @@ impl<'a> PrunedModels<'a> {
         PrunedModels { refinement, models: Vec::new() }
     }
 
-    /// Returns a refined model of `size` Gaussians: prunes the smallest kept model that has at least `size` Gaussians,
-    /// then runs the final optimization steps. If no kept model is large enough, pruning begins with `start`, the model
-    /// of the Gaussians that ranking alone keeps. Notes for the user are added to `journal`.
+    /// Returns a refined model of `size` Gaussians. Prunes a larger model by optimization and prune steps, then runs
+    /// the final optimization steps. Pruning begins with the smallest model stored by earlier calls that has at least
+    /// `size` Gaussians. If there is none, or if `start` has at most `size` Gaussians, it begins with `start`: the
+    /// model of the Gaussians that ranking keeps, before any prune step. Notes for the user are added to `journal`.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or a scratch file cannot be written.

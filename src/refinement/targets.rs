@@ -163,8 +163,8 @@ impl Targets {
         &self.cameras[self.pictures[k].camera as usize]
     }
 
-    /// Returns how many pixel columns and rows of view `k` are rendered and compared if only every `stride`-th one is
-    /// used.
+    /// Returns how many columns and how many rows of pixels of view `k` are rendered and compared, if only every
+    /// `stride`-th column and row is used.
     fn size(&self, k: usize, stride: NonZeroU32) -> [usize; 2] {
         let camera = self.camera(k);
         self.grid(k, stride).size([camera.width, camera.height]).map(|pixels| pixels as usize)

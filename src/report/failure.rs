@@ -64,9 +64,9 @@ pub enum Verdict {
     Unseen,
     /// No Gaussian of this kind was dropped or merged, or almost none.
     Untouched,
-    /// In renders where Gaussians of this kind are visible, the error is imperceptible or not much larger than elsewhere.
+    /// Where Gaussians of this kind are visible, the error is imperceptible or not much larger than elsewhere.
     Passed,
-    /// In renders where Gaussians of this kind are visible, the error is perceptible and much larger than elsewhere.
+    /// Where Gaussians of this kind are visible, the error is perceptible and much larger than elsewhere.
     Flagged,
 }
 
@@ -200,9 +200,10 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges the failure mode of one kind of Gaussian, and returns its measurements and its verdict. `members` has the
-/// counts and the contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the
-/// frame and the view of each render.
+/// Measures the errors of renders where Gaussians of the kind `kind` are visible. Returns the measurements and the
+/// [`Verdict`] whether these errors are perceptible and much larger than elsewhere. `members` has the counts and the
+/// contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the frame and the view
+/// of each render.
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;

@@ -24,9 +24,9 @@ pub struct ReportData {
     pub shown: Vec<ChosenRender>,
     /// Animations that the page shows.
     pub films: Vec<FilmPanel>,
-    /// Result of the command `sweep` for the original; `None` if the user gave none.
+    /// Result of the command `sweep` for the original model; `None` if the user gave no such result.
     pub trade_off: Option<TradeOff>,
-    /// Result of the command `precision` for the original, if one was given.
+    /// Result of the command `precision` for the original model; `None` if the user gave no such result.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub precision: Option<PrecisionDiagram>,
     /// Data of the further compressed models, in the order of the command line.

@@ -105,7 +105,7 @@ pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<Chose
     choices.iter().map(scored).collect()
 }
 
-/// Chosen render with its images.
+/// Render that was chosen for the report, with the images that the report shows of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
     /// Chosen render, with its scores.

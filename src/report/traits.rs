@@ -76,8 +76,8 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
 /// Kinds to which one Gaussian belongs: one flag per kind, in the order of [`GaussianKind::ALL`].
 pub type KindFlags = [bool; 3];
 
-/// Determines for every Gaussian to which of the [`GaussianKind`]s it belongs. A Gaussian that is never visible belongs
-/// to none.
+/// Returns for every Gaussian the [`GaussianKind`]s to which it belongs, as one flag per kind. A Gaussian that is never
+/// visible belongs to none.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.

@@ -25,9 +25,10 @@ const TRIES: usize = 64;
 /// Maximum number of iterations of the search for the direction of a cone that is nearest to a given direction
 /// ([`RigCone::angle`]).
 const MAX_DIRECTIONS: usize = 64;
-/// Tolerance of the search for the nearest direction of a cone. The search ends if every direction of the cone has a
-/// dot product with the remainder of at most this value. Vectors count as linearly dependent if their determinant is at
-/// most this value.
+/// Tolerance of the search for the direction of a cone that is nearest to a given direction ([`RigCone::angle`]). It is
+/// used in two tests. The search ends if no direction of the cone has a dot product above this value with the remainder
+/// (the given direction minus the nearest point of the cone found so far). Vectors count as linearly dependent if the
+/// absolute value of their determinant is at most this value.
 const EXACT_ENOUGH: f64 = 1e-12;
 /// Tolerance for the faces of a cone: sine of the angle below which a direction counts as being on a face, and distance
 /// of unit normals up to which two faces count as the same.
@@ -52,8 +53,9 @@ impl RigCone {
         RigCone { focus, directions }
     }
 
-    /// Returns the angle in radians, 0 to π/2, between the direction of `camera` (seen from the point where the optical
-    /// axes meet) and the nearest direction of the cone. It is 0 inside the cone, and for a camera at that point.
+    /// Returns the angle in radians, 0 to π/2, between this cone and the direction from [`RigCone::focus`] to `camera`.
+    /// Returns 0 if the direction is inside the cone, if the camera is at the focus, or if nothing is outside the cone
+    /// (see [`RigCone::new`]).
     pub fn angle_outside(&self, camera: &Camera) -> f64 {
         let direction = (camera.center() - self.focus).try_normalize().filter(|_| !self.directions.is_empty());
         direction.map_or(0.0, |direction| self.angle(direction))

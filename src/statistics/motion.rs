@@ -185,15 +185,17 @@ impl MotionSums {
         }
     }
 
-    /// Returns the trajectory magnitude D of every Gaussian, in scene units per frame; 0 if none of its steps counts.
-    /// `life` holds the number of frames in which each is alive.
+    /// Returns the trajectory magnitude D of every Gaussian, in scene units per frame; 0 if none of its steps from
+    /// frame to frame counts. The table of this module shows which steps count. `life` holds the number of frames in
+    /// which each Gaussian is alive; the definition `Literal` divides by it.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
     /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if no turn (second difference of its
-    /// positions) counts. `life` holds the number of frames in which each is alive.
+    /// positions) counts. The table of this module shows which turns count. `life` holds the number of frames in which
+    /// each Gaussian is alive; the definition `Literal` divides by `life` − 2.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()

@@ -86,8 +86,9 @@ impl ScanPlan {
         })
     }
 
-    /// Creates the plan for a stream whose frames have not arrived yet. The plan assumes that the frames are evenly
-    /// spaced. If this proves true, the plan for the complete sequence can finish the scan ([`ScanPlan::can_finish`]).
+    /// Creates the plan with which the scan of a stream begins, before its frames have arrived. This plan assumes that
+    /// the frames are evenly spaced. If they are, the scan can be finished with the plan that [`ScanPlan::new`] creates
+    /// for the complete sequence (see [`ScanPlan::can_finish`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {

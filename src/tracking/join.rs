@@ -87,7 +87,8 @@ impl Joiner {
         self.add_pairs(old, new);
     }
 
-    /// Pairs the tracks `new`, which begin in this frame, with similar ones among the earlier open tracks `old`.
+    /// Adds the pairs of tracks that may be joined: a track of `new`, which begins in this frame, and a similar track
+    /// of `old`, which began earlier and may still continue.
     fn add_pairs(&mut self, old: &[OpenTrack], new: &[OpenTrack]) {
         if old.is_empty() || new.is_empty() {
             return;

@@ -58,9 +58,11 @@ impl Rig {
     /// the camera file is read.
     pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
-    /// Bytes of memory per view, without its camera and the text of its file name: a [`Shot`], 32 bytes for its entries
-    /// in two tables while the camera file is read, and three times its entry of 40 bytes in a [`ViewSchedule`]. The
-    /// factor is three because a vector that grows needs its old memory and twice as much new memory.
+    /// Bytes of memory per view, except its camera and the text of its file name. This is the sum of:
+    /// - a [`Shot`];
+    /// - 32 bytes for entries in two tables while the camera file is read;
+    /// - 3 × 40 bytes for an entry in a [`ViewSchedule`], because a vector that grows needs its old memory and twice as
+    ///   much new memory.
     pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
     /// Bytes of memory per file name in addition to its text: the overhead of the allocator.

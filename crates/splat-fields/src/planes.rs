@@ -238,7 +238,8 @@ impl Planes {
         prepared
     }
 
-    /// Interpolates the planes with time at `time`. Returns, for every level, one line for each of the axes x, y and z.
+    /// Interpolates the planes that have a time axis at the time `time`, so that each becomes a line of features along
+    /// one axis of space. Returns, for every level, three lines: along x, y and z.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);

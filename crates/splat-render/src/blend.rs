@@ -104,20 +104,24 @@ pub(super) trait BlendSink {
     type Accumulator<V: Lanes>: Copy;
     /// Returns the accumulator with which the blending of `splat` begins.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Accumulator<V>;
-    /// Adds `fragment`, the values of the splat at the [`LANES`] pixels of group `group`, to the accumulator, and
-    /// returns the accumulator. A vector that is wider than a group also has the pixels of the following groups.
+    /// Adds `fragment` to the accumulator, and returns the accumulator. `fragment` holds the values of the splat at the
+    /// pixels of group `group`; a group is [`LANES`] neighboring pixels in a row of the tile. If `V` has more than
+    /// [`LANES`] lanes, `fragment` also holds the values at the pixels of the following groups.
     fn add<V: Lanes>(
         &mut self,
         accumulator: Self::Accumulator<V>,
         group: usize,
         fragment: Fragment<V>,
     ) -> Self::Accumulator<V>;
-    /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index, if a vector
-    /// holds one group.
+    /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index. Has an
+    /// effect only if a vector holds a single group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Returns `accumulator` with its sums over even and over odd groups swapped, if a vector holds one group of eight
-    /// pixels. Called twice per splat: after the groups with even index, and after the groups with odd index. Returns
-    /// `accumulator` unchanged by default.
+    /// Swaps the sums over even groups and the sums over odd groups in an accumulator that keeps them apart, and
+    /// returns the accumulator. The following groups are then added to the other sums. Called twice per splat: after
+    /// the groups with even index, and after the groups with odd index.
+    ///
+    /// Returns `accumulator` unchanged if a vector holds more than one group of eight pixels. The default
+    /// implementation, for accumulators without such sums, always returns it unchanged.
     #[inline(always)]
     fn swap_even_odd<V: Lanes>(&self, accumulator: Self::Accumulator<V>) -> Self::Accumulator<V> {
         accumulator
@@ -438,11 +442,12 @@ fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], sampled: &Samp
     transmittance
 }
 
-/// Returns the set `live` of vectors of pixels without the vectors in `ended`, whose pixels have all ended. Each bit
-/// stands for one vector.
+/// Returns `live` without `ended`. Both are sets of vectors of pixels, one bit per vector. All pixels of a vector in
+/// `ended` have ended: their transmittance is used up, and no further splat is blended in them.
 ///
-/// The function is cold and not inlined, so that its call is a branch, which the processor predicts. If the set were
-/// instead computed for every splat, the next splat could not begin before all pixels of this one are blended.
+/// The function is cold and not inlined, so that its call remains a branch, which the processor predicts. Without the
+/// branch, `live` would depend on the result of every splat, and the next splat could not begin before all pixels of
+/// this one are blended.
 #[cold]
 #[inline(never)]
 fn remove_ended(live: u32, ended: u32) -> u32 {

@@ -23,8 +23,8 @@ const MAX_WAIT: Duration = Duration::from_secs(60);
 /// Maximum time to wait while another run inspects an unfinished workspace (hidden folder of a killed run), which takes
 /// microseconds.
 const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
-/// Maximum length in bytes of a journal: the list of the temporary files of one result that are renamed to their final
-/// names as a unit.
+/// Maximum length in bytes of a stored [`Journal`]: the list of the files of one result, which are renamed to their
+/// final names as a unit.
 const MAX_JOURNAL: u64 = 1 << 20;
 
 /// Lock that a run holds while it moves a result to its final name or repairs an interrupted move to that name.
@@ -39,8 +39,8 @@ impl PublishLock {
     /// Waits until no other run moves a result to the name of `target`, then takes the lock.
     ///
     /// # Errors
-    /// Fails if, for a minute, another run holds the lock, or a folder that this program did not create has the name of
-    /// the lock. Also fails if a system call fails.
+    /// Fails if the lock cannot be taken within a minute, because another run holds it or because a folder that this
+    /// program did not create has its name. Also fails if a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
         let (parent, name) = split_target(target)?;
         let name = publishing_name(name);
@@ -71,7 +71,8 @@ impl PublishLock {
     }
 }
 
-/// List of the files of one result that get their final names together, in this order.
+/// List of the files of one result, in the order in which they are renamed to their final names. The renames are a
+/// unit: if they are interrupted, the next run completes or reverts all of them.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Journal {
     pub(super) replace: Replace,

@@ -191,8 +191,8 @@ fn scale_intrinsics(
 /// the model. `wrong` builds an error from the expected and the found value.
 ///
 /// # Errors
-/// Fails if the model is unknown, has distortion, or has another number of parameters than given, or if the image size
-/// is out of range.
+/// Fails if the camera model is unknown or has distortion, if the number of `values` is not the number of parameters of
+/// the model, or if the image size is out of range.
 fn lens(
     wrong: impl Fn(String, String) -> Error,
     name: &str,

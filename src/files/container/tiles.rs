@@ -292,8 +292,7 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// If `frame` belongs to another frame block than the last one read, releases the pages of the raw tiles of that
-    /// block.
+    /// Releases the pages of the raw tiles of the frame block read last, if `frame` belongs to another frame block.
     fn enter_frame_block(&mut self, frame: usize) {
         let frame_block = self.frame_block(frame);
         if frame_block != self.entered {

@@ -126,8 +126,9 @@ mod tests {
         }
     }
 
-    /// Returns a file with one row (Gaussian) for each of `edits`. An edit may set half-precision values that only
-    /// other programs write.
+    /// Writes a file to `folder` and opens it. The file has one row (Gaussian) for each function in `edits`: the words
+    /// of a row without defects ([`sound`]), which the function then changes. A function can thus set half-precision
+    /// values that [`encode_words`] never stores, such as NaN.
     fn file(folder: &std::path::Path, edits: &[fn(&mut [u32; WORDS_PER_GAUSSIAN])]) -> Splatv {
         let path = folder.join("rows.splatv");
         let rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = edits

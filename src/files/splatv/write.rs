@@ -29,9 +29,9 @@ const TEXELS_PER_GAUSSIAN: usize = 4;
 /// Returns the 32-bit words that store the Gaussian `row` in a file for viewers.
 ///
 /// - Values beyond the range of half precision become the largest finite value; NaN becomes 0.
-/// - Players divide by the length of the quaternion, so it must not be stored as 0 at every time. If half precision
-///   would turn the quaternion and its rate of change into 0, both are divided by the length of the quaternion. If this
-///   length is itself 0 or too small to divide by, the quaternion becomes the identity instead.
+/// - Players divide by the length of the quaternion, so the quaternion and its rate of change must not both be stored
+///   as 0. If half precision would turn both into 0, both are first divided by the length of the quaternion. If this
+///   length is 0, NaN or too small to divide by, the identity is stored as the quaternion instead.
 pub fn encode_words(row: &SplatvGaussian) -> [u32; WORDS_PER_GAUSSIAN] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();

@@ -25,7 +25,8 @@ const ALIGNMENT: u16 = 64;
 pub(crate) struct StoredTensor {
     /// Name of the tensor; the keys of nested dicts are joined by dots.
     pub(crate) name: String,
-    /// Stored values. Each element of the tensor is one of them.
+    /// Storage of which the tensor is a view. Each element of the tensor is one of these values, at an index that
+    /// follows from `offset` and `stride`.
     pub(crate) values: TensorValues,
     /// Index in `values` of the first element.
     pub(crate) offset: usize,

@@ -139,8 +139,9 @@ fn windows_and_velocities_are_within_half_a_step() {
     assert!(all.iter().copied().eq(0..COUNT as u32), "{all:?}");
 }
 
-/// Returns the end of the JSON pointer to component `axis` of a range in `meta.json`. `member` is the beginning of the
-/// pointer. The range of velocities has one more list around it than other ranges.
+/// Returns the last part of the JSON pointer to the value for `axis` in a bound of a value range in `meta.json`.
+/// `member` is the first part of the pointer. The bounds for velocities, whose pointers begin with `/temporal`, are
+/// nested in one more list than other bounds.
 fn index(member: &str, axis: usize) -> String {
     if member.starts_with("/temporal") { format!("/0/{axis}") } else { format!("/{axis}") }
 }

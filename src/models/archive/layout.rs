@@ -84,19 +84,20 @@ pub(super) enum Values {
     Zeros(u64),
 }
 
-/// Field of a row. Planes are counted through the components of position, rotation, log scale, opacity logit and SH
-/// coefficients, and then through those of all columns.
+/// Field of a row. The number in a variant is the index of a plane, or a number of bytes. A plane is one scalar
+/// component of all Gaussians. Planes are counted through the components of position, rotation, log scale, opacity
+/// logit and SH coefficients, and then through those of all columns.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Field {
-    /// Value of a plane as f32.
+    /// Value of the plane with this index, as f32.
     F32(usize),
-    /// Value of a plane in half precision.
+    /// Value of the plane with this index, converted to half precision.
     Half(usize),
-    /// Nonnegative half-precision number whose bits are 1024 times the value of a plane, which is about its binary
-    /// logarithm.
+    /// Nonnegative half-precision number whose bits are 1024 times the value of the plane with this index, which is
+    /// about its binary logarithm.
     Octaves(usize),
-    /// Byte that is 255 times the value of a plane.
+    /// Byte that is 255 times the value of the plane with this index.
     Byte(usize),
     /// The next of the bytes that the archive holds per Gaussian beside its values, this many.
     Bytes(usize),

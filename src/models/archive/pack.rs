@@ -76,7 +76,7 @@ enum Target {
 struct RowField {
     /// Kind of the field: returns the field with the values of a plane, or with a number of bytes.
     kind: fn(usize) -> Field,
-    /// Number of bytes that the field takes in a row.
+    /// Number of bytes of the field in each row.
     bytes: usize,
     target: Target,
 }

@@ -34,9 +34,10 @@ impl Reopener {
         Reopener { open, options }
     }
 
-    /// Returns the content of an archive of the compressed model `reduction` of `model`, which is written as `kind`.
-    /// `name` is the name of the model if it is a single file. `holds` returns what a file of the model holds, by its
-    /// path relative to the model folder.
+    /// Returns the content of an archive of `reduction`, the compressed form of `model`. The compressed model is first
+    /// written to a temporary folder as an output of the kind `kind`; `name` is its file name if it is a single file.
+    /// `holds` returns the kind of content of each written file, given the path of the file relative to the model
+    /// folder.
     ///
     /// # Errors
     /// Fails if the model cannot be written, or if an archive cannot hold its files.

@@ -3,8 +3,8 @@
 //! Input: `ckpts/ckpt_K.pt` in a result folder, or the checkpoint itself: `{"step", "splats": state dict, "optimizers":
 //! {name: Adam state}}`. `splats` holds `means` `[N, 3]`, `scales` `[N, 3]` log, `quats` `[N, 4]` wxyz of any length,
 //! `opacities` `[N]` logit, `sh0` `[N, 1, 3]`, `shN` `[N, K, 3]`; for FreeTimeGS also `times` `[N, 1]`, `durations`
-//! `[N, 1]` log, `velocities` `[N, 3]`. Output: the same checkpoint with fewer Gaussians. Cameras must be those of the trainer's
-//! parser: it normalizes the coordinates of the scene and does not store how.
+//! `[N, 1]` log, `velocities` `[N, 3]`. Output: the same checkpoint with fewer Gaussians. Cameras must be those of the
+//! trainer's parser: it normalizes the coordinates of the scene and does not store how.
 
 pub(super) mod frame_state;
 

@@ -78,7 +78,7 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) time: f64,
     /// Weight of the frame: window of the proxy times opacity of the moment match.
     pub(in crate::models) weight: f64,
-    /// States of a block of proxies at this frame, obtained from their members by moment matching.
+    /// States of a block of proxies at this frame. The state of each proxy is the moment match of its members.
     pub(in crate::models) state: &'a Gaussians,
     /// Row of this proxy in `state`.
     pub(in crate::models) row: usize,

@@ -155,7 +155,8 @@ impl RowTensors {
         self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.planes[..]))
     }
 
-    /// Returns the nodes in the checkpoint of those tensors with one row per Gaussian that only training reads.
+    /// Returns the checkpoint nodes of the tensors that only the training reads. Each of these tensors has one row per
+    /// Gaussian.
     pub(in crate::models) fn training_only(&self) -> impl Iterator<Item = NodeId> {
         self.training_only.iter().map(|tensor| tensor.id)
     }

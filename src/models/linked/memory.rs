@@ -13,8 +13,8 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed into a container, or unpacked from one, at a time; a single frame may be
 /// larger.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
-/// Bytes of memory per Gaussian of a frame for its entry (track and row) in a list, and for a copy of this list for
-/// sorting.
+/// Bytes of memory per Gaussian of a frame in the list of the (track, row) pairs of the frame, and in a copy of this
+/// list for sorting.
 const BYTES_PER_ROW: u64 = 16;
 /// Number of frames that are rendered before and after tracks are joined or attributes are made constant, to measure
 /// the change.
@@ -63,8 +63,8 @@ impl Sizes {
         [self.linking(), self.holding(), self.packing()].into_iter().max().unwrap_or(0)
     }
 
-    /// Returns the bytes of memory while the frames are open. For every track, these are its first frame and row, the
-    /// joined track it belongs to, and its constant attributes.
+    /// Returns the bytes of memory that the tracks take while the frames are open. Each track takes memory for its
+    /// first frame and row, the joined track it belongs to, and its constant attributes.
     pub(super) fn open(&self) -> u64 {
         (8 + 4 + size_of::<Attributes>() as u64) * self.linked
     }

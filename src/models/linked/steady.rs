@@ -52,8 +52,8 @@ pub(super) struct HeldMeans {
 }
 
 impl Steady {
-    /// Finds the attributes that deviate by at most `bound` along each of `count` tracks. `sums` returns sums over all
-    /// frames for a range of tracks.
+    /// Finds, for each of `count` tracks, the attributes whose root mean square deviation from their mean over the
+    /// frames is at most `bound`. `sums` returns the [`TrackSums`] over all frames for a range of tracks.
     ///
     /// # Errors
     /// Fails if `sums` fails or a write to the folder `scratch` fails.

@@ -14,7 +14,7 @@ use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{AttributeValues, Attributes, SH_C0, StoredParams, sh_from_color};
 
-/// Name of a property that occurs only in point cloud files of SpacetimeGaussians.
+/// Name of a property that only the point cloud files of SpacetimeGaussians have, by which these files are recognized.
 pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 
 /// Opened point cloud file of a SpacetimeGaussians model.

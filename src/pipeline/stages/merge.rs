@@ -223,13 +223,13 @@ impl MergeStage {
     }
 }
 
-/// Returns about the largest number m of survivors, up to `all`, that can be merged so that at most `target` Gaussians
-/// are left. (m = `target` always satisfies this.) `merged` returns for a number m the number of Gaussians that are
-/// left after m survivors are merged.
+/// Returns about the largest number m, up to `all`, for which merging leaves at most `target` Gaussians. Here m is the
+/// number of survivors (Gaussians that pruning keeps) on which merging runs; m = `target` always satisfies the
+/// condition. `merged` returns the number of Gaussians that merging leaves of m survivors.
 ///
-/// The number left grows with m except for small dips, so the interval of possible m is narrowed by the secant method.
-/// The search ends early if the number left is below `target` by at most a thousandth of it; the caller then makes
-/// fewer joins, so that exactly `target` Gaussians are left.
+/// With more survivors as input, merging leaves more Gaussians, except for small dips, so the interval of possible m is
+/// narrowed by the secant method. The search ends early if the number left is below `target` by at most a thousandth of
+/// it; the caller then makes fewer joins, so that exactly `target` Gaussians are left.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;

@@ -2,11 +2,11 @@
 //! its derivatives ∂L/∂pixel with respect to the pixels.
 //!
 //! The steps are: the render as in [`render`](super::render), a loss of the caller, a backward pass over the splats of
-//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a camera. Output:
-//! [`Gradients`]. Memory in addition to that of the render: 72 bytes per visible Gaussian
-//! ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat, tile) pair of a part of a strip
-//! ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et
-//! al., "gsplat", 2024. The gradients are derived in docs/method.md, section 8.1.
+//! each tile (`tile`), and the derivative of the projection (`splat`). Input: [`Gaussians`] and a
+//! [`Camera`](splat_core::Camera). Output: [`Gradients`]. Memory in addition to that of the render: 72 bytes per
+//! visible Gaussian ([`GRADIENT_BYTES_PER_VISIBLE`] includes the render), and 36 bytes per (splat, tile) pair of a part
+//! of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward model: Kerbl et al., "3D Gaussian Splatting", 2023,
+//! and Ye et al., "gsplat", 2024. The gradients are derived in docs/method.md, section 8.1.
 //!
 //! Discontinuities of the render are ignored: an alpha that crosses 1/255, a changed depth order, a tile that a splat
 //! newly touches. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.
