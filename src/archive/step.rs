@@ -26,6 +26,12 @@ const MAX_MULTIPLE: f64 = (1u64 << 50) as f64;
 /// Constant 1.5 · 2^52: adding and subtracting it rounds to the nearest whole number, halves to even, for |x| < 2^51.
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
+/// Returns the whole number nearest to `x`, halves to even; 0 for NaN. The magnitude of `x` must be below 2^51.
+#[inline(always)]
+fn rounded(x: f64) -> i64 {
+    (x + ROUNDING - ROUNDING) as i64
+}
+
 /// Returns the quantization step 2^(k/8).
 pub fn step_size(k: i32) -> f64 {
     let whole = k.div_euclid(8).clamp(-1000, 1000);
@@ -73,15 +79,20 @@ impl QuantizationGrid {
     /// Returns the whole number of steps nearest to `value`, at most [`MAX_MULTIPLE`] in magnitude; 0 for NaN.
     #[inline(always)]
     pub(super) fn nearest(self, value: f64) -> i64 {
-        let x = (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
-        (x + ROUNDING - ROUNDING) as i64
+        rounded(self.clamped(value))
+    }
+
+    /// Returns `value` in units of the step, limited to [`MAX_MULTIPLE`] in magnitude.
+    #[inline(always)]
+    fn clamped(self, value: f64) -> f64 {
+        (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE)
     }
 
     /// Returns the multiple nearest to the predicted value `value`, and how far the value is from it.
     #[inline(always)]
     pub(super) fn predicted(self, value: f32) -> PredictedMultiple {
-        let x = (f64::from(value) * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
-        let multiple = (x + ROUNDING - ROUNDING) as i64;
+        let x = self.clamped(f64::from(value));
+        let multiple = rounded(x);
         // `as` rounds down, and turns NaN into 0.
         let offset = ((x - multiple as f64 + 0.5) * OFFSETS as f64) as usize;
         PredictedMultiple { multiple, offset: offset.min(OFFSETS - 1) }

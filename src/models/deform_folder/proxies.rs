@@ -116,8 +116,9 @@ fn squared_distances<L: NetworkMotionModel>(
     wanted: impl Fn(usize, usize) -> DVec3,
 ) -> Result<Vec<f64>> {
     let (mut off, mut state) = (vec![0.0; raw.len()], Gaussians::zeros(0, 0));
+    let gaussians = model.with_params(raw);
     for (k, &frame) in frames.iter().enumerate() {
-        model.with_params(raw).state(frame, Attributes::POSITION, &mut state)?;
+        gaussians.state(frame, Attributes::POSITION, &mut state)?;
         for (row, off) in off.iter_mut().enumerate() {
             *off += (position(&state, row) - wanted(k, row)).length_squared();
         }
@@ -135,9 +136,10 @@ fn gauss_newton_step<L: NetworkMotionModel>(
 ) -> Result<StoredParams> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
+    let gaussians = model.with_params(raw);
     for (&frame, wanted) in frames.iter().zip(wanted) {
-        model.with_params(raw).state(frame, Attributes::POSITION, &mut state)?;
-        let slopes = model.with_params(raw).jacobian(frame, Attributes::POSITION)?;
+        gaussians.state(frame, Attributes::POSITION, &mut state)?;
+        let slopes = gaussians.jacobian(frame, Attributes::POSITION)?;
         let slopes = slopes.column(Attributes::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
             // Plane 3·i + j holds the derivative of component i by component j, so reading columns gives the transpose.
