@@ -14,7 +14,7 @@ use crate::archive::{
     self, ATTRIBUTES, ArchiveContent, EncodedArchive, QuantizationSteps, STEP_NUMBERS, TensorRole, TensorSteps,
 };
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result};
+use crate::error::{Error, ErrorKind, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
@@ -225,8 +225,11 @@ impl ArchiveStage {
             QualityTarget::Close(_) | QualityTarget::Loss(_) => {
                 let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
                     let encoded = encoded(added)?;
-                    // The reader of a model format may refuse values that coarse steps have made zero.
-                    let Ok(shown) = decoded(&encoded) else { return Ok(None) };
+                    let shown = match decoded(&encoded) {
+                        // The reader of a model format may refuse values that coarse steps have made zero.
+                        Err(error) if error.kind() == ErrorKind::Input => return Ok(None),
+                        shown => shown?,
+                    };
                     Ok(Some(measure_frames(encoded, shown)?)
                         .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
                 })?;
