@@ -18,6 +18,15 @@ pub fn name_of(path: &Path) -> String {
     name(path).or_else(|| name(&fs::canonicalize(path).ok()?)).unwrap_or_else(|| path.to_string_lossy().into_owned())
 }
 
+/// Characters that separate the components of a path on any system.
+const SEPARATORS: [char; 2] = ['/', '\\'];
+
+/// Returns the last component of a path that may have been written on another system. Separators at its end are
+/// ignored. Returns an empty text if `path` has only separators.
+pub fn last_component(path: &str) -> &str {
+    path.trim_end_matches(SEPARATORS).rsplit(SEPARATORS).next().unwrap_or_default()
+}
+
 /// Returns the last component of `path` (see [`name_of`]), escaped for display.
 pub fn shown_name(path: &Path) -> String {
     Path::new(&name_of(path)).shown().to_string()
@@ -63,6 +72,15 @@ fn real_path(path: &Path) -> Option<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn last_component_is_found_in_paths_of_any_system() {
+        for (path, last) in
+            [("a/b.ply", "b.ply"), ("C:\\x\\y\\", "y"), ("/a/b//", "b"), ("plain", "plain"), ("//", ""), ("", "")]
+        {
+            assert_eq!(last_component(path), last, "{path}");
+        }
+    }
 
     #[test]
     fn an_input_is_named_without_its_folders() {

@@ -1,6 +1,7 @@
 //! Formatting of text and numbers for HTML pages.
 
 use crate::error::printable;
+use crate::files::names::last_component;
 
 /// Escapes characters that could end an HTML text or a quoted attribute. Replaces unprintable characters, such as marks
 /// of text direction, by their codes.
@@ -21,7 +22,7 @@ pub(super) fn escape(text: &str) -> String {
 
 /// Returns the last component of a path.
 pub(super) fn file_name(path: &str) -> &str {
-    let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
+    let name = last_component(path);
     if name.is_empty() { path } else { name }
 }
 

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use crate::archive::ArchiveContent;
 use crate::error::{Error, Result};
+use crate::files::names::last_component;
 use crate::files::ply::write::{beside, extra_bytes_per_row, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
@@ -58,17 +59,6 @@ pub(super) fn write_cloud(content: &ArchiveContent, path: &Path, to: &Path) -> R
     write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.beside, &content.cloud, to)
 }
 
-/// Characters that separate the folders of a path.
-const SEPARATORS: [char; 2] = ['/', '\\'];
-
-/// Returns the last component of the path `text`; text without separators is returned unchanged.
-fn last_name(text: &str) -> &str {
-    if !text.contains(SEPARATORS) {
-        return text;
-    }
-    text.trim_end_matches(SEPARATORS).rsplit(SEPARATORS).next().unwrap_or_default()
-}
-
 /// Returns the YAML text `text` without the folders of the training machine, because archives are made to be shared.
 /// Paths are replaced by their last components: the value of a line `key: value` or `- value`, and every item of a list
 /// in brackets. All other bytes are unchanged.
@@ -83,7 +73,7 @@ pub(super) fn yaml_without_folders(text: &str) -> String {
         let mut rest = value;
         while !rest.is_empty() {
             let end = rest.find(ends_item).unwrap_or(rest.len());
-            out += last_name(&rest[..end]);
+            out += last_component(&rest[..end]);
             let next = rest[end..].chars().next().map_or(end, |c| end + c.len_utf8());
             out += &rest[end..next];
             rest = &rest[next..];

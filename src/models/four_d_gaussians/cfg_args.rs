@@ -7,6 +7,7 @@ use crate::deform::{FieldConfig, Tensors};
 use crate::error::{Error, Result};
 use crate::model::Attributes;
 
+use crate::files::names::last_component;
 use crate::files::open::read_small;
 use crate::files::python_literal::{Literal, parse_call};
 
@@ -241,7 +242,7 @@ fn without_paths(expression: &str, all: bool) -> String {
         let Some(end) = end else { break };
         let string = &content[..end];
         let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
-        let last = string.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or_default();
+        let last = last_component(string);
         out += &rest[..=start];
         match all || is_absolute {
             true => out.extend(last.chars().filter(|&c| c != quote)),
