@@ -127,9 +127,9 @@ pub fn spill_blocks(
 }
 
 /// Writes the container `path` from the frame blocks of `source` that [`spill_blocks`] encoded with the same `packing`,
-/// and with the metadata `attributes` (names and texts). The file is the same as that of [`write_container`]. `spills`
-/// lists the scratch files, each with the numbers of its frame blocks; together they must have all frame blocks, in
-/// order. Memory: a tile, and the index of the container.
+/// and with the metadata `attributes` (names and texts). The result has the same bytes as the
+/// file that [`write_container`] writes. `spills` lists the scratch files, each with the numbers of its frame blocks;
+/// together they must have all frame blocks, in order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
 /// Fails if a scratch file cannot be read back or the container cannot be written.

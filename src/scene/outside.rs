@@ -61,7 +61,7 @@ impl RigCone {
         direction.map_or(0.0, |direction| self.angle(direction))
     }
 
-    /// Returns the point where the optical axes of the cameras meet.
+    /// Returns the point nearest to the optical axes of all cameras, from which the directions of the cone start.
     pub fn focus(&self) -> DVec3 {
         self.focus
     }

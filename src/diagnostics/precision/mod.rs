@@ -106,8 +106,8 @@ pub struct PrecisionOptions {
     pub input: InputOptions,
     /// Recipe from which every setting is derived, by changing one parameter.
     pub recipe: Recipe,
-    /// Knobs (parameters, or groups of parameters) to vary. `None`: every knob; for a large model only the knobs that
-    /// need no complete runs of the program.
+    /// Knobs (parameters, or groups of parameters) to vary. `None`: every knob; for a large model every knob whose
+    /// settings can be compared without running the whole compression.
     pub knobs: Option<Vec<Knob>>,
     /// Number or fraction of Gaussians that every setting keeps.
     pub target: Target,

@@ -88,8 +88,8 @@ pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<S
     (coefficient < new_count).then(|| format!("f_rest_{}", channel * new_count + coefficient))
 }
 
-/// Returns the error for the property `name`, which the element `vertex` lacks. A hint says what kind of file it may
-/// be.
+/// Returns the error that the element `vertex` of the file `path` lacks the property `name`. If other properties show
+/// what kind of file it is, the error names that kind.
 fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
     let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();
