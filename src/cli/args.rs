@@ -227,6 +227,9 @@ pub(super) struct ScoreArgs {
     /// coverage) or rows.csv
     #[arg(short, long, value_name = "FILE")]
     pub(super) output: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     #[command(flatten)]
@@ -276,6 +279,9 @@ pub(super) struct Render {
     pub(super) output: Option<PathBuf>,
     #[command(flatten)]
     pub(super) kept: CacheArgs,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -360,6 +366,9 @@ pub(super) struct ReportArgs {
     pub(super) output: PathBuf,
     #[command(flatten)]
     pub(super) kept: CacheArgs,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -407,6 +416,9 @@ pub(super) struct ViewArgs {
     /// Output: NAME.html, a single page, or a folder with index.html; both open without a server
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -490,7 +502,7 @@ pub(super) struct CacheFolder {
     /// Folder that was given to --cache
     pub(super) folder: PathBuf,
     /// Remove all cached results in it, and the folder if nothing else is in it
-    #[arg(long, conflicts_with = "json")]
+    #[arg(long)]
     pub(super) clean: bool,
     /// Print JSON
     #[arg(long)]
@@ -514,6 +526,9 @@ pub(super) struct Demo {
     pub(super) refine_steps: Option<u32>,
     #[command(flatten)]
     pub(super) memory: Memory,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }

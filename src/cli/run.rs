@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::args::{
     CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, Evaluate, InfoArgs, Man, PrecisionArgs,
-    Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene,
+    Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene, ViewArgs,
 };
 use super::help;
 use super::message::show;
@@ -24,7 +24,7 @@ use splatsieve::evaluation::EvaluateOptions;
 use splatsieve::pipeline::summary::SummaryDetail;
 use splatsieve::pipeline::{self, compress, shardable_stages};
 use splatsieve::player::view;
-use splatsieve::player::view::ViewOptions;
+use splatsieve::player::view::{ViewOptions, ViewReport};
 use splatsieve::progress::Events;
 use splatsieve::recipe::preset_text;
 use splatsieve::report::{self, ReportOptions, trade_off};
@@ -49,7 +49,7 @@ pub(super) fn run(cli: Cli) -> Result<()> {
         CommandArgs::Sweep(args) => run_sweep(args, &events),
         CommandArgs::Precision(args) => run_precision(args, &events),
         CommandArgs::Report(args) => run_report(args, &events),
-        CommandArgs::View(args) => print(&(write_page(&view_options(args, &events))? + "\n")),
+        CommandArgs::View(args) => run_view(args, &events),
         CommandArgs::Convert(args) => run_convert(args, &events),
         CommandArgs::Info(args) => run_info(args, &events),
         CommandArgs::Cache(args) => run_cache(&args),
@@ -92,38 +92,44 @@ fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
 /// Runs the command `score`, which writes a table of the statistics and scores of all Gaussians. Prints notes, and the
 /// number of Gaussians that a compression with the recipe would keep before merging.
 fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
+    let as_json = args.json;
     let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
-    tell_notes(&report.notes);
-    print(&format!(
-        "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
-        report.output.shown(),
-        report.gaussians,
-        report.kept
-    ))
+    let (output, gaussians, kept) = (report.output.shown(), report.gaussians, report.kept);
+    let value = serde_json::json!({
+        "output": report.output.to_string_lossy(), "gaussians": gaussians, "kept": kept, "notes": report.notes,
+    });
+    let text = || format!("{output}: {gaussians} Gaussians, of which the recipe keeps {kept} before merging\n");
+    print_result(as_json, &value, &report.notes, text)
 }
 
 /// Runs the command `render`, which writes images, or with `--video` a video. Prints its notes and a description of the
 /// output.
 fn run_render(mut args: Render, events: &Events) -> Result<()> {
+    let as_json = args.json;
     if let Some(output) = args.video.take() {
         let options = video_options(args, output, events);
         let filmed = video(&options)?;
-        tell_notes(&filmed.notes);
         let (path, (width, height), fps) = (options.output.shown(), filmed.size, options.fps);
+        let value = serde_json::json!({
+            "output": options.output.to_string_lossy(), "frames": filmed.frames, "width": width, "height": height,
+            "fps": fps, "notes": filmed.notes,
+        });
         let places =
             options.beside.as_deref().map(|right| format!("  {}\n", side_by_side_text(&options.input.path, right)));
         let places = places.unwrap_or_default();
-        return print(&format!(
-            "{path}: {} frames of {width}x{height}, {fps} frames per second\n{places}",
-            filmed.frames
-        ));
+        let frames = filmed.frames;
+        let text = || format!("{path}: {frames} frames of {width}x{height}, {fps} frames per second\n{places}");
+        return print_result(as_json, &value, &filmed.notes, text);
     }
     let options = render_options(args, events)?;
     let Some(rendered) = completed(render::render(&options)?)? else { return Ok(()) };
-    tell_notes(&rendered.notes);
     let plural = if rendered.views == 1 { "" } else { "s" };
-    print(&format!("{}: {} view{plural}\n", options.output.shown(), rendered.views))
+    let value = serde_json::json!({
+        "output": options.output.to_string_lossy(), "views": rendered.views, "notes": rendered.notes,
+    });
+    let text = || format!("{}: {} view{plural}\n", options.output.shown(), rendered.views);
+    print_result(as_json, &value, &rendered.notes, text)
 }
 
 /// Runs the command `evaluate` and prints the comparison of the two models.
@@ -153,7 +159,7 @@ fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
 
 /// Runs the command `report` and prints the verdict on each compressed model, the notes, and the path of the page.
 fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
-    let page = args.output.join(report::PAGE_FILE);
+    let (as_json, page) = (args.json, args.output.join(report::PAGE_FILE));
     let mut evaluate = evaluate_options(args.models, events);
     evaluate.original.work = cache_request(args.kept);
     let options = ReportOptions {
@@ -166,25 +172,48 @@ fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
         overwrite: args.earlier.replace(),
     };
     let Some(found) = completed(report::report(&options)?)? else { return Ok(()) };
-    let mut verdicts = String::new();
-    for result in std::iter::once(&found.result).chain(&found.others) {
-        tell_notes(&result.work_notes);
-        tell_notes(&result.notes);
-        if !found.others.is_empty() {
-            verdicts += &format!("{}: ", Path::new(&result.evaluation.path.compressed).shown());
+    let results: Vec<_> = std::iter::once(&found.result).chain(&found.others).collect();
+    let notes: Vec<String> =
+        results.iter().flat_map(|result| result.work_notes.iter().chain(&result.notes).cloned()).collect();
+    let verdicts: Vec<_> = results
+        .iter()
+        .map(|result| serde_json::json!({"compressed": result.evaluation.path.compressed, "verdict": result.verdict}))
+        .collect();
+    let value = serde_json::json!({"page": page.to_string_lossy(), "results": verdicts, "notes": notes});
+    print_result(as_json, &value, &notes, || {
+        let mut text = String::new();
+        for result in &results {
+            if results.len() > 1 {
+                text += &format!("{}: ", Path::new(&result.evaluation.path.compressed).shown());
+            }
+            text += &format!("{}\n", result.verdict);
         }
-        verdicts += &format!("{}\n", result.verdict);
-    }
-    print(&format!("{verdicts}{}\n", page.shown()))
+        format!("{text}{}\n", page.shown())
+    })
 }
 
-/// Writes the HTML page that plays a model. Returns a line of text with the path of the page, its number of frames and
-/// its size.
+/// Runs the command `view`, which writes the page of the player. Prints its path and its size.
+fn run_view(args: ViewArgs, events: &Events) -> Result<()> {
+    let as_json = args.json;
+    let found = view::view(&view_options(args, events))?;
+    let value = serde_json::json!({
+        "page": found.page.to_string_lossy(), "frames": found.frames, "bytes": found.bytes, "files": found.files,
+        "notes": found.notes,
+    });
+    print_result(as_json, &value, &found.notes, || page_text(&found) + "\n")
+}
+
+/// Writes the HTML page that plays a model, and its notes to standard error. Returns the text about the page.
 fn write_page(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     tell_notes(&found.notes);
+    Ok(page_text(&found))
+}
+
+/// Returns a line of text with the path of a page of the player, its number of frames and its size.
+fn page_text(found: &ViewReport) -> String {
     let files = if found.files == 1 { String::new() } else { format!(" in {} files", found.files) };
-    Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
+    format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes)
 }
 
 /// Runs the command `convert`: writes an input in another format and prints a description of the output. A frame stream
@@ -271,7 +300,11 @@ fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
 fn run_cache(args: &CacheFolder) -> Result<()> {
     if args.clean {
         let (files, bytes) = cache::remove_entries(&args.folder)?;
-        return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
+        let value = serde_json::json!({
+            "folder": args.folder.to_string_lossy(), "files_removed": files, "bytes_removed": bytes,
+        });
+        let text = || format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown());
+        return print_as(args.json, || json_text(&value), text);
     }
     let listed = cache::list_results(&args.folder)?;
     print_as(args.json, || json_text(&listed), || cache::format_list(&listed))
@@ -279,8 +312,10 @@ fn run_cache(args: &CacheFolder) -> Result<()> {
 
 /// Runs the command `demo` and prints its results.
 fn run_demo(args: Demo, events: &Events) -> Result<()> {
+    let as_json = args.json;
     let options = demo_options(args, events);
-    print(&demo::run(&options)?.text(&options.output))
+    let found = demo::run(&options)?;
+    print_as(as_json, || json_text(&found), || found.text(&options.output))
 }
 
 /// Runs the command `test-scene` and prints its results.
@@ -321,6 +356,19 @@ fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
         Completion::Whole(found) => Ok(Some(found)),
         Completion::Shard(done) => print(&format!("{done}\n")).map(|()| None),
     }
+}
+
+/// Prints a result: as JSON, which contains the notes, or as text, with the notes on standard error before it.
+fn print_result(
+    as_json: bool,
+    value: &serde_json::Value,
+    notes: &[String],
+    text: impl FnOnce() -> String,
+) -> Result<()> {
+    if !as_json {
+        tell_notes(notes);
+    }
+    print_as(as_json, || json_text(value), text)
 }
 
 /// Writes notes to standard error, one per line.

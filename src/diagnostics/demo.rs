@@ -6,6 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use crate::diagnostics::demo_scene::Playground;
 use crate::error::{Error, Result, ShowPath};
@@ -78,7 +79,7 @@ pub struct DemoOptions {
 }
 
 /// Size and quality of one model that the demo writes.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DemoModel {
     /// File name of the model.
     pub name: &'static str,
@@ -95,7 +96,7 @@ pub struct DemoModel {
 }
 
 /// Result of the command `demo`.
-#[derive(Debug)]
+#[derive(Debug, Serialize)]
 pub struct DemoReport {
     /// Written models: the uncompressed scene first, then its compressed versions.
     pub models: Vec<DemoModel>,

@@ -189,3 +189,27 @@ fn reported_quality_equals_evaluate_on_the_same_views() {
         }
     }
 }
+
+#[test]
+fn commands_that_write_files_also_print_json() {
+    let workplace = Workplace::new();
+    workplace.done("compress {tiny} --cameras {tiny} -o small --ratio 0.5 --no-refine --quiet");
+    for (line, keys) in [
+        ("score {tiny} --cameras {tiny} -o rows.csv", &["output", "gaussians", "kept", "notes"][..]),
+        ("render {tiny} --cameras {tiny} --frame 0 --view 0 -o a.png", &["output", "views", "notes"]),
+        (
+            "render {tiny} --cameras {tiny} --video a.gif --view 0",
+            &["output", "frames", "width", "height", "fps", "notes"],
+        ),
+        ("view {tiny} small --cameras {tiny} --max-frames 2 -o a.html", &["page", "frames", "bytes", "files", "notes"]),
+        ("report {tiny} small --cameras {tiny} -o page", &["page", "results", "notes"]),
+    ] {
+        let printed = workplace.done(&format!("{line} --json --quiet"));
+        let value: Value = serde_json::from_str(&printed).unwrap_or_else(|error| panic!("{line}: {error}: {printed}"));
+        let mut found: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
+        let mut expected = keys.to_vec();
+        found.sort_unstable();
+        expected.sort_unstable();
+        assert_eq!(found, expected, "{line}");
+    }
+}
