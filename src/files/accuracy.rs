@@ -14,6 +14,11 @@
 //!
 //! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
 //! change it. The distance of two positions is the largest of the differences along x, y and z.
+//!
+//! A scale may become smaller by any amount if the stored one is still more than ten times the distance from the
+//! Gaussian's center to the far side of the scene (the distance from the median position, plus the scene size, which must
+//! not be 0). Along such an axis the density falls by less than 1/200 within the scene, whatever the scale is. Captured
+//! scenes have such Gaussians, and formats with a largest scale, such as `.spz`, store them with that one.
 
 use std::path::Path;
 
@@ -27,6 +32,9 @@ const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
 const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
 /// Maximum error of a scale, as a fraction of its value.
 const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
+/// Ratio of a scale to the distance from the Gaussian's center to the far side of the scene, from which on the exact
+/// scale does not matter.
+const FLAT_SCALE: f64 = 10.0;
 /// Maximum error of opacities and base colors, which are in [0, 1].
 const MAX_COLOR_ERROR: f64 = 0.02;
 /// Maximum error of an SH coefficient above degree 0. A color is a sum of such coefficients times basis functions.
@@ -92,6 +100,8 @@ struct Excess {
 /// Largest coding errors of a file, collected Gaussian by Gaussian.
 #[derive(Debug)]
 pub struct CodingErrors {
+    /// Median position of the Gaussians, in scene units.
+    middle: [f64; 3],
     /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
     /// Index of the Gaussian that is furthest from the median position of all Gaussians.
@@ -109,13 +119,9 @@ impl CodingErrors {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
         let middle = [0, 1, 2].map(|k| median(axis(k).collect()));
-        let distance = |i: usize| {
-            let place = positions.row::<3>(i).map(f64::from);
-            (0..3).map(|k| (place[k] - middle[k]).abs()).fold(0.0, f64::max)
-        };
-        let distances: Vec<f64> = (0..count).map(distance).collect();
+        let distances: Vec<f64> = (0..count).map(|i| distance(positions.row::<3>(i).map(f64::from), middle)).collect();
         let furthest = (0..count).max_by(|&a, &b| distances[a].total_cmp(&distances[b])).unwrap_or(0);
-        CodingErrors { scene: median(distances), furthest, position: 0.0, worst: None }
+        CodingErrors { middle, scene: median(distances), furthest, position: 0.0, worst: None }
     }
 
     /// Returns the largest position error among the Gaussians added so far, in scene units.
@@ -135,7 +141,6 @@ impl CodingErrors {
         let max_difference = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
         let position_error = max_difference(wanted.position, found.position);
         self.position = largest([self.position, position_error, 0.0]);
-        let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
         // Clamp colors to [0, 1] before comparing them, as a screen does.
         let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
         self.check_error(
@@ -144,9 +149,15 @@ impl CodingErrors {
             position_error,
             scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.middle_scale()),
         );
-        scales.into_iter().for_each(|(scale, error)| {
-            self.check_error(id, "scale", error, scene_bound.max(MAX_RELATIVE_SCALE_ERROR * scale))
-        });
+        let flat = FLAT_SCALE * (self.scene + distance(wanted.position, self.middle));
+        for (before, after) in wanted.scale.into_iter().zip(found.scale) {
+            // False for NaN.
+            let is_flat = self.scene > 0.0 && flat <= after && after <= before;
+            if !is_flat {
+                let error = (before - after).abs();
+                self.check_error(id, "scale", error, scene_bound.max(MAX_RELATIVE_SCALE_ERROR * before));
+            }
+        }
         self.check_error(id, "opacity", (wanted.opacity - found.opacity).abs(), MAX_COLOR_ERROR);
         self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
@@ -190,6 +201,11 @@ impl CodingErrors {
     }
 }
 
+/// Returns the largest of the differences of two positions along x, y and z.
+fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f64::max)
+}
+
 /// Returns the median of the finite values among `values` (the lower one of two middle values); 0 if none is finite.
 fn median(mut values: Vec<f64>) -> f64 {
     values.retain(|value| value.is_finite());
@@ -226,6 +242,19 @@ mod tests {
         let parts =
             ["position of Gaussian 2", "at most 2.00e-2 scene units", "found 5.00e-1", "Gaussian 5 is the furthest"];
         assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    }
+
+    #[test]
+    fn scales_far_beyond_the_scene_are_not_checked() {
+        // Median position 4, scene size 2: the far side of the scene is 4 from the Gaussian at 2.
+        let mut found = accuracy();
+        found.add(1, &drawn(2.0, 500.0), &drawn(2.0, 40.1));
+        found.check("a file").unwrap();
+        for (wanted, stored) in [(500.0, 39.9), (39.9, 500.0), (500.0, f64::NAN)] {
+            let mut found = accuracy();
+            found.add(1, &drawn(2.0, wanted), &drawn(2.0, stored));
+            found.check("a file").unwrap_err();
+        }
     }
 
     #[test]
