@@ -12,8 +12,8 @@
 //! 14 and 12 ms for `room2_big`, `room2_dynerf` and `deform2`, measured elsewhere.
 //!
 //! The parts of a render are differences of medians, measured in alternation, of renders that lack one part after the
-//! other. Their lower bounds are printed beside them: for the blend, [`OPERATIONS`] on every 16 events at two per cycle
-//! of the measured clock; for the rest, the bytes that must be moved at the measured memory bandwidth.
+//! other. Their lower bounds are printed beside them: for the blend, [`blend_limit`]; for the rest, the bytes that must be
+//! moved at the measured memory bandwidth.
 //!
 //! The goal for `gradient`, a render with the derivative of its squared error by every stored value, is 2.6 times the
 //! render alone; `picture/large` misses it with 2.7. The ratio of medians, measured in alternation, is printed before
@@ -24,6 +24,7 @@
 
 #[path = "../tests/models/mod.rs"]
 mod models;
+mod synthetic;
 
 use std::hint::black_box;
 use std::num::NonZeroU32;
@@ -37,15 +38,11 @@ use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
+use synthetic::{blend_limit, cloud, fastest};
+
 /// Number of renders for each median time. The medians give the printed rates, and the ratio of a render with gradients
 /// to a render without.
 const PICTURES: usize = 21;
-
-/// Number of operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20
-/// for the power of 2, 10 from there to weight and transmittance, 6 for the color.
-const OPERATIONS: f64 = 42.0;
-/// Number of pixels in the widest vector.
-const LANES: f64 = 16.0;
 
 /// Measures rendering, scoring and gradients of one view of the Gaussians `state`, as benchmark `name` of `group`.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
@@ -120,7 +117,7 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
     }
     let [whole, gray, unseen, projected] = times.map(median);
     let blend = gray - unseen;
-    let least = events / LANES * OPERATIONS / 2.0 / clock();
+    let least = blend_limit(events);
     let pixels = f64::from(camera.width) * f64::from(camera.height);
     let bytes = 4.0 * (11 + state.sh.width()) as f64 * state.len() as f64 + 12.0 * pixels;
     eprintln!(
@@ -140,17 +137,6 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
     );
 }
 
-/// Returns the clock rate in cycles per second. It is measured with a chain of exclusive ors and integer products,
-/// which take one and three cycles.
-fn clock() -> f64 {
-    const LINKS: u32 = 10_000_000;
-    fastest(|| {
-        let chain = (0..LINKS).fold(black_box(1u64), |x, k| (x ^ u64::from(k)).wrapping_mul(0x9e37_79b9_7f4a_7c15));
-        black_box(chain);
-        4.0 * f64::from(LINKS)
-    })
-}
-
 /// Returns the memory bandwidth in bytes per second, measured by reading more memory than the caches hold.
 fn bandwidth() -> f64 {
     let words = vec![1u64; 1 << 25];
@@ -158,15 +144,6 @@ fn bandwidth() -> f64 {
         black_box(black_box(&words).iter().fold(0, |sum: u64, word| sum.wrapping_add(*word)));
         size_of_val(&words[..]) as f64
     })
-}
-
-/// Calls `amount` several times, which works and returns the amount of its work. Returns the highest amount per second.
-fn fastest(amount: impl Fn() -> f64) -> f64 {
-    let rate = |_| {
-        let start = Instant::now();
-        amount() / start.elapsed().as_secs_f64()
-    };
-    (0..7).map(rate).fold(0.0, f64::max)
 }
 
 /// Returns the median of an odd number of values.
@@ -225,26 +202,6 @@ fn enlarged(camera: &Camera, size: [u32; 2]) -> Camera {
     let times = f64::from(size[0]) / f64::from(camera.width);
     let [cx, cy] = size.map(|pixels| f64::from(pixels) / 2.0);
     Camera { width: size[0], height: size[1], fx: camera.fx * times, fy: camera.fy * times, cx, cy, ..camera.clone() }
-}
-
-/// Returns `count` Gaussians that fill a box in front of the camera. Their size falls with `count`, so that the opacity
-/// of the image stays about the same.
-fn cloud(count: usize) -> Gaussians {
-    let mut cloud = Gaussians::zeros(count, 3);
-    let size = -1.2 - (count as f32).ln() / 3.0;
-    for i in 0..count {
-        // Additive recurrence with irrational steps: evenly distributed, and the same on every machine.
-        let step = |k: f64| (i as f64 * k).fract() as f32;
-        let position = [4.0 * step(0.819_172_51) - 2.0, 3.2 * step(0.671_043_61) - 1.6, 2.0 + 3.0 * step(0.549_700_48)];
-        cloud.position.set_row(i, position);
-        cloud.rotation.set_row(i, [1.0, step(0.618_034), step(0.754_877_67), step(0.569_840_3)]);
-        cloud.log_scale.set_row(i, [size + step(0.380_278), size - step(0.733_891_86), size]);
-        cloud.opacity_logit.set_row(i, [8.0 * step(0.856_674_88) - 4.0]);
-        for c in 0..48 {
-            cloud.sh.plane_mut(c)[i] = 0.3 * step(0.1 + 0.017 * f64::from(c as u8)) - 0.1;
-        }
-    }
-    cloud
 }
 
 fn sizes(criterion: &mut Criterion) {
