@@ -215,7 +215,7 @@ impl CompressedModel {
     }
 
     /// Sets the computed `proxies`. Clusters for which no proxy was good enough ([`Proxies::refused`]) are dissolved:
-    /// the leader stays unchanged, the other members are removed.
+    /// the leader (most important Gaussian of the cluster) stays unchanged, the other members are removed.
     pub fn set_proxies(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {

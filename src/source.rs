@@ -70,7 +70,7 @@ impl ReadPlan {
     /// Returns a copy of this plan with the limit `frames` (at least 1): the maximum number of frames that a reader
     /// keeps in memory after it has decoded a tile. A tile holds several consecutive frames. A small limit saves memory
     /// but makes the reader decode tiles repeatedly.
-    pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
+    pub fn with_max_kept_frames(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
@@ -205,8 +205,8 @@ pub trait Deformation: Sync {
     /// [`DeformedGaussians::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
-    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. What does not depend on
-    /// time is computed here, once.
+    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. This call does all the
+    /// work that does not depend on time.
     fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a>;
 }
 
@@ -275,7 +275,7 @@ mod tests {
 
     #[test]
     fn unplanned_frames_are_read_alone() {
-        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).keeping_at_most(0);
+        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).with_max_kept_frames(0);
         assert_eq!(wanted.max_kept_frames(), 1);
         assert_eq!(wanted.frames_between(3, 32), [3, 9, 31]);
         assert_eq!(wanted.frames_between(9, 32), [9, 31]);

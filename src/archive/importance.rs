@@ -10,7 +10,7 @@
 use std::collections::BTreeMap;
 
 use super::field::TensorRole;
-use crate::deform::{Box3, Tap, Tensor, Tensors, tap};
+use crate::deform::{Box3, Tensor, Tensors, TexelPair, texel_pair};
 use crate::model::AttributeValues;
 
 /// Maximum number of Gaussians at which the field is sampled.
@@ -276,7 +276,7 @@ impl Samples {
 /// bilinearly.
 fn read(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
     let [channels, rows, columns] = [plane.shape[1], plane.shape[2], plane.shape[3]];
-    let (a, b): (Tap, Tap) = (tap(at[axes[0]], columns), tap(at[axes[1]], rows));
+    let (a, b): (TexelPair, TexelPair) = (texel_pair(at[axes[0]], columns), texel_pair(at[axes[1]], rows));
     let interpolated = |channel: usize| {
         let texel = |row: u32, column: u32| plane.data[(channel * rows + row as usize) * columns + column as usize];
         let along = |row: u32| texel(row, a.low) * (1.0 - a.fraction) + texel(row, a.high) * a.fraction;

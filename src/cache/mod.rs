@@ -87,7 +87,7 @@ impl Cache {
 
     /// Makes all cache keys that are created from now on depend on the ids of the Gaussians that are excluded from the
     /// input, if there are any.
-    pub fn set_absent(&self, ids: &[u32]) {
+    pub fn set_excluded_ids(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
@@ -130,7 +130,7 @@ impl Cache {
 
     /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it. A
     /// run that is limited to one shard of a divided stage does the same, because `stage` is not divided. To end such a
-    /// run instead, `compute` calls [`Cache::end_shard_before`].
+    /// run instead, `compute` calls [`Cache::end_shard_run_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -153,7 +153,7 @@ impl Cache {
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
-    pub fn end_shard_before(&self, stage: &str) -> Result<()> {
+    pub fn end_shard_run_before(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(

@@ -31,7 +31,7 @@ use splatsieve::pipeline::{PruneOrMerge, Request, RunOptions, Target};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
-use splatsieve::scene::pictures::ViewSet;
+use splatsieve::scene::view_selection::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
 /// Returns the library's request for the command `compress`. Options that the command line does not give are taken from

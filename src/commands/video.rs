@@ -18,7 +18,7 @@ use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::camera_path::cameras_along;
 use crate::scene::open_compressed;
-use crate::scene::pictures::{self, ViewSet, render_background};
+use crate::scene::view_selection::{self, ViewSet, render_background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
 /// Name of the rendering stage, for progress.
@@ -100,7 +100,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
         // palette (5).
-        let mut estimate = pictures::render_estimate(work, limits, NAME, models, models * 12);
+        let mut estimate = view_selection::render_estimate(work, limits, NAME, models, models * 12);
         estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![estimate]
     })?;

@@ -25,7 +25,7 @@ use crate::progress::Events;
 use crate::recipe::{Effort, Recipe};
 use crate::render::Image;
 use crate::report::{self, ReportOptions};
-use crate::scene::pictures::ViewSet;
+use crate::scene::view_selection::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
 /// File name of the generated scene.

@@ -11,20 +11,20 @@
 //!
 //! Peak memory per survivor: its state, held by the caller; the proxy states before and after a pass (each at most half
 //! as many as survivors); and [`BYTES_PER_SURVIVOR`]. To this add [`BYTES_PER_PAIR`] for each candidate pair that is
-//! measured in one call, and [`BYTES_PER_PASSING`] for each pair that passed all tests. There are at most
+//! measured in one call, and [`BYTES_PER_PASSED_PAIR`] for each pair that passed all tests. There are at most
 //! `max_neighbors` pairs per survivor; 3.5 were measured for evenly distributed Gaussians. The memory of the callback
 //! is not included.
 
-pub mod gates;
+pub mod appearance;
 pub mod greedy;
 mod groups;
-pub mod known;
-pub mod merged;
+pub mod merged_sequence;
 pub mod moments;
 pub mod motion;
 pub mod motion_pass;
 pub mod neighbors;
 pub mod proxy;
+pub mod similarity_cache;
 pub(crate) mod trajectories;
 pub mod tree;
 pub mod voxels;
@@ -35,11 +35,11 @@ use serde::{Deserialize, Serialize};
 use crate::model::hash_id;
 use crate::model::{Attributes, Gaussians};
 use crate::recipe;
-use gates::{Appearance, AppearanceThresholds};
+use appearance::{Appearance, AppearanceThresholds};
 pub use groups::MergeGroups;
-use known::BYTES_PER_CACHED_PAIR;
 use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
+use similarity_cache::BYTES_PER_CACHED_PAIR;
 use tree::TreePoint;
 
 /// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
@@ -49,13 +49,13 @@ use tree::TreePoint;
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
-/// its copy in the list of pairs to measure, two known similarities ([`known::SimilarityCache`]; one for this pair and
+/// its copy in the list of pairs to measure, two known similarities ([`similarity_cache::SimilarityCache`]; one for this pair and
 /// one for a pair of an earlier pass), and the motion similarity that is returned.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
 /// list.
-pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
+pub const BYTES_PER_PASSED_PAIR: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
 /// Number of nodes (single Gaussians or merged groups) whose neighbors one parallel task looks up.
 const CHUNK: usize = 1024;

@@ -10,7 +10,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::gates::COSINE_EPSILON;
+use super::appearance::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, MotionSimilarity};
 
 /// Bytes of memory for one pair during the measurement.
@@ -48,7 +48,7 @@ impl PairMeasure {
     /// there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
     ///
     /// `noise` is σ, the noise level of a step in scene units.
-    pub fn alignment(&self, noise: f64) -> f64 {
+    pub fn velocity_alignment(&self, noise: f64) -> f64 {
         let floor = 2.0 * f64::from(self.steps) * noise * noise;
         let denominator = self.squares + floor;
         if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
@@ -56,7 +56,7 @@ impl PairMeasure {
 
     /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
     /// least one is alive. Returns 1 if neither is ever alive.
-    pub fn one_alive_fraction(&self) -> f64 {
+    pub fn fraction_with_one_alive(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
 }
@@ -90,11 +90,11 @@ impl MotionThresholds {
     /// the fraction of frames with only one alive is too large, or if the two Gaussians drift too far apart.
     pub fn similarity(&self, pair: &PairMeasure) -> f64 {
         let together =
-            pair.common > 0 && pair.drift <= self.max_drift && pair.one_alive_fraction() <= self.max_dead_time;
+            pair.common > 0 && pair.drift <= self.max_drift && pair.fraction_with_one_alive() <= self.max_dead_time;
         match self.trajectory {
             _ if !together => f64::NAN,
             MotionSimilarity::Cosine => pair.cosine,
-            MotionSimilarity::Alignment => pair.alignment(self.noise),
+            MotionSimilarity::Alignment => pair.velocity_alignment(self.noise),
         }
     }
 }
@@ -287,9 +287,9 @@ mod tests {
         assert!(!merges(&slow, &path(|t| -0.01 * t as f32), 1.0));
         assert!(!merges(&slow, &path(|t| 0.1 * t as f32), 1.0));
         let opposite = measure(&slow, &path(|t| -0.01 * t as f32), MotionParams::Runs);
-        assert!((opposite.alignment(0.0) + 1.0).abs() < 1e-12);
+        assert!((opposite.velocity_alignment(0.0) + 1.0).abs() < 1e-12);
         let tenfold = measure(&slow, &path(|t| 0.1 * t as f32), MotionParams::Runs);
-        assert!((tenfold.alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
+        assert!((tenfold.velocity_alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
         assert!(merges_in_paper(&slow, &path(|t| 0.1 * t as f32)), "the cosine is blind to speed");
         assert!(!merges_in_paper(&slow, &path(|t| -0.01 * t as f32)));
         assert!(merges(&slow, &path(|t| 5.0 + 0.01 * t as f32), 1.0));
@@ -341,7 +341,7 @@ mod tests {
         let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
         let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
         let pair = measure(&long, &short, MotionParams::Runs);
-        assert_eq!((pair.common, pair.union, pair.steps, pair.one_alive_fraction()), (12, 16, 11, 0.25));
+        assert_eq!((pair.common, pair.union, pair.steps, pair.fraction_with_one_alive()), (12, 16, 11, 0.25));
         assert!(!merges(&long, &short, 1.0), "a quarter dead is more than a tenth");
     }
 

@@ -14,8 +14,8 @@ use rayon::prelude::*;
 
 use super::trajectories::{NEEDED, Trajectories};
 use crate::error::Result;
-use crate::merging::known::PairSimilarity;
 use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotion};
+use crate::merging::similarity_cache::PairSimilarity;
 use crate::merging::voxels::voxel_order;
 use crate::model::{AttributeValues, opacity};
 use crate::outputs::container::FRAME_BLOCK;
@@ -149,7 +149,7 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = self.events.task("merge", "states", (ids.len() * frames) as u64);
-        let wanted = ReadPlan::new(0..frames).keeping_at_most(self.max_kept_frames);
+        let wanted = ReadPlan::new(0..frames).with_max_kept_frames(self.max_kept_frames);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state_buffer();
         for frame in 0..frames {

@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::MergeGroups;
-use super::gates::unit_rotation;
+use super::appearance::unit_rotation;
 use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};

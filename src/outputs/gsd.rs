@@ -50,7 +50,7 @@ pub fn write_gsd(source: &dyn FrameSource, path: &Path, held: usize, events: &Ev
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let scratch = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
     let mut blocks = BufWriter::new(scratch);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
     let (mut frames, mut most, mut left_out) = (Vec::<Value>::new(), 0, 0);
     for frame in 0..info.times.len() {
         let packed = PackedFrame::new(states.read(frame)?);

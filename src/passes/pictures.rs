@@ -177,7 +177,7 @@ pub fn for_each_view_batch<const S: usize>(
     max_batch: BatchLimits,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).keeping_at_most(max_batch.held);
+    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).with_max_kept_frames(max_batch.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);

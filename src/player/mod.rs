@@ -4,8 +4,8 @@
 //! chunks and the program that shows them (`page/`, WebGL 2 with the arithmetic of [`crate::render`]) into one file or
 //! into a folder. [`poster`] renders the image that the page shows first.
 
-pub mod lattice;
 pub mod page;
 pub mod poster;
+pub mod quantization;
 pub mod track;
 pub mod view;

@@ -123,7 +123,7 @@ impl RunningContribution {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::DemoScene;
-    use crate::model::{Flags, Gaussians, Rig, Rows, SequenceInfo, Split, ViewSchedule};
+    use crate::model::{AnomalyFlags, Gaussians, Rig, SequenceInfo, Split, StatisticRows, ViewSchedule};
     use crate::passes::scoring_views;
     use crate::pruning::{Overrides, select};
     use crate::recipe::{self, Recipe};
@@ -284,7 +284,7 @@ mod tests {
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
         let zeros = || vec![0.0; count];
-        let rows = Rows {
+        let rows = StatisticRows {
             d: zeros(),
             kappa: zeros(),
             v: zeros(),
@@ -293,7 +293,7 @@ mod tests {
             w: seen.peak,
             e: zeros(),
             vis: vec![1.0; count],
-            flags: vec![Flags::empty(); count],
+            flags: vec![AnomalyFlags::empty(); count],
         };
         let scores = score::score(&rows, 2, &recipe.score);
         let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();

@@ -269,7 +269,7 @@ impl RefineStage {
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
-                work.filling_blocks(),
+                work.block_buffer_memory(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
                 ("views", whole_views.max(views_of_steps)),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),

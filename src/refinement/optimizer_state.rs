@@ -147,7 +147,7 @@ impl<'a> OptimizerState<'a> {
         if deformation.is_some() {
             optimizer.reevaluate_states()?;
         } else {
-            let wanted = ReadPlan::new(optimizer.frames.clone()).keeping_at_most(scene.limits.max_kept_frames);
+            let wanted = ReadPlan::new(optimizer.frames.clone()).with_max_kept_frames(scene.limits.max_kept_frames);
             let mut states = FrameStates::open(result, &wanted)?;
             let mut linearized = LinearizedFramesWriter::new(&scene.scratch, varying)?;
             for &frame in &optimizer.frames {

@@ -19,7 +19,7 @@ use crate::metrics::decibels_text;
 use crate::progress::Progress;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
-use crate::scene::between::SplitMix64;
+use crate::scene::views_between::SplitMix64;
 use crate::source::FrameSource;
 
 /// Minimum and maximum number of optimization steps between two renderings of the validation views. Within these limits
@@ -75,7 +75,7 @@ impl RefineStage {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
                     Targets::new(scene, self.pictures, self.stored_stride(scene.workload().pixels, count), false)?;
-                scene.work.end_shard_before(NAME)?;
+                scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
             })

@@ -3,7 +3,7 @@
 use super::film::FilmPanel;
 use super::findings::{ResultData, WorstPlaceImages};
 use super::run::RunFiles;
-use super::shown::ShownImage;
+use super::shown_images::ShownImage;
 
 /// Comparison of one compressed model with the original, for the report page.
 pub(super) struct Analysis {

@@ -9,7 +9,7 @@ use crate::model::{Attributes, Camera, FrameView};
 use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch};
 use crate::render::{Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::{ViewSet, select_views};
+use crate::scene::view_selection::{ViewSet, select_views};
 use crate::source::Ids;
 
 /// Maximum number of views on which quality is measured.

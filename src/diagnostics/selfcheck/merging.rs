@@ -4,7 +4,7 @@
 use glam::{DMat3, DQuat, DVec3};
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, random_gaussians};
+use super::generated::clouds::{Random, random_gaussians};
 use crate::error::{Error, Result};
 use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::{Importance, merge_state, weights};

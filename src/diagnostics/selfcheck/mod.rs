@@ -11,7 +11,7 @@
 
 mod case;
 mod field;
-pub mod made;
+pub mod generated;
 mod merging;
 pub mod oracle;
 mod pictures;

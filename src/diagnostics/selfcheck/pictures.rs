@@ -6,8 +6,8 @@ use std::num::NonZeroU32;
 use glam::DVec3;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
-use super::oracle::picture::{blended_indices, render_blended, render_view};
+use super::generated::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
+use super::oracle::render::{blended_indices, render_blended, render_view};
 use crate::metrics::{psnr, ssim};
 use crate::model::{Attributes, Camera, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};

@@ -1,7 +1,7 @@
 //! Self-check cases for percentiles, by which statistics are normalized and the scene extent is measured.
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::Random;
+use super::generated::clouds::Random;
 use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;

@@ -5,10 +5,10 @@ use std::f64::consts::PI;
 use glam::{DMat3, DVec3};
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, tilted_camera};
+use super::generated::clouds::{Random, tilted_camera};
 use super::oracle::statistics::{OracleRow, row};
 use crate::error::Result;
-use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
+use crate::model::{Attributes, Camera, Gaussians, StatisticRows, ViewSchedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 use crate::statistics::{BlockScan, ScanPlan};
 
@@ -284,14 +284,14 @@ fn without_views(frames: usize) -> ViewSchedule {
 }
 
 /// Returns the statistics that the scan of the program computes for `frames` at evenly spaced times.
-fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
 /// Returns the statistics that the scan of the program computes for `frames` at `times`. Tells the scan which frames
 /// have the same opacities as the frame before, as the program's readers of models do.
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {

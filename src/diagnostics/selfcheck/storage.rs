@@ -7,7 +7,7 @@ use std::path::Path;
 use gseq::Compression;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, random_gaussians};
+use super::generated::clouds::{Random, random_gaussians};
 use crate::archive::{
     ATTRIBUTES, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorRole, TensorSteps,
     attribute_values, decode, encode, round_cloud, step_size,

@@ -3,7 +3,7 @@
 use std::fs;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{random_gaussians, tilted_camera};
+use super::generated::clouds::{random_gaussians, tilted_camera};
 use crate::diagnostics::test_scene;
 use crate::diagnostics::test_scene::TestSceneOptions;
 use crate::error::{Error, Result};

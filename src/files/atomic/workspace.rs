@@ -255,7 +255,7 @@ fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
         Err(TryLockError::WouldBlock) => return Ok(None),
         // A run that removes a workspace deletes its lock file before it releases the lock. So if the lock file still
         // exists under its name, the workspace is not being removed.
-        Ok(()) if handle.names_file(LOCK, &file) => true,
+        Ok(()) if handle.entry_is_file(LOCK, &file) => true,
         Ok(()) => return Ok(None),
         Err(TryLockError::Error(_)) => false,
     };

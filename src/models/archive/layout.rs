@@ -146,12 +146,13 @@ impl Field {
     }
 }
 
-/// Returns the number of the first plane of the columns in a model of this SH degree.
+/// Returns the index of the first plane (scalar component) that belongs to a column, that is, to values beyond the
+/// standard attributes. In an archive, the planes of the attributes come first; their number depends on the SH degree.
 pub(super) fn first_column_plane(sh_degree: usize) -> usize {
     first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
 }
 
-/// Returns the number of the first plane of an attribute.
+/// Returns the index of the first plane (scalar component) of `attribute` in an archive.
 pub(super) fn first_plane(attribute: Attributes) -> usize {
     match attribute {
         Attributes::POSITION => 0,
@@ -182,7 +183,8 @@ fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
     None
 }
 
-/// Returns the name of the archive part with the bytes of file `k` that are no values.
+/// Returns the name under which an archive stores the remaining bytes of file `k`: all its bytes except the values that
+/// the archive holds as planes and tensors.
 pub(super) fn rest_name(k: usize) -> String {
     format!("file.{k}")
 }
@@ -309,7 +311,8 @@ impl Layout {
 }
 
 /// Returns the bytes of file `k`; `None` if its layout does not match the content. `beside` is the offset of the next
-/// bytes beside the values, and is advanced.
+/// unused byte in [`ArchiveContent::beside`], the bytes that are stored unchanged for each Gaussian. The function
+/// advances it past the bytes of this file.
 fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut usize) -> Option<Vec<u8>> {
     let mut rest = content.files.get(&rest_name(k))?.as_slice();
     let mut out = Vec::new();

@@ -110,7 +110,7 @@ pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
 ///
 /// # Errors
 /// Fails if the layout is malformed.
-pub fn kind_with_layout(content: &ArchiveContent, path: &Path) -> Result<Option<OutputKind>> {
+pub fn restored_output_kind(content: &ArchiveContent, path: &Path) -> Result<Option<OutputKind>> {
     let layout = Layout::read(content, path)?;
     Ok(layout.map(|layout| match layout.files.first().filter(|_| !layout.folder) {
         Some(file) => OutputKind::from_path(Path::new(&file.path), None, OutputKind::Model),
@@ -119,7 +119,7 @@ pub fn kind_with_layout(content: &ArchiveContent, path: &Path) -> Result<Option<
 }
 
 /// Returns whether the archive holds a 4DGaussians model folder rather than a single PLY.
-pub fn is_folder(content: &ArchiveContent) -> bool {
+pub fn holds_model_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
@@ -146,7 +146,7 @@ impl OpenArchive {
             let model = layout.restore(&content, path, scratch.path())?;
             drop(content);
             open_restored(&model, path, options)?
-        } else if is_folder(&content) {
+        } else if holds_model_folder(&content) {
             unpack(&content, path, scratch.path())?;
             drop(content);
             (four_d_gaussians::ENTRY.open)(scratch.path(), options)?

@@ -24,7 +24,8 @@ pub(in crate::models) struct Reopener {
 }
 
 impl Reopener {
-    /// Creates a record of opening a model by `open` with `options`.
+    /// Creates a reopener from the function `open` and the options `options` with which a model was opened. It opens
+    /// archives of this model in the same way.
     pub(in crate::models) fn new(
         open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
         options: &OpenOptions,

@@ -123,7 +123,7 @@ impl Params {
         &self.npz
     }
 
-    /// Returns how archives of the model are opened.
+    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened.
     pub(super) fn reopener(&self) -> &Reopener {
         &self.reopener
     }

@@ -7,7 +7,7 @@
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
 use crate::passes::{SourceWithDeltas, gather_all};

@@ -8,7 +8,7 @@
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, logit, opacity};
 use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::recipe::MergeParams;
@@ -85,7 +85,8 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
 }
 
 /// Computes for each of `clusters` the path, temporal window and shape of its proxy from its members (merged
-/// Gaussians).
+/// Gaussians). The moment match of the members at a frame is the Gaussian with the mean and covariance of their
+/// mixture.
 ///
 /// `line_of` returns the path and window of a member by its id; `window` returns the value of a window at a time. Calls
 /// `visit` with the moment match of each proxy at each sampled frame at which the proxy is visible. The moment match
@@ -144,8 +145,9 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds one frame to the sums. Row `row` of `state` is the moment match at this frame, `m` the window, and `alpha`
-    /// the opacity.
+    /// Adds one frame to the sums. Row `row` of `state` is the moment match of the members at this frame (the Gaussian
+    /// with the mean and covariance of their mixture), `m` is the value of the proxy's temporal window, and `alpha` the
+    /// opacity of the moment match.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -154,7 +156,8 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns the opacity logit at the center of the window and the mean covariance; `None` if no frame was added.
+    /// Returns two averages over the added frames: the opacity logit of the proxy at the center of its temporal window,
+    /// and the covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));

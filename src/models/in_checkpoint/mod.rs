@@ -134,7 +134,8 @@ impl<L: ProxyRule> CheckpointModel<L> {
         found
     }
 
-    /// Returns how the model was opened.
+    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened. Fails if
+    /// there is none.
     fn reopener(&self) -> Result<&Reopener> {
         self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
     }

@@ -50,7 +50,8 @@ struct WindowedModel<L: ProxyRule> {
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns how the `.ftgs.ply` in an archive of this file is opened.
+    /// Returns the reopener of this file, which opens the `.ftgs.ply` in an archive of the file. Fails if there is
+    /// none.
     fn reopener(&self) -> Result<&Reopener> {
         self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }

@@ -15,7 +15,9 @@ use crate::files::atomic::ScratchFolder;
 use crate::memory_plan::{MemoryPart, Workload};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::bounds::ErrorBounds;
-use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
+use crate::outputs::container::{
+    FRAME_BLOCK_WITH_ERROR_BOUNDS, GAUSSIAN_BLOCK, Packing, column_bytes, write_container,
+};
 use crate::pipeline::stages::reference_views::{
     ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, OCTAVE_HALVINGS, OCTAVE_RANGE,
     QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
@@ -48,7 +50,11 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
     }
-    [work.tile_write_buffers(BOUNDED_FRAME_BLOCK), vec![work.compressor_memory(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
+    [
+        work.tile_write_buffers(FRAME_BLOCK_WITH_ERROR_BOUNDS),
+        vec![work.compressor_memory(LEVEL, FRAME_BLOCK_WITH_ERROR_BOUNDS)],
+    ]
+    .concat()
 }
 
 /// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If

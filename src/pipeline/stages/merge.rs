@@ -20,11 +20,11 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging;
-use crate::merging::known::{PairSimilarity, SimilarityCache};
 use crate::merging::motion::MotionThresholds;
 use crate::merging::motion_pass;
 use crate::merging::motion_pass::PairMeter;
 use crate::merging::proxy::{Importance, weights};
+use crate::merging::similarity_cache::{PairSimilarity, SimilarityCache};
 use crate::merging::voxels::voxel_order;
 use crate::merging::{MergeResult, RequestedPairs, Survivors};
 use crate::model::{AttributeValues, Attributes, Gaussians};
@@ -154,7 +154,7 @@ impl MergeStage {
             ("pool", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
             ("survivors", merging::BYTES_PER_SURVIVOR as u64),
-            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSING) as u64),
+            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSED_PAIR) as u64),
             ("readers", work.input.reader),
             ("followed", motion_pass::bytes_per_gaussian(limits.max_kept_frames) as u64),
         ];
@@ -168,7 +168,7 @@ impl MergeStage {
             seconds: SECONDS_TO_MERGE * work.gaussian_count()
                 + FOLLOWED_FRACTION * work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.filling_blocks()],
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.block_buffer_memory()],
         }
     }
 
@@ -207,7 +207,7 @@ impl MergeStage {
                     }
                 };
                 drop(trial);
-                scene.work.end_shard_before(NAME)?;
+                scene.work.end_shard_run_before(NAME)?;
                 let MergeOutcome { compressed, summary } = &mut merged;
                 let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
                 compressed.set_proxies(proxies);

@@ -8,7 +8,7 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
-use crate::model::{Attributes, Rows, Statistic};
+use crate::model::{Attributes, Statistic, StatisticRows};
 use crate::passes::{frames_to_cover, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::pruning::removal::ranking_stride;
@@ -57,9 +57,9 @@ impl VisibilityStage {
         };
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
         let frames = if strided > max_views { frames.min(max_views as u64) } else { frames };
-        let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
+        let rows = StatisticRows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
         per_gaussian.insert(0, ("rows", rows as u64));
-        fixed.push(Workload::view_list(strided.min(max_views)));
+        fixed.push(Workload::view_list_memory(strided.min(max_views)));
         if every > 1.0 {
             // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
