@@ -9,7 +9,8 @@ use crate::recipe::{FieldPrecision, MergeParams};
 /// Reference frame, at which Gaussians are compared for merging, and the extent of the scene at this frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceFrame {
-    /// Index of the frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
+    /// Index of the frame with the most Gaussians alive (opacity ≥ alpha_min); the first one in a tie; 0 if there are
+    /// no frames.
     pub frame: usize,
     /// Longest side of the box between the 1st and the 99th percentile of the positions at this frame, scene units.
     pub extent: f64,

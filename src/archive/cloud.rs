@@ -192,9 +192,9 @@ fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
 }
 
 /// Encodes the Gaussians `cloud` with the quantization steps `steps` of their attributes, and the further values
-/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for each
-/// Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and column to
-/// `bits`.
+/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for
+/// each Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and
+/// column to `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     columns: &[Column],

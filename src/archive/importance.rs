@@ -210,7 +210,7 @@ fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
 struct Samples {
     /// Number of inputs of the trunk (the layers that all heads share).
     width: usize,
-    /// Inputs of the trunk, `[samples, width]`.
+    /// Inputs of the trunk (the layers that all heads share), `[samples, width]`.
     features: Vec<f32>,
     /// For every plane: its name, the index of its first channel among the inputs, and for each channel the sum over
     /// all samples of the squared product of the five other planes.

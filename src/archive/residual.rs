@@ -33,7 +33,8 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
 /// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all others.
+/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all
+/// others.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.

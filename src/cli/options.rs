@@ -379,7 +379,7 @@ fn view_set(named: SplitArg) -> ViewSet {
     split(named).map_or(ViewSet::All, ViewSet::Split)
 }
 
-/// Returns the cache folder and the shard that the arguments name; `None` without `--cache`.
+/// Returns the cache folder and the shard (part of a divided stage) that the arguments name; `None` without `--cache`.
 pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }

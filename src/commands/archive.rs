@@ -1,5 +1,5 @@
-//! Writing of an archive, and unpacking of an archive into files that the renderer of the model opens. Part of the command
-//! `convert`.
+//! Writing of an archive, and unpacking of an archive into files that the renderer of the model opens. Part of the
+//! command `convert`.
 
 use std::fs;
 use std::io::Read;
@@ -98,11 +98,10 @@ pub fn unpack_archive(
 
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the
 /// archive have about 50 dB PSNR against renders of the input. If the input consists of explicit frames, the archive is
-/// a container with bounded errors, whose bounds are chosen in the same way.
+/// a container with bounded errors, whose bounds are chosen in the same way. Returns the report on the written file.
 ///
-///
-/// # Errors
-/// Fails if the input cannot be read or has no archives, or if the output exists already or cannot be written.
+///  # Errors Fails if the input cannot be read or has no archives, or if the output exists already or cannot be
+/// written.
 pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<ConvertReport> {
     if input.is_stream() {
         return Err(Error::usage(

@@ -231,7 +231,7 @@ pub fn verify(path: &Path) -> Result<VerifyReport> {
 }
 
 /// Copies the complete frames of the truncated or damaged container `input` to the new container `output`. Fails if no
-/// frame is complete.
+/// frame is complete. Returns how many frames and tiles were found and saved.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_container_name(output, "info --repair")?;
     check_is_container(input)?;

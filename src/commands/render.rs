@@ -68,7 +68,8 @@ pub struct RenderReport {
     pub notes: Vec<String>,
 }
 
-/// Renders views of an input to image files.
+/// Renders views of an input to image files. Returns the number of rendered views; if the run is limited to one shard
+/// (part of a divided stage), returns a report about this shard.
 ///
 /// Memory: one frame state, and for each thread one render with its projected Gaussians
 /// ([`crate::scene::view_selection::render_estimate`]).

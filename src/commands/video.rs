@@ -73,7 +73,7 @@ pub struct VideoReport {
 
 /// Renders a video of an input, with one image per frame of the model, in order. Exception: if a camera path leads
 /// through a still (a model without motion), the video has a fixed number of images from each camera of the path to the
-/// next.
+/// next. Returns the number and the size of the video frames.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
@@ -241,7 +241,7 @@ impl FilmSource<'_> {
     }
 }
 
-/// Joins images of the same size from left to right.
+/// Joins images of the same size from left to right, and returns the joined image.
 fn side_by_side(mut images: Vec<Image>) -> Image {
     if images.len() == 1 {
         return images.swap_remove(0);

@@ -272,7 +272,8 @@ fn smaller(camera: &Camera) -> Camera {
     }
 }
 
-/// Joins three renders of equal size from left to right, with a white line between neighboring renders.
+/// Joins three renders of equal size from left to right, with a white line between neighboring renders, and returns the
+/// joined image.
 fn beside(images: [Image; 3]) -> Image {
     let (width, height) = (images[0].width, images[0].height);
     let line = vec![1.0; 3 * FILM_GAP as usize];

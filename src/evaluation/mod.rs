@@ -73,7 +73,7 @@ pub struct EvaluateOptions {
 }
 
 /// Opens the original and the compressed model, renders both from the selected views and compares the renders. Returns
-/// the evaluation, or a report if the run computes only one shard.
+/// the evaluation, or a report if the run computes only one shard (part of a divided stage).
 ///
 /// # Errors
 /// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
@@ -82,8 +82,8 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
 
-/// Does the work of [`evaluate`]. A run that computes only one shard (part of a divided stage) ends with the error
-/// [`Error::ShardDone`].
+/// Does the work of [`evaluate`], and returns the evaluation. A run that computes only one shard (part of a divided
+/// stage) ends with the error [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, TargetKind::File, &options.input_paths(), options.overwrite)?;
@@ -210,8 +210,8 @@ impl ModelPair {
     }
 
     /// Compares all views, as [`ModelPair::evaluate`] does, but as the first stage of a longer run. The difference: a
-    /// run that is limited to one shard returns the evaluation if the scores of all shards are in the cache, so that it
-    /// can go on to the next stage.
+    /// run that is limited to one shard (part of a divided stage) returns the evaluation if the scores of all shards
+    /// are in the cache, so that it can go on to the next stage.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -236,7 +236,7 @@ impl ModelPair {
 
     /// Renders every view and returns the values of `observe` for all views, in order. `observe` gets the same
     /// arguments as in [`ModelPair::observe`], but no scores are computed. The work is done as the stage `name`, which
-    /// can be divided into shards.
+    /// can be divided into shards (ranges of the views).
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -482,7 +482,7 @@ impl ModelPair {
         Ok((all, observed))
     }
 
-    /// Renders a view with both models, and reads its photograph if there is one.
+    /// Renders a view with both models, and reads its photograph if there is one. Returns these images.
     fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
         let &ViewStates { picture, camera, .. } = view;
         Ok(RenderedViews {

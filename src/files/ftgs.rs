@@ -241,8 +241,8 @@ pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Resul
     write_ftgs_with(params, clip, MIN_TIME_DEVIATION, path)
 }
 
-/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most [`MIN_TIME_DEVIATION`]
-/// that leaves all deviations in `params` as they are.
+/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most
+/// [`MIN_TIME_DEVIATION`] that leaves all deviations in `params` as they are.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

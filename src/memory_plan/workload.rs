@@ -20,7 +20,7 @@ const PER_SLOT: u64 = 80;
 /// list of time stamps grows by being copied to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
 /// Bytes of memory per frame of an open input: two copies of its time stamp (one in the container's index, one in the
-/// sequence), and the number of Gaussians alive in the frame.
+/// sequence), and the number of Gaussians alive (opacity ≥ alpha_min) in the frame.
 const PER_FRAME: u64 = 8 + 8 + 8;
 /// Bytes of memory per view in a list of views.
 const PER_PICTURE: u64 = 24;

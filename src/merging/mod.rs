@@ -2,7 +2,7 @@
 //! and covariance (method.md, section 5).
 //!
 //! ```text
-//! states at the reference frame ─▶ neighbors ─▶ gates ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy
+//! states at the reference frame ─▶ neighbors ─▶ appearance ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy
 //! frames ──▲
 //! ```
 //!
@@ -49,8 +49,8 @@ use tree::TreePoint;
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
-/// its copy in the list of pairs to measure, two known similarities ([`similarity_cache::SimilarityCache`]; one for this pair and
-/// one for a pair of an earlier pass), and the motion similarity that is returned.
+/// its copy in the list of pairs to measure, two known similarities ([`similarity_cache::SimilarityCache`]; one for
+/// this pair and one for a pair of an earlier pass), and the motion similarity that is returned.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
@@ -66,7 +66,7 @@ pub struct Survivors<'a> {
     /// Attributes of all Gaussians at the reference frame. Of the SH coefficients, comparisons use only those of degree
     /// 0; proxies get those of all degrees.
     pub states: &'a Gaussians,
-    /// Rows of the survivors in `states`, increasing.
+    /// Rows of the survivors (Gaussians left by pruning) in `states`, increasing.
     pub rows: &'a [u32],
     /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. Leaders are ranked by C;
     /// ties are broken by the hashes of the ids.
@@ -92,7 +92,7 @@ pub struct RequestedPairs<'a> {
 
 impl<'a> RequestedPairs<'a> {
     /// Returns each pair as two rows of [`Survivors::states`]. For a node that is a merged group, the row is that of
-    /// its leader.
+    /// its leader (the Gaussian into which the others are merged).
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
     }
@@ -128,9 +128,9 @@ pub struct PassCounts {
     pub sequential: bool,
 }
 
-/// Runs all merging passes of `recipe` over `survivors`. Every pass first merges nodes (Gaussians or merged groups)
-/// that coincide, then neighbors. A merge joins one or more nodes (members) to a leader: the node of the resulting
-/// group that ranks first by its contribution C.
+/// Runs all merging passes of `recipe` over `survivors` (Gaussians left by pruning). Every pass first merges nodes
+/// (Gaussians or merged groups) that coincide, then neighbors. A merge joins one or more nodes (members) to a leader:
+/// the node of the resulting group that ranks first by its contribution C.
 ///
 /// A member must pass three tests with its leader: 1 (place and size), 2 (color) and 3 (motion). `measure` provides the
 /// values for test 3: it returns the motion similarity of every requested pair, in the order of the request. A pair
@@ -279,10 +279,10 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 (`gates`) compare, and
-/// that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the set
-/// that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call of
-/// `take` gets at most `max_batch` pairs (at least 1).
+/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 ([`appearance`]) compare,
+/// and that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the
+/// set that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call
+/// of `take` gets at most `max_batch` pairs (at least 1).
 ///
 /// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
 /// than that coincide, each of them finds only neighbors that coincide with it. Without this step, they would not all

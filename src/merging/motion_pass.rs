@@ -127,8 +127,8 @@ impl PairMeter<'_> {
     }
 
     /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in voxel order: sorted by the voxel (of side
-    /// `reach`) in which their position in `reference` lies. Fails if the source cannot be read or the scratch file
-    /// cannot be written.
+    /// `reach`) in which their position in `reference` lies. Returns the handle of this file. Fails if the source
+    /// cannot be read or the scratch file cannot be written.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);

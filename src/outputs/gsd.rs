@@ -116,7 +116,8 @@ struct PackedFrame {
 }
 
 impl PackedFrame {
-    /// Packs the visible Gaussians of `state` into textures, without those that have a value that is not finite.
+    /// Packs the visible Gaussians of `state` into textures and returns them. Leaves out Gaussians with a value that is
+    /// not finite.
     fn new(state: &Gaussians) -> PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();

@@ -163,7 +163,7 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
 }
 
 /// Fits lines in time windows (linear motion with an opacity that is a Gaussian function of time) to all Gaussians of
-/// `source`, for the format `kind`.
+/// `source`, for the format `kind`. Returns the lines and the error of the fit.
 fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);

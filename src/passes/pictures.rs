@@ -107,7 +107,8 @@ pub struct ViewStates<'a, const S: usize> {
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool.
+    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool, and returns the
+    /// image.
     ///
     /// If the subject has features, the renderer blends these in place of colors, and the decoder of its model computes
     /// the color of each pixel from them. `background` is then ignored.

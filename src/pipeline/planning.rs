@@ -48,7 +48,8 @@ pub struct Planning<'a> {
     pub prunes: bool,
     /// Whether survivors (Gaussians that are not removed) are merged.
     pub merges: bool,
-    /// Refinement stage, which fits the survivors to renders of the original; `None` if nothing is refined.
+    /// Refinement stage, which fits the survivors (Gaussians left by pruning) to renders of the original; `None` if
+    /// nothing is refined.
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,

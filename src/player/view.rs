@@ -79,10 +79,11 @@ fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
 }
 
-/// Writes the page that plays the model, or two models side by side.
+/// Writes the page that plays the model, or two models side by side. Returns the paths, the number of frames and the
+/// size of the page.
 ///
-/// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values ([`MAX_VALUES_PER_FRAME_GROUP`]), and
-/// the render of the poster.
+/// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values
+/// ([`MAX_VALUES_PER_FRAME_GROUP`]), and the render of the poster.
 ///
 /// # Errors
 /// Fails if the inputs, the cameras or the output are invalid. Nothing is written then.

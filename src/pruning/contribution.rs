@@ -31,8 +31,9 @@ pub struct VisibleContribution {
 }
 
 impl VisibleContribution {
-    /// Converts the sums and maxima in `found` to contributions C and peaks W. `pictures`: number of views that were
-    /// rendered; only every `pixel_stride`-th column and row of their pixels was rendered.
+    /// Converts the sums and maxima in `found` to contributions C (mean per view, pixels) and peaks W (largest weight
+    /// in a pixel), and returns these. `pictures`: number of views that were rendered; only every `pixel_stride`-th
+    /// column and row of their pixels was rendered.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();

@@ -83,8 +83,8 @@ pub struct Scored {
     /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
     /// Gaussians.
     pub absent: Vec<u32>,
-    /// Reference frame (the frame in which most Gaussians are alive, at which Gaussians are compared for merging), and
-    /// the extent of the scene at this frame.
+    /// Reference frame (the frame in which most Gaussians are alive (opacity ≥ alpha_min), at which Gaussians are
+    /// compared for merging), and the extent of the scene at this frame.
     pub reference: ReferenceFrame,
     /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
     /// coordinate.
@@ -234,7 +234,7 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
         .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
-/// Counts the Gaussians with unusual values, such as NaN, for each kind of unusual value.
+/// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
 fn flags(rows: &StatisticRows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
@@ -247,7 +247,8 @@ fn flags(rows: &StatisticRows) -> FlagSummary {
     }
 }
 
-/// Fails if Gaussians are alive but none is in any view. This happens if the cameras belong to another scene.
+/// Fails if Gaussians are alive (opacity ≥ alpha_min) but none is in any view. This happens if the cameras belong to
+/// another scene.
 fn check_views(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
     let seen = rows.vis.iter().filter(|&&vis| vis > 0.0).count();
@@ -384,8 +385,8 @@ impl Scored {
     }
 }
 
-/// Returns the median number of frames in which a Gaussian is alive. Gaussians that are never alive are ignored; if all
-/// are, returns 0.
+/// Returns the median number of frames in which a Gaussian is alive (opacity ≥ alpha_min). Gaussians that are never
+/// alive are ignored; if all are, returns 0.
 fn median_life(life: &[u32]) -> u32 {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&frames| frames > 0).collect();
     let middle = lives.len() / 2;

@@ -84,7 +84,8 @@ impl VisibilityStage {
     }
 
     /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of
-    /// frames in which each Gaussian is alive. Writes a warning to `journal` if the cameras see very few Gaussians.
+    /// frames in which each Gaussian is alive (opacity ≥ alpha_min). Writes a warning to `journal` if the cameras see
+    /// very few Gaussians.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -117,14 +118,15 @@ impl VisibilityStage {
     }
 }
 
-/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive in some frame.
-/// Cameras that see fewer probably belong to another scene. Cameras of trained models see two thirds; those inside a
-/// scene that fills a room see a third.
+/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive (opacity ≥
+/// alpha_min) in some frame. Cameras that see fewer probably belong to another scene. Cameras of trained models see two
+/// thirds; those inside a scene that fills a room see a third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
 
-/// Returns a warning for the user if very few of the Gaussians that are ever alive contribute to any view, so that the
-/// cameras may belong to another scene. `peak`: largest contribution W of each Gaussian to a pixel. `life`: number of
-/// frames in which each Gaussian is alive. `origin`: where the cameras came from, for the message.
+/// Returns a warning for the user if very few of the Gaussians that are ever alive (opacity ≥ alpha_min) contribute to
+/// any view, so that the cameras may belong to another scene. `peak`: largest contribution W of each Gaussian to a
+/// pixel. `life`: number of frames in which each Gaussian is alive. `origin`: where the cameras came from, for the
+/// message.
 fn wrong_scene_warning(peak: &[f64], life: &[u32], origin: &str) -> Option<String> {
     let alive = life.iter().filter(|&&frames| frames > 0).count();
     let seen = peak.iter().zip(life).filter(|&(&peak, &frames)| frames > 0 && peak > 0.0).count();

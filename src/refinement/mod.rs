@@ -201,9 +201,9 @@ impl RefineStage {
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
-        // With a deformation field, no reader is open while steps are made, and either two more states and what the field
-        // computes without time are held while states are evaluated again, or one state per thread while views are
-        // rendered.
+        // With a deformation field, no reader is open while steps are made, and either two more states and what the
+        // field computes without time are held while states are evaluated again, or one state per thread while views
+        // are rendered.
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
         let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };

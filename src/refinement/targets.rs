@@ -82,9 +82,9 @@ enum Purpose {
 }
 
 impl Targets {
-    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Of training views only every
-    /// `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth view is a test view;
-    /// otherwise there are no test views.
+    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Returns these target views.
+    /// Of training views only every `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth
+    /// view is a test view; otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.

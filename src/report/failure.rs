@@ -1,9 +1,9 @@
 //! Failure modes (kinds of damage that the paper names), detected in renders.
 //!
-//! Input: the kinds of every Gaussian ([`mod@super::traits`]: fast, thin or changing in appearance) and the renders of
-//! both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst place, and a
-//! verdict. The visibility of a kind is known exactly: the original is rendered once more with colors that encode the
-//! kinds, which gives for every pixel the share w of each kind.
+//! Input: the kinds of every Gaussian ([`mod@super::gaussian_kinds`]: fast, thin or changing in appearance) and the
+//! renders of both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst
+//! place, and a verdict. The visibility of a kind is known exactly: the original is rendered once more with colors that
+//! encode the kinds, which gives for every pixel the share w of each kind.
 //!
 //! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. Memory:
 //! per thread one more render, and the original's state without its colors.
@@ -139,8 +139,8 @@ pub struct KindTotals {
     pub shares: (f64, f64),
 }
 
-/// Renders the Gaussians `state` with colors that encode their kinds (`traits`): red, green and blue of a pixel are the
-/// shares of the three kinds in it.
+/// Renders the Gaussians `state` with colors that encode their kinds (`traits`), and returns the image: red, green and
+/// blue of a pixel are the shares of the three kinds in it.
 pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {

@@ -36,7 +36,8 @@ pub const MAX_STILL_MOTION: f64 = 5e-4;
 /// Gaussian is alive.
 pub const MIN_OPACITY_CHANGE: f64 = 0.05;
 /// Minimum change of the base color that counts as a change of appearance: standard deviation over the frames in which
-/// the Gaussian is alive, root mean square over the channels, colors in [0, 1]. It is five steps of 1/255.
+/// the Gaussian is alive (opacity ≥ alpha_min), root mean square over the channels, colors in [0, 1]. It is five steps
+/// of 1/255.
 pub const MIN_COLOR_CHANGE: f64 = 0.02;
 /// Maximum number of frames at which distances and colors are measured. They are evenly spaced.
 pub const MAX_SAMPLED_FRAMES: usize = 24;

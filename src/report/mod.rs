@@ -2,8 +2,9 @@
 //!
 //! Input: the original, one or more compressed models, their cameras, and the files that `compress` wrote beside its
 //! results. Output: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
-//! The steps are `run` (files of `compress`), `traits` (Gaussians at risk), the evaluation observed by `failure`,
-//! `histogram`, `shown` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`, `details`.
+//! The steps are `run` (files of `compress`), `gaussian_kinds` (Gaussians at risk), the evaluation observed by
+//! `failure`, `histogram`, `shown_images` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`,
+//! `details`.
 //!
 //! Memory: the memory of an evaluation or of scoring, which run one after the other, and the page.
 

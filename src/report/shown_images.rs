@@ -1,8 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
 //! Input: first the scores of all renders, from which some renders are chosen; then the chosen renders, which the
-//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`] renders of at most
-//! [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`] renders of
+//! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 

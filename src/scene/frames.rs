@@ -15,8 +15,8 @@ impl Scene {
         self.absent.set(ids);
     }
 
-    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_excluded_ids`]) are invisible in
-    /// it.
+    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_excluded_ids`]) are
+    /// invisible in it.
     pub fn source(&self) -> &dyn FrameSource {
         if self.absent.is_empty() { self.input.source() } else { self }
     }

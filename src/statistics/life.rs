@@ -14,7 +14,7 @@ pub(super) struct LifeSpans {
     sum: Vec<f64>,
     sum_of_squares: Vec<f64>,
     frames: Vec<u32>,
-    /// Number of Gaussians alive in the frame that was added last.
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in the frame that was added last.
     alive: u32,
     /// Number of frames that repeat the opacities of the first frame and are not counted in `frames` yet.
     repeats: u32,
@@ -56,8 +56,8 @@ impl LifeSpans {
         all
     }
 
-    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive in it. All
-    /// frames in between must also have had these opacities, so every α − α₁ is 0.
+    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive (opacity ≥
+    /// alpha_min) in it. All frames in between must also have had these opacities, so every α − α₁ is 0.
     #[inline(always)]
     pub(super) fn repeat_frame(&mut self) -> u32 {
         self.repeats += 1;
@@ -74,7 +74,7 @@ impl LifeSpans {
         }
     }
 
-    /// Returns for each Gaussian the number of frames so far in which it was alive.
+    /// Returns for each Gaussian the number of frames so far in which it was alive (opacity ≥ alpha_min).
     pub(super) fn frames(&self) -> &[u32] {
         &self.frames
     }

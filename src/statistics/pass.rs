@@ -24,7 +24,7 @@ pub struct ScanResult {
     /// Statistics, one row per Gaussian. The trajectory magnitude D and the curvature κ still include rounding noise;
     /// the anisotropy E is not filled yet.
     pub rows: StatisticRows,
-    /// Number of Gaussians alive in each frame.
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in each frame.
     pub alive_per_frame: Vec<u32>,
     /// Largest |coordinate| of all positions in all frames, scene units.
     pub largest_coordinate: f32,
@@ -77,7 +77,8 @@ pub fn scan_blocks(
 impl ScanResult {
     /// Converts the result of a scan that read only the frames `frames` (increasing) into a result for the whole
     /// sequence, which has `all` frames. Life spans grow in proportion. Frames that were not read have no Gaussians
-    /// alive. Sets D, κ and V to 0, because steps between the frames that were read are not the steps of the sequence.
+    /// alive (opacity ≥ alpha_min). Sets D, κ and V to 0, because steps between the frames that were read are not the
+    /// steps of the sequence.
     pub fn extrapolate_to_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
         let mut alive_per_frame = vec![0; all];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
@@ -99,7 +100,7 @@ impl ScanResult {
 }
 
 /// Joins consecutive blocks of Gaussians, each given by its rows and its largest coordinate, into one result.
-/// `alive_per_frame` holds the number of Gaussians alive in each frame.
+/// `alive_per_frame` holds the number of Gaussians alive (opacity ≥ alpha_min) in each frame.
 fn joined(blocks: impl IntoIterator<Item = (StatisticRows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
     let mut rows = StatisticRows::default();
     let mut largest_coordinate = 0.0f32;

@@ -62,8 +62,8 @@ pub struct BlockStatistics {
     /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a
     /// Gaussian with [`AnomalyFlags::NON_FINITE`] are 0.
     pub rows: StatisticRows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has
-    /// not returned. Gaussians with NaN values are included.
+    /// Number of the block's Gaussians alive (opacity ≥ alpha_min) in each frame, for the frames that
+    /// [`BlockScan::take_alive_counts`] has not returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
@@ -118,8 +118,8 @@ impl<'a> BlockScan<'a> {
         self.uncarried = 0;
     }
 
-    /// Returns how many of the block's Gaussians are alive in each frame added since the last call, and forgets these
-    /// numbers.
+    /// Returns how many of the block's Gaussians are alive (opacity ≥ alpha_min) in each frame added since the last
+    /// call, and forgets these numbers.
     pub fn take_alive_counts(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
     }

@@ -1,7 +1,7 @@
 //! Statistics of every Gaussian over all frames, one array per statistic (docs/method.md, section 1).
 //!
-//! A new statistic is a field of [`StatisticRows`] and a variant of [`Statistic`]. Tables, histograms, temporary files and
-//! memory plans then include it.
+//! A new statistic is a field of [`StatisticRows`] and a variant of [`Statistic`]. Tables, histograms, temporary files
+//! and memory plans then include it.
 
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
@@ -21,8 +21,8 @@ bitflags! {
     }
 }
 
-/// Statistic that is computed for each Gaussian. The methods return its names, its meaning, and the array of [`StatisticRows`]
-/// that holds its values.
+/// Statistic that is computed for each Gaussian. The methods return its names, its meaning, and the array of
+/// [`StatisticRows`] that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
     /// Trajectory magnitude, see [`StatisticRows::d`].
@@ -43,7 +43,8 @@ pub enum Statistic {
     W,
 }
 
-/// Functions that return the array of a statistic from [`StatisticRows`], the first for reading and the second for writing.
+/// Functions that return the array of a statistic from [`StatisticRows`], the first for reading and the second for
+/// writing.
 #[derive(Debug, Clone, Copy)]
 pub enum StatisticAccess {
     /// Statistic whose values are real numbers.
@@ -177,8 +178,8 @@ pub struct StatisticRows {
     /// Contribution C to a render in pixels, mean over the views. The parameter `coverage` of the recipe selects the
     /// sum of alpha · transmittance over the pixels (`visible`), or the opacity times the projected area (`projected`).
     pub c: Vec<f64>,
-    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if the contribution [`StatisticRows::c`]
-    /// is computed from projected areas.
+    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if the contribution
+    /// [`StatisticRows::c`] is computed from projected areas.
     pub w: Vec<f64>,
     /// Anisotropy E of the canonical (time-independent) scales. The parameter `anisotropy` of the recipe selects the
     /// ratio of the largest scale to the smallest (`ratio`), or ln(largest scale / middle scale) (`log`).

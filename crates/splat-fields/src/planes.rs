@@ -67,7 +67,7 @@ impl Box3 {
         factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
     }
 
-    /// Converts a position `p` in scene units to normalized coordinates, which are −1 to 1 inside the box.
+    /// Returns the position `p` (scene units) in normalized coordinates, which are −1 to 1 inside the box.
     #[inline(always)]
     pub fn normalized(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)

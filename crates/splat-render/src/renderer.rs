@@ -53,7 +53,8 @@ impl Image {
     }
 }
 
-/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool.
+/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool, and returns the
+/// image.
 ///
 /// An image without pixels stays empty, and without Gaussians every pixel is `background`. Scales are clamped to e^±80.
 /// A zero quaternion counts as the identity; a NaN color counts as 0.

@@ -34,7 +34,8 @@ pub(super) struct JudgedQuality {
 
 impl Judge {
     /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`PICTURES`]
-    /// views, renders an evenly spaced selection of [`PICTURES`].
+    /// views, renders an evenly spaced selection of [`PICTURES`]. Returns these renders as the reference for
+    /// [`Judge::quality`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.

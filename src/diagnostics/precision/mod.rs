@@ -164,7 +164,8 @@ impl Bench<'_> {
     }
 }
 
-/// Measures all settings of the requested knobs on a model and writes the results to the output folder.
+/// Measures all settings of the requested knobs on a model and writes the results to the output folder. Returns the
+/// results.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe, the options or the output are invalid, or if a run fails. No files

@@ -212,7 +212,7 @@ impl Bench<'_> {
     }
 
     /// Measures the errors of percentiles that are found in one pass over the values, by histograms with several
-    /// numbers of mantissa bits. The reference is exact percentiles.
+    /// numbers of mantissa bits. The reference is exact percentiles. Returns the measurements.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;

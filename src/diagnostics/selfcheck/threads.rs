@@ -16,6 +16,7 @@ use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
 /// Compares results computed on one thread with results computed on two threads. They must be equal byte for byte.
+/// Returns the largest error, with the bound that it must not exceed.
 pub(super) fn same_bytes() -> CaseResult {
     CaseResult::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (run_on(1)?, run_on(2)?);

@@ -214,8 +214,8 @@ pub struct ExitGuard(
 
 /// Removes all outputs of this process that do not have their final names yet. Called when the process is about to end.
 ///
-/// First waits until a result that is being moved to its final name is complete. Files outside workspaces (hidden
-/// output folders) stay.
+/// Returns a guard: as long as it exists, no thread of this process can begin or publish an output. First waits until a
+/// result that is being moved to its final name is complete. Files outside workspaces (hidden output folders) stay.
 pub fn remove_unfinished() -> ExitGuard {
     let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {

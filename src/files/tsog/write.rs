@@ -25,7 +25,8 @@ pub const MAX_FRAMES: usize = 1 << 16;
 /// all Gaussians, then the largest error. The unit is the middle one of a Gaussian's three scales.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
-/// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`.
+/// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`. Returns the
+/// largest errors of the stored values.
 ///
 /// # Errors
 /// Fails if there are no Gaussians, or more than the images can hold; if there are too many frames; if a position is

@@ -34,8 +34,8 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
 }
 
 /// Encodes the compressed model `reduction` of `model` as an archive with steps of 2^-16, restores it, and returns the
-/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the frames
-/// of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
+/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the
+/// frames of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
 ///
 /// # Panics
 /// Panics if a check fails.

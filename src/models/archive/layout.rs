@@ -26,7 +26,8 @@ pub(super) const LAYOUT: &str = "layout";
 const MAX_GROWTH: u64 = 4;
 /// Number of bytes that the restored files may have in addition to [`MAX_GROWTH`] times the decoded archive.
 const BASE_BYTES: u64 = 1 << 20;
-/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per frame.
+/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per
+/// frame.
 const MAX_LAYOUT_BYTES: usize = 4 << 20;
 /// Maximum length in bytes of a path in an archive.
 const MAX_PATH: usize = 256;
@@ -76,11 +77,11 @@ pub(super) struct Span {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Values {
-    /// One row per Gaussian, in the order of the archive; each row consists of these fields.
+    /// One row per Gaussian, in the order of the archive; each row consists of the given fields.
     Rows(Vec<Field>),
     /// All values of the tensor with this name, as f32.
     Tensor(String),
-    /// This many zero bytes.
+    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
     Zeros(u64),
 }
 
@@ -99,9 +100,10 @@ pub(super) enum Field {
     Octaves(usize),
     /// Byte that is 255 times the value of the plane with this index.
     Byte(usize),
-    /// The next of the bytes that the archive holds per Gaussian beside its values, this many.
+    /// Bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::beside`]); the number of these
+    /// bytes.
     Bytes(usize),
-    /// This many zero bytes.
+    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
     Zeros(usize),
 }
 
@@ -335,7 +337,8 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut 
     Some(out)
 }
 
-/// Appends one row of `fields` per Gaussian to `out`; `None` if a field has no values.
+/// Appends one row of `fields` per Gaussian to `out`. Returns `None` if the content of the archive has no values for a
+/// field.
 fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {

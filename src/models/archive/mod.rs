@@ -106,7 +106,8 @@ pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
 }
 
 /// Returns the kind of output as which [`unpack`] restores the model that `content` holds in the layout of its own
-/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the archive.
+/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the
+/// archive.
 ///
 /// # Errors
 /// Fails if the layout is malformed.

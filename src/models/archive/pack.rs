@@ -1,7 +1,7 @@
 //! Makes the content of an archive from the files of a model, as its own renderer opens them.
 //!
-//! Input: a model that was written in its own format, and what its files hold. Output: [`ArchiveContent`] with the values of
-//! the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
+//! Input: a model that was written in its own format, and what its files hold. Output: [`ArchiveContent`] with the
+//! values of the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
 //! ([`super::layout`]). Memory: the files and their values.
 
 use std::fs;
@@ -37,7 +37,8 @@ pub(in crate::models) enum FileContent<'a> {
     Splatv,
     /// Weights of a network: a PyTorch state dict.
     Weights,
-    /// Gaussians as rows of the tensors of a checkpoint with the same objects as this one.
+    /// Gaussians as rows of the tensors of a checkpoint. The tensors are described for the checkpoint from which the
+    /// model was read; the file is a copy of it with the same tree of objects.
     Checkpoint(&'a RowTensors),
     /// Gaussians in the arrays of a NumPy archive; the function returns the axis that counts them and the attribute
     /// that an array holds.

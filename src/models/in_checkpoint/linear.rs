@@ -68,7 +68,8 @@ pub(in crate::models) struct Matched {
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// State that one proxy should have at one frame: the moment match of its members.
+/// State that one proxy should have at one frame: the moment match of its members, that is, the Gaussian with the mean
+/// and covariance of their mixture.
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
@@ -76,7 +77,7 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of the frame: window of the proxy times opacity of the moment match.
+    /// Weight of the frame: window of the proxy times opacity of the moment match (see [`ProxyAtFrame`]).
     pub(in crate::models) weight: f64,
     /// States of a block of proxies at this frame. The state of each proxy is the moment match of its members.
     pub(in crate::models) state: &'a Gaussians,
@@ -133,7 +134,8 @@ pub(in crate::models) fn match_proxies(
     Ok(matched)
 }
 
-/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match.
+/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match (see
+/// [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
     /// Sum over the frames of m·α: window times opacity of the moment match.

@@ -89,7 +89,8 @@ pub(super) struct ModelDescription {
     pub(super) root: Option<PathBuf>,
     /// Path of the checkpoint file.
     pub(super) file: PathBuf,
-    /// How the model was opened.
+    /// Reopener of the model, which opens archives of the model as the model itself was opened; `None` if there is
+    /// none.
     pub(super) reopener: Option<Reopener>,
     /// Notes for the user.
     pub(super) notes: Vec<String>,

@@ -157,8 +157,8 @@ impl<L: MotionModel> MotionModelFrames<L> {
 }
 
 /// Returns the stored parameters of the compressed model `reduction` of `raw`: Gaussians are removed, proxies
-/// (Gaussians that replace merged ones) put in place of their leaders, parameter deltas added, and the SH degree
-/// lowered.
+/// (Gaussians that replace merged ones) put in place of their leaders (the most important members of the clusters),
+/// parameter deltas added, and the SH degree lowered.
 pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) -> StoredParams {
     let mut raw_left = raw.pick(&reduction.kept);
     if let Some(proxies) = &reduction.proxies.raw {

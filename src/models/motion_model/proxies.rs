@@ -11,7 +11,8 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum difference in opacity, at any frame, between a proxy and the moment match of its members (merged Gaussians).
+/// Maximum difference in opacity, at any frame, between a proxy and the moment match of its members (the Gaussian with
+/// the mean and covariance of the merged Gaussians).
 const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 
 /// Returns the proxies that `propose` computes for `clusters`, one row each. A proxy is refused if at any frame its

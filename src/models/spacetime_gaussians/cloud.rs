@@ -123,8 +123,8 @@ impl PointCloudFile {
     }
 
     /// Writes the compressed model to a PLY file with the same properties. Rows are copied byte for byte, except that
-    /// proxies (Gaussians that replace merged ones) are written in place of their leaders, and parameter deltas are
-    /// added.
+    /// proxies (Gaussians that replace merged ones) are written in place of their leaders (the most important members
+    /// of the clusters), and parameter deltas are added.
     ///
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.

@@ -44,8 +44,8 @@ struct WindowedModel<L: ProxyRule> {
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// How the `.ftgs.ply` in an archive of this file is opened. `None` for Gaussians without windows of time, which a
-    /// `.ftgs.ply` cannot hold; their archives hold frames.
+    /// Reopener of this file, which opens the `.ftgs.ply` in an archive of the file. `None` for Gaussians without
+    /// windows of time, which a `.ftgs.ply` cannot hold; their archives hold frames.
     reopener: Option<Reopener>,
 }
 

@@ -113,7 +113,7 @@ impl Rounds {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
-    /// buffers for rendering all survivors.
+    /// buffers for rendering all survivors (Gaussians left by pruning).
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);

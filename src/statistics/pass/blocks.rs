@@ -19,8 +19,8 @@ pub(crate) struct BlockScans<'a> {
     /// Numbers of the blocks of Gaussians to scan.
     pub(crate) blocks: Range<usize>,
     pub(crate) progress: Progress,
-    /// Number of Gaussians alive in each frame, summed over finished blocks. The sums are integers, so the order in
-    /// which blocks finish does not matter.
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in each frame, summed over finished blocks. The sums are
+    /// integers, so the order in which blocks finish does not matter.
     pub(crate) alive: Mutex<Vec<u32>>,
 }
 

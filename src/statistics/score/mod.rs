@@ -102,8 +102,8 @@ impl ScoredQuantity {
 
 /// Computes the scores of `rows`, which come from a sequence of `frames` frames.
 ///
-/// Rows with [`AnomalyFlags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy `rows.e`
-/// is used only if its weight λ is above 0. An empty list of rows gives empty scores.
+/// Rows with [`AnomalyFlags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy
+/// `rows.e` is used only if its weight λ is above 0. An empty list of rows gives empty scores.
 pub fn score(rows: &StatisticRows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
