@@ -45,8 +45,8 @@ pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
 pub struct ScoreStage {
     /// Whether motion that could be rounding noise of the positions is set to zero.
     pub snap_noise: bool,
-    /// Policy for Gaussians with NaN or infinity in an attribute: stop with an error, drop them, or keep them
-    /// unchanged.
+    /// Policy for Gaussians with NaN or infinity in an attribute: the run stops with an error, drops them, or keeps
+    /// them unchanged.
     pub non_finite: NonFinite,
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
@@ -83,8 +83,8 @@ pub struct Scored {
     /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
     /// Gaussians.
     pub absent: Vec<u32>,
-    /// Reference frame (the frame in which most Gaussians are alive (opacity ≥ alpha_min), at which Gaussians are
-    /// compared for merging), and the extent of the scene at this frame.
+    /// Reference frame, at which Gaussians are compared for merging (the frame with the most Gaussians alive, opacity ≥
+    /// alpha_min), and the extent of the scene at this frame.
     pub reference: ReferenceFrame,
     /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
     /// coordinate.

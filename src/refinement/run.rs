@@ -110,7 +110,7 @@ struct EpochSampler {
     pictures: Vec<usize>,
     at: usize,
     random: SplitMix64,
-    /// Number of views taken since the beginning.
+    /// Number of views taken from the random order so far, over all epochs.
     taken: usize,
 }
 
@@ -200,7 +200,7 @@ struct BestState<Delta, Trajectory> {
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
-    /// Number of deltas in the mean.
+    /// Number of deltas over which the mean is taken so far.
     count: u32,
 }
 

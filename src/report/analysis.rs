@@ -13,7 +13,7 @@ pub(super) struct Analysis {
     pub(super) run: RunFiles,
     /// Renders that the page shows, as images.
     pub(super) shown: Vec<ShownImage>,
-    /// Animations that the page shows.
+    /// Animations that the page shows for this compressed model.
     pub(super) films: Vec<FilmPanel>,
     /// Images of the places with the worst damage: one pair of images for each failure mode that can be judged.
     pub(super) close: Vec<WorstPlaceImages>,

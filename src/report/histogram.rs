@@ -19,7 +19,7 @@ const BINS: usize = 40;
 /// bin.
 const DEEPEST: f64 = 1e-8;
 
-/// Three values, one for each fate of Gaussians: kept, merged, dropped.
+/// One value for each fate of Gaussians: kept, merged, dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ByFate<T> {
     /// Value for Gaussians that remain unchanged.

@@ -31,7 +31,8 @@ const LEVEL: i32 = 15;
 /// Initial error bounds of position, rotation, log scale, opacity and SH: for positions as a fraction of the scene
 /// extent, for the others in the units of the attributes. They are finer than most final bounds.
 const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Maximum ratio of a final error bound to its initial one; with wider bounds no motion and no color would remain.
+/// Maximum ratio of a final error bound to its initial one; with wider bounds, rounding would remove all motion and all
+/// differences of color.
 const MAX_WIDENING: f64 = 64.0;
 /// Maximum number of blocks of Gaussians that are encoded to count the bits of every attribute.
 const COUNTED_BLOCKS: usize = 4;

@@ -73,7 +73,7 @@ const FOLLOWED_FRACTION: f64 = 0.3;
 pub(crate) struct MergeStage {
     /// Parameters of the tests for similarity, of the merge passes and of the proxies.
     pub recipe: recipe::MergeParams,
-    /// Parameters of the scan, which define in which frames a Gaussian is alive (opacity ≥ alpha_min) (its life span)
+    /// Parameters of the scan, which define in which frames a Gaussian is alive (its life span: opacity ≥ alpha_min)
     /// and how motion between frames is measured.
     pub scan: recipe::ScanParams,
     /// Whether survivors (Gaussians left by pruning) may be pruned in addition to merging, to reach the requested
