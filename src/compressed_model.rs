@@ -137,7 +137,7 @@ impl TrajectoryDelta {
         self.0.first().map_or(Attributes::empty(), ParamDelta::attributes)
     }
 
-    /// Returns the delta at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
+    /// Returns the change at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
     /// if there are no keyframes.
     pub fn at_frame(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
@@ -258,8 +258,8 @@ impl CompressedModel {
         }
     }
 
-    /// Returns the sum of the constant delta and the trajectory delta at frame `frame` of a sequence of `frames`
-    /// frames.
+    /// Returns the total change of the Gaussians at frame `frame` of a sequence of `frames` frames: the sum of the
+    /// constant delta and of the trajectory delta at this frame.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.trajectory_delta.at_frame(frame, frames).plus(self.delta.clone())

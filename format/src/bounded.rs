@@ -328,7 +328,7 @@ impl BoundedTracks {
         }
     }
 
-    /// Returns the bytes of heap memory that this value takes.
+    /// Returns the bytes of heap memory that the list of exceptions (values stored with their original bits) takes.
     pub(crate) fn memory(&self) -> usize {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }

@@ -22,10 +22,11 @@ const OFFSET_UNIT: f64 = 4.0;
 /// Maximum absolute offset, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
-/// Returns for each tensor the offsets that are added to the exponent of its quantization step, in eighths of an
-/// octave: one per channel of a plane; for a matrix one per row, followed by one per column. `position` holds the
-/// canonical positions, `space` is the box that the planes cover, `times` are the first and last time. Returns an empty
-/// map if the field has no planes or an unknown structure.
+/// Returns, for each tensor of the deformation field, the offsets of its quantization steps, in eighths of an octave:
+/// the exponent (base 2) of a step is changed by these amounts. A plane of features has one offset per channel; a
+/// matrix has one per row, followed by one per column. `position` holds the canonical positions, `space` is the box
+/// that the planes cover, `times` are the first and last time. Returns an empty map if the field has no planes or an
+/// unknown structure.
 pub fn step_offsets(
     field: &BTreeMap<String, TensorRole>,
     tensors: &Tensors,

@@ -138,8 +138,8 @@ pub struct ObservedOrder {
 /// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
 /// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Name of the error: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the
-/// finest setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
+/// Name of the error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
+/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
 /// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
 /// setting keeps.

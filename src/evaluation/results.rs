@@ -90,7 +90,8 @@ pub struct FrameMeans {
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// Means of the scores over the views of this frame. Temporal errors are those since the previous evaluated frame.
+    /// Means of the scores over the views of this frame. The temporal error (flicker) of a view compares it with the
+    /// previous evaluated frame.
     #[serde(flatten)]
     pub means: QualityMeans,
 }

@@ -26,7 +26,7 @@ pub struct ByFate<T> {
     pub kept: T,
     /// Value for Gaussians that were merged into a proxy (Gaussian that replaces a cluster).
     pub merged: T,
-    /// Value for Gaussians that were removed.
+    /// Value for Gaussians that were removed without being merged.
     pub dropped: T,
 }
 

@@ -24,8 +24,8 @@ pub(in crate::models) struct Reopener {
 }
 
 impl Reopener {
-    /// Creates a reopener from the function `open` and the options `options` with which a model was opened. It opens
-    /// archives of this model in the same way.
+    /// Creates a value that opens archives of a model with the function `open` and the options `options`, with which
+    /// the model itself was opened.
     pub(in crate::models) fn new(
         open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
         options: &OpenOptions,

@@ -123,7 +123,7 @@ impl Params {
         &self.npz
     }
 
-    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened.
+    /// Returns the value that opens archives of the model in the way in which the model itself was opened.
     pub(super) fn reopener(&self) -> &Reopener {
         &self.reopener
     }

@@ -135,7 +135,7 @@ impl<L: ProxyRule> CheckpointModel<L> {
         found
     }
 
-    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened. Fails if
+    /// Returns the value that opens archives of the model in the way in which the model itself was opened. Fails if
     /// there is none.
     fn reopener(&self) -> Result<&Reopener> {
         self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))

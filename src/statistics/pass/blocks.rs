@@ -44,7 +44,8 @@ impl<'a> BlockScans<'a> {
         wanted(frame, self.source.info().varying)
     }
 
-    /// Returns a scan of block `block` without frames, and a buffer for the block's attributes at one frame.
+    /// Returns a scan of block `block` that has not read any frame yet, and a buffer for the attributes of the block at
+    /// one frame.
     pub(crate) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
         let range = self.range(block);
         let state = Gaussians::zeros(range.len(), self.source.info().sh_degree);
