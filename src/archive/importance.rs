@@ -222,8 +222,9 @@ struct Samples {
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each; `None` if the planes are
-    /// missing or malformed.
+    /// Evaluates the feature planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each, and returns the
+    /// resulting inputs of the trunk (the layers that all heads share). Returns `None` if the planes are missing or
+    /// malformed.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();

@@ -317,10 +317,11 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes the frames `frames` of `source` as one frame block. `presence` holds the [`BlockChange`] of each block of
-/// Gaussians in these frames. Calls `each` for every tile in the order of the container, with the index of its block of
-/// Gaussians, the index of its column, and the tile; `None` means that the tile equals that of the frame block before.
-/// Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
+/// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `presence`
+/// tells for each block of Gaussians which of its values have to be encoded. Calls `each` for every tile in the order
+/// of the container, with the index of its block of Gaussians, the index of its column, and the tile; `None` means that
+/// the tile equals that of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians ×
+/// frames) encoded since the last call.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,

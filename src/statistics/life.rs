@@ -64,7 +64,8 @@ impl LifeSpans {
         self.alive
     }
 
-    /// Adds the frames counted by `repeats` to the counts in `frames`; must be called before results are read.
+    /// Adds the repeated frames that were counted so far to the number of frames in which each Gaussian is alive
+    /// (opacity ≥ alpha_min). Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {

@@ -148,8 +148,9 @@ impl Field {
     }
 }
 
-/// Returns the index of the first plane (scalar component) that belongs to a column, that is, to values beyond the
-/// standard attributes. In an archive, the planes of the attributes come first; their number depends on the SH degree.
+/// Returns the index, in an archive, of the first plane (scalar component) after those of the standard attributes. The
+/// planes from this index on hold values that only the model's format has. `sh_degree` determines the number of planes
+/// of the standard attributes.
 pub(super) fn first_column_plane(sh_degree: usize) -> usize {
     first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
 }

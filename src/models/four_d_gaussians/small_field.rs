@@ -18,7 +18,8 @@ const MIN_HALF_VALUES: usize = 1024;
 /// Rounding of values within range stays below it; values too large or too small for half precision exceed it.
 const MAX_ERROR: f64 = 1.0 / 2048.0;
 
-/// Returns the tensors with the values that are read back after storage in half precision.
+/// Returns `tensors` with the values that are read back after storage in half precision. Tensors that are not stored in
+/// half precision (small ones, and values out of its range) are unchanged.
 pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     for tensor in tensors.values_mut() {
         if let Some(halves) = halves(tensor) {

@@ -75,7 +75,8 @@ pub(super) trait MotionModel: Debug + Send + Sync {
 
 /// Computes colors of pixels from rendered features.
 pub(super) trait Shading: Sync {
-    /// Returns the features of the Gaussians `raw` at `time`, feature by feature.
+    /// Returns the features of the Gaussians `raw` at `time`, from which the color of a pixel is computed after
+    /// blending: one plane per feature, with its value for every Gaussian.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues;
 
     /// Returns the color of a pixel from its blended `features`, seen from the camera center `center` along the unit
