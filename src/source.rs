@@ -262,8 +262,9 @@ pub trait BlockReader: Send {
     /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later
-    /// calls of [`BlockReader::read`] only have to copy values. Does so only for frames that the reader may keep.
+    /// Decodes the attributes `_want` at frame `_frame`, and at the frames that are stored in one block with it, so
+    /// that later calls of [`BlockReader::read`] only have to copy values. Does nothing for frames that the reader may
+    /// not keep in memory.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }

@@ -162,7 +162,8 @@ impl Multiples {
         Multiples { plane, step, halvings, values: multiples, moves, exceptions }
     }
 
-    /// Returns the number of static tracks, whose values are all stored as one multiple.
+    /// Returns the number of static tracks: components of a Gaussian whose values in all frames are stored as one
+    /// number.
     fn static_tracks(&self) -> usize {
         self.moves.iter().filter(|&&moves| !moves).count()
     }

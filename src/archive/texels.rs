@@ -11,8 +11,8 @@ use crate::model::AttributeValues;
 /// Exponent of class 0. The exponent of a texel is the floor of log2 of its squared interpolation weights, summed over
 /// the Gaussians that read it. Texels with a smaller exponent also belong to class 0.
 const MIN_EXPONENT: i32 = -8;
-/// Number of classes of texels. Each class is one octave of the squared interpolation weights, summed over the
-/// Gaussians that read a texel.
+/// Number of classes of texels. A class holds the texels of one octave of the sum of squared interpolation weights,
+/// taken over the Gaussians that read the texel; it selects their quantization grid.
 pub(super) const CLASSES: usize = 16;
 
 /// Returns the octave that belongs to the texel class `class`: log2, rounded down, of the squared interpolation weights

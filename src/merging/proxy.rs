@@ -63,7 +63,7 @@ impl ProxyState {
 pub struct Importance<'a> {
     /// Id of each row of the table of Gaussians.
     pub ids: &'a [u32],
-    /// Contribution C (mean share in the renders, pixels) of each id.
+    /// Mean contribution C of each id to a render, in pixels.
     pub coverage: &'a [f64],
     /// Visibility Vis (share of the views in which the Gaussian is on screen) of each id.
     pub visibility: &'a [f64],

@@ -144,8 +144,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds the frames counted by `steady` to `steps`, `turns` and `history`, and sets the sums of Gaussians that are
-    /// not alive to 0; must be called before results are read.
+    /// Adds the frames with unchanged opacities that were counted so far to the numbers of steps and turns of each
+    /// Gaussian. Sets the sums of steps and turns of Gaussians that are not alive (opacity ≥ alpha_min) to 0. Must be
+    /// called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
