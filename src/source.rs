@@ -263,8 +263,8 @@ pub trait BlockReader: Send {
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Decodes the attributes `_want` at frame `_frame`, and at the frames that are stored in one block with it, so
-    /// that later calls of [`BlockReader::read`] only have to copy values. Decodes nothing for frames that the reader may
-    /// not keep in memory.
+    /// that later calls of [`BlockReader::read`] only have to copy values. Decodes nothing for frames that the reader
+    /// may not keep in memory.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }
