@@ -83,7 +83,7 @@ fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
     let mut count_neighbors = |row: u32| {
         nearest.start_query(row, position.row(row as usize), NEIGHBORS + 1, epsilon);
         tree.search(&points, &mut nearest);
-        nearest.sorted().len().min(NEIGHBORS)
+        nearest.sort_by_distance().len().min(NEIGHBORS)
     };
     order.into_iter().map(&mut count_neighbors).sum()
 }

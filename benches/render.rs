@@ -33,7 +33,7 @@ use std::time::Instant;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3, Quat, Vec3};
 use splatsieve::diagnostics::demo_scene::DemoScene;
-use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
+use splatsieve::diagnostics::selfcheck::oracle::render as oracle;
 use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};

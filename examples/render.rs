@@ -12,7 +12,7 @@ use splatsieve::files::image::write::{ImageFormat, write_image};
 use splatsieve::model::Attributes;
 use splatsieve::passes::gather_all;
 use splatsieve::render::render;
-use splatsieve::scene::pictures::{ViewSet, select_views};
+use splatsieve::scene::view_selection::{ViewSet, select_views};
 use splatsieve::scene::{InputOptions, open_scene};
 
 fn main() -> Result<(), Box<dyn Error>> {

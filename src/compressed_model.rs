@@ -9,7 +9,8 @@ use crate::recipe::{FieldPrecision, MergeParams};
 /// Reference frame, at which Gaussians are compared for merging, and the extent of the scene at this frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceFrame {
-    /// Index of the frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
+    /// Index of the frame with the most Gaussians alive (opacity ≥ alpha_min); the first one in a tie; 0 if there are
+    /// no frames.
     pub frame: usize,
     /// Longest side of the box between the 1st and the 99th percentile of the positions at this frame, scene units.
     pub extent: f64,
@@ -136,7 +137,7 @@ impl TrajectoryDelta {
         self.0.first().map_or(Attributes::empty(), ParamDelta::attributes)
     }
 
-    /// Returns the delta at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
+    /// Returns the change at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
     /// if there are no keyframes.
     pub fn at_frame(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
@@ -215,7 +216,7 @@ impl CompressedModel {
     }
 
     /// Sets the computed `proxies`. Clusters for which no proxy was good enough ([`Proxies::refused`]) are dissolved:
-    /// the leader stays unchanged, the other members are removed.
+    /// the leader (most important Gaussian of the cluster) stays unchanged, the other members are removed.
     pub fn set_proxies(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
@@ -257,8 +258,8 @@ impl CompressedModel {
         }
     }
 
-    /// Returns the sum of the constant delta and the trajectory delta at frame `frame` of a sequence of `frames`
-    /// frames.
+    /// Returns the total change of the Gaussians at frame `frame` of a sequence of `frames` frames: the sum of the
+    /// constant delta and of the trajectory delta at this frame.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.trajectory_delta.at_frame(frame, frames).plus(self.delta.clone())

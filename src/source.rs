@@ -70,7 +70,7 @@ impl ReadPlan {
     /// Returns a copy of this plan with the limit `frames` (at least 1): the maximum number of frames that a reader
     /// keeps in memory after it has decoded a tile. A tile holds several consecutive frames. A small limit saves memory
     /// but makes the reader decode tiles repeatedly.
-    pub fn keeping_at_most(self, frames: usize) -> ReadPlan {
+    pub fn with_max_kept_frames(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
@@ -205,8 +205,8 @@ pub trait Deformation: Sync {
     /// [`DeformedGaussians::jacobian`] can compute.
     fn movable(&self) -> Attributes;
 
-    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. What does not depend on
-    /// time is computed here, once.
+    /// Returns the Gaussians with the parameters `stored`, to be evaluated at several frames. This call does all the
+    /// work that does not depend on time.
     fn with_params<'a>(&'a self, stored: &'a StoredParams) -> Box<dyn DeformedGaussians + 'a>;
 }
 
@@ -262,8 +262,9 @@ pub trait BlockReader: Send {
     /// the reader may keep in memory. Readers that keep no frames ignore the plan.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Decodes the attributes `_want` at `_frame`, and at the frames that are decoded together with it, so that later
-    /// calls of [`BlockReader::read`] only have to copy values. Does so only for frames that the reader may keep.
+    /// Decodes the attributes `_want` at frame `_frame`, and at the frames that are stored in one block with it, so
+    /// that later calls of [`BlockReader::read`] only have to copy values. Decodes nothing for frames that the reader
+    /// may not keep in memory.
     fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }
@@ -275,7 +276,7 @@ mod tests {
 
     #[test]
     fn unplanned_frames_are_read_alone() {
-        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).keeping_at_most(0);
+        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).with_max_kept_frames(0);
         assert_eq!(wanted.max_kept_frames(), 1);
         assert_eq!(wanted.frames_between(3, 32), [3, 9, 31]);
         assert_eq!(wanted.frames_between(9, 32), [9, 31]);

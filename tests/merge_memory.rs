@@ -9,10 +9,10 @@ use std::path::Path;
 
 use splatsieve::diagnostics::demo_scene::DemoScene;
 use splatsieve::files::container::Container;
-use splatsieve::merging::known::BYTES_PER_CACHED_PAIR;
 use splatsieve::merging::motion::MotionThresholds;
 use splatsieve::merging::motion_pass::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
 use splatsieve::merging::neighbors::PointIndex;
+use splatsieve::merging::similarity_cache::BYTES_PER_CACHED_PAIR;
 use splatsieve::merging::tree::TreePoint;
 use splatsieve::model::Attributes;
 use splatsieve::outputs::container::write_container;

@@ -46,7 +46,7 @@ fn reading_raw_tiles_keeps_no_pages_resident() {
     }
     // Frame by frame.
     let mut frames =
-        FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::all_frames().keeping_at_most(1))
+        FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::all_frames().with_max_kept_frames(1))
             .unwrap();
     let mut state = frames.state_buffer();
     for frame in 0..FRAMES {

@@ -162,7 +162,8 @@ impl Multiples {
         Multiples { plane, step, halvings, values: multiples, moves, exceptions }
     }
 
-    /// Returns the number of static tracks, whose values are all stored as one multiple.
+    /// Returns the number of static tracks: components of a Gaussian whose values in all frames are stored as one
+    /// number.
     fn static_tracks(&self) -> usize {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
@@ -328,7 +329,7 @@ impl BoundedTracks {
         }
     }
 
-    /// Returns the bytes of heap memory that this value takes.
+    /// Returns the bytes of heap memory that the list of exceptions (values stored with their original bits) takes.
     pub(crate) fn memory(&self) -> usize {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }

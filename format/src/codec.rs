@@ -318,8 +318,8 @@ impl TileDecoder {
         }
     }
 
-    /// Decodes the multiples of the next frame of a tile in the lossy encoding. The multiples of static tracks, which
-    /// are stored once, do not change after the first frame.
+    /// Decodes the values of the next frame of a tile in the lossy encoding, as multiples of the quantization step.
+    /// Values that are the same in all frames are stored once and are decoded at the first frame only.
     fn step_multiples(&mut self) {
         let [before, second_before] = &mut self.recent;
         if self.next == 0 {

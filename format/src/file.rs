@@ -97,7 +97,7 @@ impl MappedFile {
     /// reads wait for the disk.
     pub(crate) fn will_need(&self, range: std::ops::Range<u64>) {
         if !range.is_empty() {
-            splat_platform::expect_pages(&self.map, range.start as usize..range.end as usize);
+            splat_platform::prefetch_pages(&self.map, range.start as usize..range.end as usize);
         }
     }
 

@@ -12,7 +12,7 @@ use crate::record::{Digest, RECORD_BYTES, Record, TileRecord};
 pub(crate) struct Index {
     pub(crate) offset: u64,
     pub(crate) tiles: u64,
-    /// Number of frames T of the sequence.
+    /// Number T of frames of the sequence.
     pub(crate) frames: u64,
     /// Byte range of the file in which the stored bytes of tiles may lie.
     pub(crate) payloads: Range<u64>,

@@ -31,9 +31,10 @@ pub struct RecoverReport {
     pub bytes_skipped: u64,
 }
 
-/// Writes a valid container `dst` with the frame blocks of the damaged container `src`, up to the first frame block
-/// that lacks its time stamps or a tile. Every value keeps its bits. After a damaged record, every multiple of 64 bytes
-/// is tried as the start of the next. Memory: about 150 bytes per tile, the time stamps, and one tile buffer.
+/// Recovers a damaged container and returns a report. Writes a valid container `dst` with the frame blocks of the
+/// damaged container `src`, up to the first frame block that lacks its time stamps or a tile. Every value keeps its
+/// bits. After a damaged record, every multiple of 64 bytes is tried as the start of the next. Memory: about 150 bytes
+/// per tile, the time stamps, and one tile buffer.
 ///
 /// Fails if the header of `src` is damaged or `dst` cannot be written. If no frame can be saved, `dst` has no frames
 /// and the report says so; that is not an error.

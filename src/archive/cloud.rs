@@ -88,7 +88,7 @@ enum PlaneSource {
     Column(usize, usize),
 }
 
-/// Returns the planes of the attributes in coding order, without the position.
+/// Returns the planes (scalar components) of the attributes in coding order, without the three of the position.
 fn attribute_planes(sh_degree: usize) -> Vec<Plane> {
     let plane = |attribute, c, group| Plane { source: PlaneSource::Attribute(attribute, c), group };
     let mut planes: Vec<_> = (0..4).map(|c| plane(Attributes::ROTATION, c, 1)).collect();
@@ -118,7 +118,8 @@ impl PointCloudShape {
         self.columns.iter().try_fold(attributes, |sum, column| sum.checked_add(column.planes))
     }
 
-    /// Returns the planes in coding order, without the position. The shape must be sound.
+    /// Returns the planes in coding order, without the position. The parameters must have passed
+    /// [`PointCloudShape::is_sound`].
     fn planes(&self) -> Vec<Plane> {
         let mut planes = attribute_planes(self.sh_degree);
         for (k, column) in self.columns.iter().enumerate() {
@@ -172,9 +173,9 @@ fn gather(x: u64) -> u64 {
     x
 }
 
-/// Rounds all positions to `grid`. Returns three things: every position less the minimum on each axis; this minimum;
-/// and the number of low bits of a coordinate that the Morton curve does not use. Positions and minimum are in
-/// quantization steps.
+/// Rounds all positions to `grid`, and measures them in quantization steps from the minimum on each axis. Returns the
+/// measured positions; the minimum, in quantization steps; and the number of low bits of a coordinate that the Morton
+/// curve leaves out, so that its index fits into 64 bits.
 fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
@@ -191,9 +192,9 @@ fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
 }
 
 /// Encodes the Gaussians `cloud` with the quantization steps `steps` of their attributes, and the further values
-/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for each
-/// Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and column to
-/// `bits`.
+/// `columns` with the steps `column_steps`. Returns the parameters for decoding, the entropy-coded symbols, and for
+/// each Gaussian in the new order its index in `cloud`. Adds the approximate number of bits of every attribute and
+/// column to `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     columns: &[Column],
@@ -265,7 +266,7 @@ pub(super) fn encode(
 }
 
 /// Decodes the Gaussians and their further columns from their symbols `bytes`; `None` if the bytes do not match
-/// `shape`, which must be sound.
+/// `shape`, which must have passed [`PointCloudShape::is_sound`].
 pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians, Vec<Column>)> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
@@ -310,12 +311,12 @@ struct CurveDistances {
 }
 
 impl CurveDistances {
-    /// Returns models that have seen no distance yet.
+    /// Creates the entropy models of distances along the Morton curve. At first, all symbols are equally probable.
     fn new() -> CurveDistances {
         CurveDistances { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
     }
 
-    /// Writes a distance to `to` and updates the models.
+    /// Writes a distance along the Morton curve to `to`, and adapts the entropy models to it.
     fn encode(&mut self, distance: u64, to: &mut SymbolEncoder) {
         let length = 64 - distance.leading_zeros();
         to.symbol(&mut self.high, length as usize / SYMBOLS);
@@ -323,7 +324,7 @@ impl CurveDistances {
         to.long_bits(distance, length.saturating_sub(1));
     }
 
-    /// Reads a distance from `from` and updates the models.
+    /// Reads a distance along the Morton curve from `from`, and adapts the entropy models to it.
     fn decode(&mut self, from: &mut SymbolDecoder<'_>) -> u64 {
         let high = from.symbol(&mut self.high) & 3;
         let length = (high * SYMBOLS + from.symbol(&mut self.low[high])) as u32;
@@ -345,7 +346,7 @@ struct PlaneCoder {
 }
 
 impl PlaneCoder {
-    /// Returns the state before the first plane is coded, for `count` Gaussians.
+    /// Creates the coder of the planes (scalar components) of `count` Gaussians. No plane has been coded yet.
     fn new(count: usize) -> PlaneCoder {
         let none = || vec![0.0; count];
         PlaneCoder { known: [none(), none()], sizes: none(), group: usize::MAX, models: Residuals::new() }

@@ -247,7 +247,9 @@ impl<'a> SymbolDecoder<'a> {
         bit
     }
 
-    /// Moves the state past a symbol with this start and length of its interval, which contains `place`.
+    /// Removes the symbol that was just decoded from the state of the ANS coder, and reads a 32-bit word of the input
+    /// if the state has become too small. `place` is the value (in units of 1/2^15) by which the symbol was found; it
+    /// lies in the interval of the symbol, given by its start and length.
     #[inline(always)]
     fn advance(&mut self, place: u32, (start, length): (u32, u32)) {
         self.state = u64::from(length) * (self.state >> PRECISION) + u64::from(place - start);

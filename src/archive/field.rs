@@ -110,7 +110,8 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the number of places (rows times columns) of a tensor with several channels; 0 for other tensors.
+    /// Returns the number of places (row, column) of a feature plane, each of which holds one value per channel: rows
+    /// times columns. Returns 0 for a tensor with a single channel.
     pub(super) fn places(&self) -> usize {
         let [channels, rows, columns] = self.extents();
         if channels > 1 { rows.saturating_mul(columns) } else { 0 }
@@ -152,8 +153,9 @@ impl TensorEntry {
         }
     }
 
-    /// Returns the quantization grid for values of class `class` in channel `channel`. The class of a weight is the sum
-    /// of its row and column offsets, the class of a texel its octave of summed squared interpolation weights.
+    /// Returns the quantization grid of a value in channel `channel` with the class `class`. The class is a number that
+    /// an archive derives for each value: for a weight, the sum of the step offsets of its row and its column; for a
+    /// texel, the octave of its squared interpolation weights, summed over the Gaussians that read it.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
             TensorRole::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
@@ -164,8 +166,8 @@ impl TensorEntry {
         })
     }
 
-    /// Returns the class of each weight, row by row: [`ZERO_OFFSET_CLASS`] plus the offsets of the weight's row and
-    /// column.
+    /// Returns the class of each weight, row by row. The class determines the quantization step: it is
+    /// [`ZERO_OFFSET_CLASS`] plus the step offsets of the weight's row and column.
     fn weight_classes(&self) -> Vec<u8> {
         let [_, rows, columns] = self.extents();
         let (row_offsets, column_offsets) = self.channels.split_at(self.channels.len().saturating_sub(columns));

@@ -10,7 +10,7 @@
 use std::collections::BTreeMap;
 
 use super::field::TensorRole;
-use crate::deform::{Box3, Tap, Tensor, Tensors, tap};
+use crate::deform::{Box3, Tensor, Tensors, TexelPair, texel_pair};
 use crate::model::AttributeValues;
 
 /// Maximum number of Gaussians at which the field is sampled.
@@ -22,10 +22,11 @@ const OFFSET_UNIT: f64 = 4.0;
 /// Maximum absolute offset, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
-/// Returns for each tensor the offsets that are added to the exponent of its quantization step, in eighths of an
-/// octave: one per channel of a plane; for a matrix one per row, followed by one per column. `position` holds the
-/// canonical positions, `space` is the box that the planes cover, `times` are the first and last time. Returns an empty
-/// map if the field has no planes or an unknown structure.
+/// Returns, for each tensor of the deformation field, the offsets of its quantization steps, in eighths of an octave:
+/// the exponent (base 2) of a step is changed by these amounts. A plane of features has one offset per channel; a
+/// matrix has one per row, followed by one per column. `position` holds the canonical positions, `space` is the box
+/// that the planes cover, `times` are the first and last time. Returns an empty map if the field has no planes or an
+/// unknown structure.
 pub fn step_offsets(
     field: &BTreeMap<String, TensorRole>,
     tensors: &Tensors,
@@ -210,7 +211,7 @@ fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
 struct Samples {
     /// Number of inputs of the trunk (the layers that all heads share).
     width: usize,
-    /// Inputs of the trunk, `[samples, width]`.
+    /// Inputs of the trunk (the layers that all heads share), `[samples, width]`.
     features: Vec<f32>,
     /// For every plane: its name, the index of its first channel among the inputs, and for each channel the sum over
     /// all samples of the squared product of the five other planes.
@@ -221,8 +222,9 @@ struct Samples {
 const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
-    /// Evaluates the planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each; `None` if the planes are
-    /// missing or malformed.
+    /// Evaluates the feature planes for at most [`GAUSSIANS`] Gaussians at [`TIMES`] times each, and returns the
+    /// resulting inputs of the trunk (the layers that all heads share). Returns `None` if the planes are missing or
+    /// malformed.
     fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
@@ -276,7 +278,7 @@ impl Samples {
 /// bilinearly.
 fn read(plane: &Tensor, axes: [usize; 2], at: [f32; 4]) -> Vec<f32> {
     let [channels, rows, columns] = [plane.shape[1], plane.shape[2], plane.shape[3]];
-    let (a, b): (Tap, Tap) = (tap(at[axes[0]], columns), tap(at[axes[1]], rows));
+    let (a, b): (TexelPair, TexelPair) = (texel_pair(at[axes[0]], columns), texel_pair(at[axes[1]], rows));
     let interpolated = |channel: usize| {
         let texel = |row: u32, column: u32| plane.data[(channel * rows + row as usize) * columns + column as usize];
         let along = |row: u32| texel(row, a.low) * (1.0 - a.fraction) + texel(row, a.high) * a.fraction;

@@ -59,7 +59,7 @@ impl QuantizedTensor<'_> {
         sum / count.max(1) as f64
     }
 
-    /// Returns the class of every place in `row`.
+    /// Returns, for each place in row `row`, the class that selects its quantization grid (`TensorEntry::grid`).
     fn row_classes(&self, row: usize) -> &[u8] {
         if self.classes.len() == self.columns {
             self.classes

@@ -33,7 +33,8 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
 /// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all others.
+/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all
+/// others.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.
@@ -46,7 +47,7 @@ pub(super) struct Residuals {
 }
 
 impl Residuals {
-    /// Returns models that have seen no error yet.
+    /// Creates the entropy models of prediction errors. At first, all symbols are equally probable.
     pub(super) fn new() -> Residuals {
         Residuals { classes: [SymbolModel::NEW; CONTEXTS], signs: [const { [BitModel::NEW; SIGN_CONTEXTS] }; OFFSETS] }
     }
@@ -59,7 +60,8 @@ impl Residuals {
         &mut self.classes[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Returns the entropy model of the sign of an error whose magnitude has the class `class`, which is not 0.
+    /// Returns the entropy model of the sign of a prediction error. `class` is the class of its magnitude (the length
+    /// of its bits), which is not 0; `offset` is the fractional part of the prediction, in classes.
     fn sign_model(&mut self, offset: usize, class: usize) -> &mut BitModel {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
     }

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::*;
-use crate::deform::{Tensor, tap};
+use crate::deform::{Tensor, texel_pair};
 use crate::model::AttributeValues;
 
 /// Generator of deterministic pseudo-random numbers.
@@ -136,7 +136,7 @@ proptest! {
             let [rows, columns] = [7usize, 9];
             for i in 0..count {
                 let u = space.normalized(back.cloud.position.row(i));
-                let (p, q) = (tap(u[axes[0]], columns), tap(u[axes[1]], rows));
+                let (p, q) = (texel_pair(u[axes[0]], columns), texel_pair(u[axes[1]], rows));
                 for (row, b) in [(q.low, 1.0 - q.fraction), (q.high, q.fraction)] {
                     for (column, a) in [(p.low, 1.0 - p.fraction), (p.high, p.fraction)] {
                         let weight = f64::from(a * b);

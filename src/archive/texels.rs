@@ -5,18 +5,19 @@
 //! Sums and products of f32 in a fixed order give the same classes on every machine.
 
 use super::quantized_tensor::UNREAD;
-use crate::deform::{Box3, tap};
+use crate::deform::{Box3, texel_pair};
 use crate::model::AttributeValues;
 
 /// Exponent of class 0. The exponent of a texel is the floor of log2 of its squared interpolation weights, summed over
 /// the Gaussians that read it. Texels with a smaller exponent also belong to class 0.
 const MIN_EXPONENT: i32 = -8;
-/// Number of classes of texels. Each class is one octave of the squared interpolation weights, summed over the
-/// Gaussians that read a texel.
+/// Number of classes of texels. A class holds the texels of one octave of the sum of squared interpolation weights,
+/// taken over the Gaussians that read the texel; it selects their quantization grid.
 pub(super) const CLASSES: usize = 16;
 
-/// Returns log2, rounded down, of the squared interpolation weights of a texel of class `class`, summed over the
-/// Gaussians that read it. A texel that is read once with weight 1 has 0.
+/// Returns the octave that belongs to the texel class `class`: log2, rounded down, of the squared interpolation weights
+/// with which Gaussians read the texel, summed over these Gaussians. A texel that is read once with weight 1 has octave
+/// 0.
 pub(super) fn octaves(class: u8) -> i32 {
     i32::from(class) + MIN_EXPONENT
 }
@@ -37,7 +38,7 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
     let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
         let u = space.normalized(position.row(i));
-        let (a, b) = (tap(u[axes[0]], size[0]), tap(u[axes[1]], size[1]));
+        let (a, b) = (texel_pair(u[axes[0]], size[0]), texel_pair(u[axes[1]], size[1]));
         for (row, in_b) in [(b.low, 1.0 - b.fraction), (b.high, b.fraction)] {
             for (column, in_a) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
                 let weight = in_a * in_b;
@@ -53,7 +54,7 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
 pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {
-        let a = tap(space.normalized(position.row(i))[axis], size);
+        let a = texel_pair(space.normalized(position.row(i))[axis], size);
         for (column, weight) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
             squared_weights[column as usize] += weight * weight;
         }
@@ -64,7 +65,7 @@ pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis:
 /// Returns the range of rows that a plane over time needs for times from `first` to `last`. Rows are times; the plane
 /// has `size` of them.
 pub(super) fn time_rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
-    let (first, last) = (tap(first, size), tap(last, size));
+    let (first, last) = (texel_pair(first, size), texel_pair(last, size));
     let end = if last.fraction > 0.0 { last.high } else { last.low };
     first.low as usize..end as usize + 1
 }

@@ -66,8 +66,8 @@ impl CacheDir {
         Ok(found)
     }
 
-    /// Finds the stored shards of `stage` whose key is not `key`. Returns the descriptions of the inputs to which they
-    /// belong.
+    /// Finds the stored shards (parts of a divided stage) of `stage` whose key is not `key`. Returns the descriptions
+    /// of the inputs to which they belong.
     pub(super) fn foreign_inputs(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
         let is_foreign = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;

@@ -20,11 +20,12 @@ pub struct StoredResult {
     pub stage: String,
     /// Cache key of the result, 32 hexadecimal digits.
     pub key: String,
-    /// Number of shards into which the stage was divided; 1: the result is not divided.
+    /// Number of shards (parts of a divided stage) into which the stage was divided; 1: the result is not divided.
     pub parts: usize,
-    /// Indices, counted from 1, of the shards that are not stored.
+    /// Indices, counted from 1, of the shards (parts of a divided stage) that are not stored.
     pub missing: Vec<usize>,
-    /// Indices, counted from 1, of the stored shards that are damaged and will be computed again.
+    /// Indices, counted from 1, of the stored shards (parts of a divided stage) that are damaged and will be computed
+    /// again.
     pub damaged: Vec<usize>,
     /// Number of bytes of all files of the result.
     pub bytes: u64,

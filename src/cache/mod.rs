@@ -87,7 +87,7 @@ impl Cache {
 
     /// Makes all cache keys that are created from now on depend on the ids of the Gaussians that are excluded from the
     /// input, if there are any.
-    pub fn set_absent(&self, ids: &[u32]) {
+    pub fn set_excluded_ids(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
@@ -129,8 +129,8 @@ impl Cache {
     }
 
     /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it. A
-    /// run that is limited to one shard of a divided stage does the same, because `stage` is not divided. To end such a
-    /// run instead, `compute` calls [`Cache::end_shard_before`].
+    /// run that is limited to one shard (part) of a divided stage does the same, because `stage` is not divided. To end
+    /// such a run instead, `compute` calls [`Cache::end_shard_run_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -148,12 +148,12 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends the run by an error if it is limited to one shard of a divided stage. To be called before `stage`, which
-    /// cannot be divided. In all other runs does nothing.
+    /// Ends the run by an error if it is limited to one shard (part) of a divided stage. To be called before `stage`,
+    /// which cannot be divided. In all other runs does nothing.
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
-    pub fn end_shard_before(&self, stage: &str) -> Result<()> {
+    pub fn end_shard_run_before(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(
@@ -231,8 +231,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. If the run is limited to shard 1 of 1, which is the whole stage,
-    /// fails with [`Error::ShardDone`] instead.
+    /// Returns `whole`, the full result of `stage`. If the run is limited to shard (part of a divided stage) 1 of 1,
+    /// which is the whole stage, fails with [`Error::ShardDone`] instead.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {
@@ -302,8 +302,8 @@ impl Cache {
         Err(Error::ShardDone(report))
     }
 
-    /// Adds a note for the user if the folder `dir` holds shards of `stage` that have another key than `key`, because
-    /// they belong to another input or recipe.
+    /// Adds a note for the user if the folder `dir` holds shards (parts of a divided stage) of `stage` that have
+    /// another key than `key`, because they belong to another input or recipe.
     fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in dir.foreign_inputs(stage, key)? {
             self.add_note(format!(
@@ -325,7 +325,8 @@ impl Cache {
     }
 }
 
-/// Returns the indices (1 to `count`) of the shards that are not in `stored`, as text such as `3, 10-20`.
+/// Returns the indices (1 to `count`) of the shards (parts of a divided stage) that are not in `stored`, as text such
+/// as `3, 10-20`.
 fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
     format_ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }

@@ -15,13 +15,13 @@ pub(super) const MAX_SHARDS: usize = 900;
 pub enum Completion<T> {
     /// The run did all its work, with this result.
     Whole(T),
-    /// The run computed one shard and wrote no result. Holds a report for display.
+    /// The run computed one shard (part of a divided stage) and wrote no result. Holds a report for display.
     Shard(String),
 }
 
 impl<T> Completion<T> {
     /// Converts the result of a run: success becomes [`Completion::Whole`], and the error [`Error::ShardDone`], with
-    /// which a run that is limited to one shard ends, becomes [`Completion::Shard`].
+    /// which a run that is limited to one shard (part of a divided stage) ends, becomes [`Completion::Shard`].
     ///
     /// # Errors
     /// Fails if `result` is any other error.
@@ -45,12 +45,12 @@ impl Shard {
     /// Shard 1 of 1, which contains all the work.
     pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
-    /// Returns all shards of a stage divided into `count` shards, in order.
+    /// Returns all shards (parts of a divided stage) of a stage divided into `count` shards, in order.
     pub(super) fn all(count: usize) -> impl Iterator<Item = Shard> {
         (1..=count).map(move |index| Shard { index, count })
     }
 
-    /// Returns the index of the shard, from 1, and the number of shards.
+    /// Returns the index of the shard (part of a divided stage), from 1, and the number of shards.
     pub(super) fn numbers(self) -> (usize, usize) {
         (self.index, self.count)
     }

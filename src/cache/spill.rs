@@ -33,7 +33,8 @@ pub struct SpillWriter {
 }
 
 impl Spill {
-    /// Returns a spill of the bytes of `file` from byte `start` on. `path` is shown in error messages.
+    /// Creates a spill (temporary data on disk) whose content is the bytes of `file` from byte `start` on. `path` is
+    /// shown in error messages.
     pub(super) fn from_file(file: File, start: u64, path: PathBuf) -> Spill {
         Spill { file, start, path }
     }

@@ -178,8 +178,9 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
 #[test]
 fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
-    let run_undivided =
-        |work: &Cache| work.get_or_compute("alone", CacheKey::new(&1), || work.end_shard_before("alone").map(|()| 5u8));
+    let run_undivided = |work: &Cache| {
+        work.get_or_compute("alone", CacheKey::new(&1), || work.end_shard_run_before("alone").map(|()| 5u8))
+    };
     let message = run_undivided(&open_cache(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("the next stage, alone, is not divided"), "{message}");
     assert_eq!(run_undivided(&open_cache(folder.path(), None)).unwrap(), 5);

@@ -126,8 +126,8 @@ pub(super) struct OutputFormat {
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz, .sog,
-    /// .glb, .tsog, .ftgs.ply or .gsd
+    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs, .spz,
+    /// .sog, .glb, .tsog, .ftgs.ply or .gsd
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     #[command(flatten)]
@@ -438,8 +438,8 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd; a folder (the model in an archive, a PLY
-    /// per frame of a sequence, or a model of the input's own format); - for a frame stream on standard output
+    /// NAME.gseq, .ply, .splatv, .4dgs, .spz, .sog, .glb, .tsog, .ftgs.ply or .gsd; a folder (the model in an archive,
+    /// a PLY per frame of a sequence, or a model of the input's own format); - for a frame stream on standard output
     /// (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,

@@ -23,7 +23,7 @@ use splatsieve::error::{Error, ShowPath};
 use splatsieve::files::atomic::{take_warnings, with_user_path};
 use splatsieve::memory_plan;
 
-/// Runs the program on the arguments of this process.
+/// Runs the program on the arguments of this process, and returns its exit code.
 pub(crate) fn main() -> ExitCode {
     let cli = match parse(std::env::args_os()) {
         Ok(cli) => cli,

@@ -31,7 +31,7 @@ use splatsieve::pipeline::{PruneOrMerge, Request, RunOptions, Target};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
-use splatsieve::scene::pictures::ViewSet;
+use splatsieve::scene::view_selection::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
 /// Returns the library's request for the command `compress`. Options that the command line does not give are taken from
@@ -379,7 +379,7 @@ fn view_set(named: SplitArg) -> ViewSet {
     split(named).map_or(ViewSet::All, ViewSet::Split)
 }
 
-/// Returns the cache folder and the shard that the arguments name; `None` without `--cache`.
+/// Returns the cache folder and the shard (part of a divided stage) that the arguments name; `None` without `--cache`.
 pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
     kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
 }

@@ -61,7 +61,7 @@ impl Display {
         Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
     }
 
-    /// Adds a progress bar for `task`, labeled `name`.
+    /// Adds a progress bar for `task`, labeled `name`. Returns the bar.
     fn bar(&self, task: Task<'_>, name: String) -> Bar {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {

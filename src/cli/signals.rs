@@ -1,6 +1,6 @@
 //! Handling of events that interrupt a run: signals, and input files that other programs truncate.
 
-use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps};
+use splat_platform::{TruncatedMapMessage, end_on_signals, report_truncated_maps};
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::remove_unfinished;
 
@@ -10,7 +10,7 @@ use splatsieve::files::atomic::remove_unfinished;
 ///   file, if its path is known.
 pub(super) fn install() {
     end_on_signals(remove_unfinished, |signal| ErrorKind::Interrupted { signal }.exit_code());
-    report_cut_short_maps(TruncatedMapMessage {
+    report_truncated_maps(TruncatedMapMessage {
         before: "splatsieve: ",
         unknown_path: "an input file",
         after: ", end of file: expected the bytes that were there when it was opened, found fewer\n  the file was cut short \

@@ -1,5 +1,5 @@
-//! Writing of an archive, and unpacking of an archive into files that the renderer of the model opens. Part of the command
-//! `convert`.
+//! Writing of an archive, and unpacking of an archive into files that the renderer of the model opens. Part of the
+//! command `convert`.
 
 use std::fs;
 use std::io::Read;
@@ -7,7 +7,7 @@ use std::path::Path;
 
 use crate::TOOL;
 use crate::archive::MAGIC;
-use crate::commands::converted::ConvertReport;
+use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
@@ -16,7 +16,7 @@ use crate::files::open::open_file;
 use crate::journal::Journal;
 use crate::limits::ReadLimit;
 use crate::model::Attributes;
-use crate::models::archive::{is_folder, kind_with_layout, read_archive, unpack};
+use crate::models::archive::{holds_model_folder, read_archive, restored_output_kind, unpack};
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::pipeline::stage::PreparedArchive;
 use crate::pipeline::stages::archive::ArchiveStage;
@@ -39,9 +39,11 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes the model in the archive at `path` to `output` as it was before: a model folder or a single file. Returns
-/// `None` and writes nothing if the model has a layout of its own and `kind` is another kind of output, for which the
-/// model has to be opened.
+/// Writes the model in the archive at `path` to `output` in the form in which it was archived: as a model folder or a
+/// single file. Some archives also hold the file layout of their model format. If such an archive is to become another
+/// kind of output (`kind`), returns `None` and writes nothing; the caller then opens the archive as an input and
+/// converts it.
+///
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
@@ -52,7 +54,7 @@ pub fn unpack_archive(
     memory: ReadLimit,
 ) -> Result<Option<ConvertReport>> {
     let (content, parts) = read_archive(path, memory)?;
-    let with_layout = kind_with_layout(&content, path)?;
+    let with_layout = restored_output_kind(&content, path)?;
     match with_layout {
         Some(own) if own != kind => return Ok(None),
         // Other archives hold a model folder or a PLY.
@@ -75,7 +77,7 @@ pub fn unpack_archive(
             parts.total()
         )],
     };
-    let single = with_layout.map_or(!is_folder(&content), |own| own != OutputKind::Model);
+    let single = with_layout.map_or(!holds_model_folder(&content), |own| own != OutputKind::Model);
     if single {
         check_target(output, TargetKind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
@@ -95,10 +97,11 @@ pub fn unpack_archive(
 }
 
 /// Writes all Gaussians of `input` to the archive `output`. The quantization steps are chosen so that renders of the
-/// archive have about 50 dB PSNR against renders of the input; an archive of frames is a container with error bounds.
+/// archive have about 50 dB PSNR against renders of the input. If the input consists of explicit frames, the archive is
+/// a container with bounded errors, whose bounds are chosen in the same way. Returns the report on the written file.
 ///
-/// # Errors
-/// Fails if the input cannot be read or has no archives, or if the output exists already or cannot be written.
+///  # Errors Fails if the input cannot be read or has no archives, or if the output exists already or cannot be
+/// written.
 pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<ConvertReport> {
     if input.is_stream() {
         return Err(Error::usage(

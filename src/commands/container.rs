@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::cache::{Completion, SpillWriter};
 use crate::commands::archive::is_archive;
-use crate::commands::converted::ConvertReport;
+use crate::commands::convert_report::ConvertReport;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::files::container::Container;
@@ -25,12 +25,12 @@ use crate::models::stream::pack_stream;
 use crate::models::{ColumnInfo, InputModel, ModelSize, TimeOrigin};
 use crate::outputs::bounds::{ErrorBounds, MaxError};
 use crate::outputs::container::{
-    BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
+    FRAME_BLOCK, FRAME_BLOCK_WITH_ERROR_BOUNDS, Packing, join_container, spill_blocks, write_container,
 };
 use crate::outputs::frame_stream::StreamWriter;
 use crate::outputs::kind::{OutputKind, check_container_name};
 use crate::passes::FrameReaders;
-use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
+use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
     InputOptions, OpenedInput, first_frame_box, frame_quota, is_linked, link_stream, open_cache, open_input,
@@ -98,7 +98,7 @@ fn pack_whole(
     MemoryPlan::fit_budget(workload(&*opened.input), input.memory, &input.events, |work, _| {
         pack_estimates(work, storing)
     })?
-    .send_times(input.memory.tell, &input.events);
+    .send_stage_times(input.memory.tell, &input.events);
     let (work, digest) = open_cache(input, &*opened.input)?;
     let extent = || Ok(first_frame_box(source)?.map_or(1.0, |bounds| bounds.extent()));
     let packing = storing.packing(|| work.get_or_compute("extent", work.key(&()), extent))?;
@@ -116,7 +116,7 @@ fn pack_whole(
             &input.scratch_folder(),
             encode,
         )?;
-        work.end_shard_before("writing")?;
+        work.end_shard_run_before("writing")?;
         let staged = StagedFile::new(output, overwrite)?;
         join_container(source, staged.path(), packing, attributes, &spills)?;
         staged
@@ -189,9 +189,9 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     let header =
         StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
     let plan = MemoryPlan::fit_budget(workload(&*opened.input), input.memory, &input.events, unpack_estimates)?;
-    plan.send_times(input.memory.tell, &input.events);
+    plan.send_stage_times(input.memory.tell, &input.events);
     let max_held = plan.limits.max_kept_frames;
-    let read_plan = ReadPlan::all_frames().keeping_at_most(max_held);
+    let read_plan = ReadPlan::all_frames().with_max_kept_frames(max_held);
     let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Attributes::all(), &read_plan)?;
     let mut state = frames.state_buffer();
     if !info.times.is_empty() {
@@ -231,7 +231,7 @@ pub fn verify(path: &Path) -> Result<VerifyReport> {
 }
 
 /// Copies the complete frames of the truncated or damaged container `input` to the new container `output`. Fails if no
-/// frame is complete.
+/// frame is complete. Returns how many frames and tiles were found and saved.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_container_name(output, "info --repair")?;
     check_is_container(input)?;
@@ -287,14 +287,14 @@ fn workload(input: &dyn InputModel) -> Workload {
 /// Returns the resource estimate (memory and time) of packing all frames into a container with the precision `storing`.
 fn pack_estimates(work: &Workload, storing: &StoragePrecision) -> Vec<ResourceEstimate> {
     let seconds = work.reading_seconds(work.gaussian_count(), work.frames as f64)
-        + work.gaussian_count() * work.frames as f64 * SECONDS_TO_ENCODE;
+        + work.gaussian_count() * work.frames as f64 * ENCODE_SECONDS_PER_STATE;
     let level = match storing {
         StoragePrecision::Exact(Compression::Zstd(level)) | StoragePrecision::Within(_, level) => *level,
         StoragePrecision::Exact(_) => 0,
     };
     // Bounds may need the extent of the scene, for which the positions of the first frame are read.
     let (together, positions) = match storing {
-        StoragePrecision::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
+        StoragePrecision::Within(..) => (FRAME_BLOCK_WITH_ERROR_BOUNDS, 16),
         StoragePrecision::Exact(_) => (FRAME_BLOCK, 0),
     };
     let per_gaussian = vec![("positions", positions)];
@@ -308,7 +308,13 @@ fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     let per_gaussian =
         vec![states, ("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
     let seconds = 2.0 * work.reading_seconds(work.gaussian_count(), work.frames as f64);
-    vec![ResourceEstimate { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.filling_blocks()] }]
+    vec![ResourceEstimate {
+        stage: "unpack",
+        reads: 1.0,
+        seconds,
+        per_gaussian,
+        fixed: vec![work.block_buffer_memory()],
+    }]
 }
 
 impl InputInfo {

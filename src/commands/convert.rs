@@ -8,7 +8,7 @@ use std::path::Path;
 
 use crate::TOOL;
 use crate::commands::archive::{is_archive, unpack_archive, write_archive};
-use crate::commands::converted::ConvertReport;
+use crate::commands::convert_report::ConvertReport;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFile, StagedFolder, TargetKind, check_target};
@@ -18,7 +18,7 @@ use crate::model::Attributes;
 use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::outputs::time_windows::{MAX_SINGLE_FRAME_GAUSSIANS, is_windowed};
 use crate::passes::TRACKS_PER_BLOCK;
-use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
+use crate::pipeline::stages::write::ENCODE_SECONDS_PER_STATE;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_input};
@@ -82,7 +82,7 @@ pub fn convert(
     let work = Workload::new(source.info(), model.memory_profile());
     let plan =
         MemoryPlan::fit_budget(work, input.memory, &input.events, |work, limits| vec![estimate(kind, work, limits)])?;
-    plan.send_times(input.memory.tell, &input.events);
+    plan.send_stage_times(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     let mut write = |path: &Path| -> Result<u64> {
@@ -94,7 +94,7 @@ pub fn convert(
         let bytes = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folders(),
+            "input": InputSummary::new(model, &input.path, model.digest()?)?.with_file_names_only(),
         });
         let path = staged.path().join(SUMMARY_FILE);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
@@ -129,6 +129,6 @@ fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstim
         ("encoded", kind.encoding_bytes(state_bytes)),
     ];
     let seconds = work.reading_seconds(work.gaussian_count(), work.frames as f64)
-        + work.gaussian_count() * work.frames as f64 * SECONDS_TO_ENCODE;
+        + work.gaussian_count() * work.frames as f64 * ENCODE_SECONDS_PER_STATE;
     ResourceEstimate { stage: "convert", reads: 1.0, seconds, per_gaussian, fixed }
 }

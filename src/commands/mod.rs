@@ -3,7 +3,7 @@
 pub mod archive;
 pub mod container;
 pub mod convert;
-pub mod converted;
+pub mod convert_report;
 pub mod render;
 pub mod score;
 pub mod video;

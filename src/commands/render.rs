@@ -19,7 +19,7 @@ use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch
 use crate::pipeline::summary::{CameraSummary, InputSummary};
 use crate::progress::Events;
 use crate::render::Image;
-use crate::scene::pictures::{self, ViewSet, render_background, select_view, select_views};
+use crate::scene::view_selection::{self, ViewSet, render_background, select_view, select_views};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 
@@ -68,10 +68,11 @@ pub struct RenderReport {
     pub notes: Vec<String>,
 }
 
-/// Renders views of an input to image files.
+/// Renders views of an input to image files. Returns the number of rendered views; if the run is limited to one shard
+/// (part of a divided stage), returns a report about this shard.
 ///
 /// Memory: one frame state, and for each thread one render with its projected Gaussians
-/// ([`crate::scene::pictures::render_estimate`]).
+/// ([`crate::scene::view_selection::render_estimate`]).
 ///
 /// # Errors
 /// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or
@@ -124,7 +125,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
             let key = scene.work.key(&(&chosen, background, format.extension()));
             let make = |some: Range<usize>, to: &mut SpillWriter| job.spill(&chosen[some], to);
             let spills = scene.work.spill_in_shards(NAME, key, chosen.len(), &scene.scratch, make)?;
-            scene.work.end_shard_before("writing")?;
+            scene.work.end_shard_run_before("writing")?;
             let staged = StagedFolder::new(output, options.overwrite)?;
             for (some, spill) in spills {
                 write_spilled(&chosen[some], &spill, |picture| staged.path().join(name(picture)))?;
@@ -137,7 +138,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
         };
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.without_folders(),
+            "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.with_file_names_only(),
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: scene.rig.cameras.len(),
@@ -156,7 +157,7 @@ fn render_whole(options: &RenderOptions) -> Result<RenderReport> {
 /// Returns the resource estimate (memory and time) of rendering. `keeps_files`: whether the encoded image files of a
 /// batch of views stay in memory until they are written.
 fn estimates(work: &Workload, limits: &Limits, keeps_files: bool) -> Vec<ResourceEstimate> {
-    vec![pictures::render_estimate(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
+    vec![view_selection::render_estimate(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
 }
 
 /// Returns the image format that the extension of `output` gives; fails for extensions other than `.png` and `.npy`.

@@ -18,7 +18,7 @@ use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::camera_path::cameras_along;
 use crate::scene::open_compressed;
-use crate::scene::pictures::{self, ViewSet, render_background};
+use crate::scene::view_selection::{self, ViewSet, render_background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
 /// Name of the rendering stage, for progress.
@@ -73,7 +73,7 @@ pub struct VideoReport {
 
 /// Renders a video of an input, with one image per frame of the model, in order. Exception: if a camera path leads
 /// through a still (a model without motion), the video has a fixed number of images from each camera of the path to the
-/// next.
+/// next. Returns the number and the size of the video frames.
 ///
 /// # Errors
 /// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
@@ -100,7 +100,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     scene.plan_memory(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
         // palette (5).
-        let mut estimate = pictures::render_estimate(work, limits, NAME, models, models * 12);
+        let mut estimate = view_selection::render_estimate(work, limits, NAME, models, models * 12);
         estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![estimate]
     })?;
@@ -241,7 +241,7 @@ impl FilmSource<'_> {
     }
 }
 
-/// Joins images of the same size from left to right.
+/// Joins images of the same size from left to right, and returns the joined image.
 fn side_by_side(mut images: Vec<Image>) -> Image {
     if images.len() == 1 {
         return images.swap_remove(0);

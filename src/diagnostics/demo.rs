@@ -26,7 +26,7 @@ use crate::progress::Events;
 use crate::recipe::{Effort, Recipe};
 use crate::render::Image;
 use crate::report::{self, ReportOptions};
-use crate::scene::pictures::ViewSet;
+use crate::scene::view_selection::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
 /// File name of the generated scene.
@@ -273,7 +273,8 @@ fn smaller(camera: &Camera) -> Camera {
     }
 }
 
-/// Joins three renders of equal size from left to right, with a white line between neighboring renders.
+/// Joins three renders of equal size from left to right, with a white line between neighboring renders, and returns the
+/// joined image.
 fn beside(images: [Image; 3]) -> Image {
     let (width, height) = (images[0].width, images[0].height);
     let line = vec![1.0; 3 * FILM_GAP as usize];

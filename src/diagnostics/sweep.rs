@@ -51,7 +51,7 @@ pub struct SweepOptions {
 /// Measures the trade-off curves and writes them to the output folder. Runs every method at every fraction; a method
 /// that chooses the number of Gaussians itself is also run once without a given fraction. Then runs the preset
 /// `default` with every number of refinement steps. Gaussians are scored by the training views; results are compared
-/// with the original on the held-out views.
+/// with the original on the held-out views. Returns the measurements.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the fractions or the output are invalid, or if a run fails. No files remain in this

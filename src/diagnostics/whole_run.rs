@@ -7,13 +7,13 @@ use std::path::Path;
 use crate::error::{Error, Result};
 use crate::evaluation::baseline::prune_by;
 use crate::evaluation::cost::{Cost, RepeatLimits};
-use crate::evaluation::found::Evaluation;
 use crate::evaluation::method::MethodKind;
+use crate::evaluation::results::Evaluation;
 use crate::evaluation::{self, EvaluateOptions, ModelPair};
 use crate::files::atomic::Replace;
 use crate::model::Split;
 use crate::pipeline::{Request, Target, compress};
-use crate::scene::pictures::ViewSet;
+use crate::scene::view_selection::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
 /// Settings shared by all complete runs that are compared with one another.

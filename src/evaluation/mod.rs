@@ -8,9 +8,9 @@
 
 pub mod baseline;
 pub mod cost;
-pub mod found;
 pub mod method;
 pub mod precision;
+pub mod results;
 pub mod trade_off;
 
 use std::fs;
@@ -25,7 +25,9 @@ use serde::de::DeserializeOwned;
 use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
-use crate::evaluation::found::{ByModel, Comparison, Evaluation, ImageScore, RigSides, TruthComparison, ViewScores};
+use crate::evaluation::results::{
+    Comparison, Evaluation, ImageScore, InsideOutsideMeans, OriginalAndCompressed, TruthComparison, ViewScores,
+};
 use crate::files::atomic::{Replace, StagedFile, TargetKind, check_target};
 use crate::journal::records::RenderTime;
 use crate::limits::Limits;
@@ -37,9 +39,9 @@ use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
-use crate::scene::outside::{RigCone, training_cameras};
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{self, ViewSet, render_background, select_frames, select_views, spread_views};
+use crate::scene::view_selection::{self, ViewSet, render_background, select_frames, select_views, spread_views};
+use crate::scene::views_outside::{RigCone, training_cameras};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
 /// Name of the evaluation stage, for progress and cache entries.
@@ -71,7 +73,7 @@ pub struct EvaluateOptions {
 }
 
 /// Opens the original and the compressed model, renders both from the selected views and compares the renders. Returns
-/// the evaluation, or a report if the run computes only one shard.
+/// the evaluation, or a report if the run computes only one shard (part of a divided stage).
 ///
 /// # Errors
 /// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
@@ -80,8 +82,8 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
 
-/// Does the work of [`evaluate`]. A run that computes only one shard (part of a divided stage) ends with the error
-/// [`Error::ShardDone`].
+/// Does the work of [`evaluate`], and returns the evaluation. A run that computes only one shard (part of a divided
+/// stage) ends with the error [`Error::ShardDone`].
 fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, TargetKind::File, &options.input_paths(), options.overwrite)?;
@@ -102,7 +104,7 @@ fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
 /// `work` must be that of the larger model.
 pub fn resource_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
-    let mut need = pictures::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    let mut need = view_selection::render_estimate(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
     need.fixed.push(("scores", size_of::<ViewScores>() as u64 * work.pictures));
     need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));
@@ -189,7 +191,7 @@ impl ModelPair {
             &self.scene.events,
             needs,
         )?;
-        plan.send_times(budget.tell, &self.scene.events);
+        plan.send_stage_times(budget.tell, &self.scene.events);
         self.scene.limits = plan.limits;
         Ok(())
     }
@@ -203,13 +205,13 @@ impl ModelPair {
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
     pub fn evaluate(&self) -> Result<Evaluation> {
         let evaluation = self.evaluate_as_first_stage()?;
-        self.scene.work.end_shard_before("averaging")?;
+        self.scene.work.end_shard_run_before("averaging")?;
         Ok(evaluation)
     }
 
     /// Compares all views, as [`ModelPair::evaluate`] does, but as the first stage of a longer run. The difference: a
-    /// run that is limited to one shard returns the evaluation if the scores of all shards are in the cache, so that it
-    /// can go on to the next stage.
+    /// run that is limited to one shard (part of a divided stage) returns the evaluation if the scores of all shards
+    /// are in the cache, so that it can go on to the next stage.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -234,7 +236,7 @@ impl ModelPair {
 
     /// Renders every view and returns the values of `observe` for all views, in order. `observe` gets the same
     /// arguments as in [`ModelPair::observe`], but no scores are computed. The work is done as the stage `name`, which
-    /// can be divided into shards.
+    /// can be divided into shards (ranges of the views).
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -298,16 +300,16 @@ impl ModelPair {
         });
         let scene = &self.scene;
         let count = |input: &dyn InputModel| input.source().info().count;
-        let path = ByModel {
+        let path = OriginalAndCompressed {
             original: scene.path.to_string_lossy().into_owned(),
             compressed: self.compressed_as.path.to_string_lossy().into_owned(),
         };
-        let size = ByModel { original: scene.input.size()?, compressed: self.compressed.size()? };
+        let size = OriginalAndCompressed { original: scene.input.size()?, compressed: self.compressed.size()? };
         Ok(Evaluation {
             tool: TOOL.to_owned(),
             path,
-            count: ByModel { original: count(&*scene.input), compressed: count(&*self.compressed) },
-            bytes: ByModel { original: size.original.total(), compressed: size.compressed.total() },
+            count: OriginalAndCompressed { original: count(&*scene.input), compressed: count(&*self.compressed) },
+            bytes: OriginalAndCompressed { original: size.original.total(), compressed: size.compressed.total() },
             size,
             cameras: CameraSummary {
                 origin: scene.rig.origin.clone(),
@@ -316,7 +318,7 @@ impl ModelPair {
             },
             background: self.background,
             loss: Comparison::from_views(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
-            rig_sides: RigSides::from_views(&scores, &self.outside_views()),
+            rig_sides: InsideOutsideMeans::from_views(&scores, &self.outside_views()),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
@@ -352,7 +354,7 @@ impl ModelPair {
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
-    pub fn render_again<O>(
+    pub fn render_views_again<O>(
         &self,
         places: &[usize],
         mut see: impl FnMut(usize, &Gaussians, &Camera, RenderedViews) -> O,
@@ -480,7 +482,7 @@ impl ModelPair {
         Ok((all, observed))
     }
 
-    /// Renders a view with both models, and reads its photograph if there is one.
+    /// Renders a view with both models, and reads its photograph if there is one. Returns these images.
     fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
         let &ViewStates { picture, camera, .. } = view;
         Ok(RenderedViews {
@@ -507,7 +509,7 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
 
 /// Scores of one view: first of the compressed model against the original, then of each model against the photograph if
 /// there is one.
-type PairScores = (ImageScore, Option<ByModel<ImageScore>>);
+type PairScores = (ImageScore, Option<OriginalAndCompressed<ImageScore>>);
 
 /// Images of one view at one frame, all of the same size.
 pub struct RenderedViews {
@@ -531,7 +533,7 @@ impl RenderedViews {
             let against = |image: fn(&RenderedViews) -> &Image| {
                 score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
-            ByModel {
+            OriginalAndCompressed {
                 original: against(|rendered| &rendered.original),
                 compressed: against(|rendered| &rendered.compressed),
             }

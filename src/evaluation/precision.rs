@@ -138,15 +138,15 @@ pub struct ObservedOrder {
 /// Name of the error: root mean square error of renders of the model that a setting yields, compared with renders of
 /// the whole model; color values are in [0, 1].
 pub const RENDER_ERROR: &str = "pictures";
-/// Name of the error: error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the
-/// finest setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
+/// Name of the error that a setting adds to the error of renders, divided by the error [`RENDER_ERROR`] of the finest
+/// setting. The divisor counts as the error of the compressed model itself (see [`added_error`]).
 pub const ADDED_ERROR: &str = "added";
 /// Name of the error: Jaccard distance between the set of Gaussians that a setting keeps and the set that the finest
 /// setting keeps.
-pub const SELECTION_DISTANCE: &str = "kept";
+pub const KEPT_SET_JACCARD_DISTANCE: &str = "kept";
 /// Name of the error: relative error of the number of Gaussians that the thresholds of the recipe keep, compared with
 /// the finest setting.
-pub const COUNT_ERROR: &str = "staying";
+pub const KEPT_COUNT_ERROR: &str = "staying";
 /// Name of the error: largest relative error of the percentiles P1 and P99, compared with exact percentiles. Scores are
 /// normalized by these percentiles.
 pub const PERCENTILE_ERROR: &str = "percentiles";
@@ -163,8 +163,8 @@ pub fn axis_label(error: &str) -> String {
     match error {
         RENDER_ERROR => "root mean square error of renders".to_owned(),
         ADDED_ERROR => "error added / error of the model".to_owned(),
-        SELECTION_DISTANCE => "1 - Jaccard of the kept set".to_owned(),
-        COUNT_ERROR => "relative error of how many stay".to_owned(),
+        KEPT_SET_JACCARD_DISTANCE => "1 - Jaccard of the kept set".to_owned(),
+        KEPT_COUNT_ERROR => "relative error of how many stay".to_owned(),
         PERCENTILE_ERROR => "worst relative error of P1 and P99".to_owned(),
         DIFFERENT_BYTES => "results of other bytes".to_owned(),
         statistic => format!("relative L2 error of {statistic}"),
@@ -404,7 +404,7 @@ mod tests {
         let curve = PrecisionCurve::new(
             "bits",
             "exact",
-            vec![mark(2.0, 0.25, &[("C", 0.5), (SELECTION_DISTANCE, 0.0)])],
+            vec![mark(2.0, 0.25, &[("C", 0.5), (KEPT_SET_JACCARD_DISTANCE, 0.0)])],
             None,
             &[],
         );

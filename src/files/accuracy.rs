@@ -113,8 +113,8 @@ pub struct CodingErrors {
 }
 
 impl CodingErrors {
-    /// Returns a record without errors. `positions` holds the positions of all Gaussians of the file; they determine
-    /// the scene size.
+    /// Creates a record of coding errors that has no errors yet. `positions` holds the positions of all Gaussians of
+    /// the file. The scene size, to which position errors are compared, follows from them.
     pub fn new(positions: &AttributeValues) -> CodingErrors {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
@@ -224,7 +224,8 @@ mod tests {
         RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Returns a record for six Gaussians on a line: five with a spacing of 2, and one far away. The scene size is 2.
+    /// Returns a record of coding errors for six Gaussians on a line: five with a spacing of 2, and one far away. The
+    /// scene size is 2.
     fn accuracy() -> CodingErrors {
         let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);

@@ -125,7 +125,7 @@ pub struct StagedFile {
 
 impl StagedFile {
     /// Prepares to write the output file `target`, which must have passed [`check_target`]. Does not create the file
-    /// yet.
+    /// yet. Returns the handle through which the file is written and published.
     ///
     /// # Errors
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
@@ -170,7 +170,8 @@ pub struct StagedFiles {
 impl StagedFiles {
     /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
     /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
-    /// the summary (JSON file that describes the result). `replace` says which existing files may be replaced.
+    /// the summary (JSON file that describes the result). `replace` says which existing files may be replaced. Returns
+    /// the handle through which the files are written and published.
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -298,7 +299,8 @@ pub struct ScratchFile {
 }
 
 impl ScratchFile {
-    /// Reserves an unused path for a scratch file in `folder`. Does not create the file yet.
+    /// Reserves an unused path for a scratch file in `folder`. Does not create the file yet. Returns the handle of the
+    /// path, which removes the file when it is dropped.
     ///
     /// # Errors
     /// Fails if the folder does not exist or a system call fails.

@@ -18,9 +18,9 @@ use crate::files::splatv::rows::ZeroRotation;
 use crate::model::{AttributeValues, Attributes, StoredParams};
 
 /// Index in [`StoredParams::format_specific`] of the center of the time window.
-pub const CENTER: usize = 0;
+pub const TIME_CENTER: usize = 0;
 /// Index in [`StoredParams::format_specific`] of the natural logarithm of the standard deviation of the time window.
-pub const LOG_DEVIATION: usize = 1;
+pub const LOG_TIME_DEVIATION: usize = 1;
 /// First of three indices in [`StoredParams::format_specific`] of the velocity along x, y, z, per unit of time.
 pub const VELOCITY: usize = 2;
 /// Number of parameters in [`StoredParams::format_specific`] of a Gaussian with linear motion in a Gaussian window of
@@ -29,7 +29,7 @@ pub const PARAMS_PER_GAUSSIAN: usize = 5;
 
 /// Smallest standard deviation with which the player shows a time window, as a fraction of the length of the sequence.
 /// The player raises smaller standard deviations to this value.
-pub const MIN_DEVIATION: f64 = 0.02;
+pub const MIN_TIME_DEVIATION: f64 = 0.02;
 /// Opacity to which the player raises the opacity of every Gaussian at every time, if it is lower. Written to the
 /// header, and assumed if a header does not state it.
 const OPACITY_FLOOR: f64 = 1e-4;
@@ -145,7 +145,7 @@ impl FtgsHeader {
         degree?;
         let uses_velocity = number("use_velocity", 1.0, &|x| x == 0.0 || x == 1.0, "0 or 1")? == 1.0;
         let is_positive = |x: f64| x.is_finite() && x >= 0.0;
-        let min_deviation = number("min_duration", MIN_DEVIATION, &is_positive, "a number of at least 0")?;
+        let min_deviation = number("min_duration", MIN_TIME_DEVIATION, &is_positive, "a number of at least 0")?;
         let opacity_floor =
             number("opacity_floor", OPACITY_FLOOR, &|x| (0.0..1.0).contains(&x), "a number from 0 to below 1")?;
         let frames = number("n_frames", 0.0, &|x| (1.0..=1e9).contains(&x) && x.fract() == 0.0, "a number of frames")?;
@@ -238,20 +238,21 @@ fn inspect(params: &StoredParams, zero_rotation: ZeroRotation) -> (Defects, Vec<
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Result<()> {
-    write_ftgs_with(params, clip, MIN_DEVIATION, path)
+    write_ftgs_with(params, clip, MIN_TIME_DEVIATION, path)
 }
 
-/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most [`MIN_DEVIATION`]
-/// that leaves all deviations in `params` as they are.
+/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most
+/// [`MIN_TIME_DEVIATION`] that leaves all deviations in `params` as they are.
 ///
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_exact_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Result<()> {
-    let smallest = params.format_specific.plane(LOG_DEVIATION).iter().fold(f32::INFINITY, |least, &x| least.min(x));
+    let smallest =
+        params.format_specific.plane(LOG_TIME_DEVIATION).iter().fold(f32::INFINITY, |least, &x| least.min(x));
     let smallest = f64::from(smallest).exp();
     // The logarithm of the usual minimum is rounded to f32.
-    let is_usual = smallest >= MIN_DEVIATION * (1.0 - 1e-6);
-    write_ftgs_with(params, clip, if is_usual { MIN_DEVIATION } else { smallest }, path)
+    let is_usual = smallest >= MIN_TIME_DEVIATION * (1.0 - 1e-6);
+    write_ftgs_with(params, clip, if is_usual { MIN_TIME_DEVIATION } else { smallest }, path)
 }
 
 /// Writes a file whose header states `min_deviation`, the minimum standard deviation in time.
@@ -368,7 +369,7 @@ mod tests {
     fn velocities_count_only_if_the_header_says_so() {
         let still = read_changed("use_velocity 1", "use_velocity 0").unwrap();
         assert!((VELOCITY..PARAMS_PER_GAUSSIAN).all(|plane| still.params.format_specific.plane(plane) == [0.0; 4]));
-        assert_eq!(still.params.format_specific.plane(CENTER), params(4, 0).format_specific.plane(CENTER));
+        assert_eq!(still.params.format_specific.plane(TIME_CENTER), params(4, 0).format_specific.plane(TIME_CENTER));
     }
 
     #[test]
@@ -390,7 +391,7 @@ mod tests {
         );
         let kept = Ftgs::open(&path, &PlyOptions::default(), ZeroRotation::Identity).unwrap();
         assert_eq!((kept.params.len(), kept.params.gaussians.rotation.row(2)), (4, [1.0, 0.0, 0.0, 0.0]));
-        odd.format_specific.plane_mut(CENTER).fill(f32::NAN);
+        odd.format_specific.plane_mut(TIME_CENTER).fill(f32::NAN);
         write_ftgs(&odd, &ClipTimes::UNIT_INTERVAL, &path).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("NaN or infinite value in 6"));
     }

@@ -27,15 +27,16 @@ use checked::CheckedReader;
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
 impl ParseAbort {
-    /// Stores `error` and returns a parser error, which the seed returns to stop the parser.
+    /// Stores `error`, and returns a parser error. A deserializer (seed) that returns the parser error stops the JSON
+    /// parser; [`read`] then fails with `error`.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")
     }
 }
 
-/// Reads the JSON document in the file at `path` and returns the value that `seed` builds from it. `seed` stores its
-/// own errors in `stopped`.
+/// Reads the JSON document in the file at `path` and returns the value that the deserializer `seed` builds from it. To
+/// stop with an error of its own, `seed` stores the error in `stopped`.
 ///
 /// # Errors
 /// Fails if the seed fails, the file cannot be read, the text is not UTF-8 or not JSON (the message names the place),

@@ -14,8 +14,6 @@ pub mod frame_stream;
 pub mod ftgs;
 pub mod glb;
 pub mod image;
-#[doc(hidden)]
-pub mod in_memory;
 pub(crate) mod json;
 mod map;
 pub mod names;
@@ -23,6 +21,8 @@ pub(crate) mod npy;
 pub(crate) mod npz;
 pub(crate) mod open;
 pub mod page_policy;
+#[doc(hidden)]
+pub mod parser_checks;
 mod pickle;
 pub mod ply;
 pub mod ply_frames;

@@ -17,7 +17,7 @@ pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
     utf_8(path, text, (bytes.len() - text.len()) as u64).map(str::to_owned)
 }
 
-/// Removes a UTF-8 byte order mark from `bytes`, the first bytes of the file at `path`.
+/// Returns `bytes`, the first bytes of the file at `path`, without a UTF-8 byte order mark.
 ///
 /// # Errors
 /// Fails if `bytes` begin with a UTF-16 byte order mark.
@@ -35,7 +35,7 @@ pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
         .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
 }
 
-/// Converts `bytes` to text. They begin at offset `start` of the file at `path`. Fails if they are not UTF-8.
+/// Returns `bytes` as text. The bytes begin at offset `start` of the file at `path`. Fails if they are not UTF-8.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();

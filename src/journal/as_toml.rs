@@ -60,8 +60,8 @@ mod tests {
             same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_pictures, tried: tried.clone() });
             let mut journal = Journal::default();
             journal.leave_out("a", "b");
-            journal.record_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });
-            journal.record_saving("e", "f", SavedCost::Values { bytes: 1 << 50 });
+            journal.leave_out_with_saving("c", "d", SavedCost::Stage { seconds: odd, reads: 2.0 });
+            journal.leave_out_with_saving("e", "f", SavedCost::Values { bytes: 1 << 50 });
             journal.notes.push("several\nlines, 40.1 dB".to_owned());
             journal.field =
                 Some(FieldSummary { half: true, pictures: 3, rounding: odd, result: Some(odd), least: odd });

@@ -14,7 +14,7 @@ use crate::cache::{Cache, CacheKey, Spill};
 use crate::error::Result;
 use crate::journal::as_toml::AsToml;
 use crate::journal::records::Forecast;
-use crate::journal::records::{FieldSummary, LeftOut, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord};
+use crate::journal::records::{FieldSummary, OmittedWork, RefinedSummary, SavedCost, ShDegreeSummary, StageRecord};
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
@@ -62,7 +62,7 @@ pub struct Journal {
     /// Records of the stages that have run, in order.
     pub stages: Vec<StageRecord>,
     /// Stages that the run omitted, with reasons.
-    pub left_out: Vec<LeftOut>,
+    pub left_out: Vec<OmittedWork>,
     /// Notes for the user.
     pub notes: Vec<String>,
     /// Measured effect on renders of writing the deformation field in half precision, if it was measured.
@@ -113,7 +113,7 @@ impl Journal {
         compute: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
         self.cached(&scene.work, name, key, |journal| {
-            scene.work.end_shard_before(name)?;
+            scene.work.end_shard_run_before(name)?;
             journal.run_stage(name, gaussians_in, scene.source(), compute)
         })
     }
@@ -167,12 +167,12 @@ impl Journal {
 
     /// Adds an entry for the omitted work `what` with the reason `why`.
     pub fn leave_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
-        self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
+        self.left_out.push(OmittedWork { what: what.into(), why: why.into(), saved: None });
     }
 
     /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost `saved`.
-    pub fn record_saving(&mut self, what: impl Into<String>, why: impl Into<String>, saved: SavedCost) {
-        self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
+    pub fn leave_out_with_saving(&mut self, what: impl Into<String>, why: impl Into<String>, saved: SavedCost) {
+        self.left_out.push(OmittedWork { what: what.into(), why: why.into(), saved: Some(saved) });
     }
 
     fn add(

@@ -38,7 +38,7 @@ pub struct StageRecord {
 
 /// Stage or step that a run omitted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct LeftOut {
+pub struct OmittedWork {
     /// Name of the omitted work.
     pub what: String,
     /// Reason for omitting the work.
@@ -76,7 +76,7 @@ impl SavedCost {
     }
 }
 
-impl LeftOut {
+impl OmittedWork {
     /// Returns the reason and the saved cost as text for display.
     pub fn reason(&self) -> String {
         match self.saved {

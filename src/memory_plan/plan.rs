@@ -228,7 +228,7 @@ impl MemoryPlan {
     }
 
     /// Sends the estimated time of each stage to `events` if `tell` asks for the whole plan ([`Verbosity::Plan`]).
-    pub fn send_times(&self, tell: Verbosity, events: &Events) {
+    pub fn send_stage_times(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
             let stages = stage_seconds(&self.work, &self.estimates);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();

@@ -20,7 +20,7 @@ const PER_SLOT: u64 = 80;
 /// list of time stamps grows by being copied to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
 /// Bytes of memory per frame of an open input: two copies of its time stamp (one in the container's index, one in the
-/// sequence), and the number of Gaussians alive in the frame.
+/// sequence), and the number of Gaussians alive (opacity ≥ alpha_min) in the frame.
 const PER_FRAME: u64 = 8 + 8 + 8;
 /// Bytes of memory per view in a list of views.
 const PER_PICTURE: u64 = 24;
@@ -154,7 +154,7 @@ impl Workload {
 
     /// Returns the memory that the readers of all threads take while each thread fills one block of Gaussians with
     /// values. Includes the buffers for decoding tiles.
-    pub fn filling_blocks(&self) -> MemoryPart {
+    pub fn block_buffer_memory(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
@@ -192,11 +192,11 @@ impl Workload {
             ("views", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
         ];
         let buffers = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
-        (per_gaussian, vec![self.filling_blocks(), ("views", buffers)])
+        (per_gaussian, vec![self.block_buffer_memory(), ("views", buffers)])
     }
 
     /// Returns the memory that a list of `pictures` views takes.
-    pub fn view_list(pictures: f64) -> MemoryPart {
+    pub fn view_list_memory(pictures: f64) -> MemoryPart {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
@@ -210,7 +210,7 @@ impl Workload {
         let varying = self.frames_at_most(frames as u64) * self.state_bytes(self.varying);
         let block = self.largest_block(GAUSSIAN_BLOCK as u64)
             * (2 * self.state_bytes(Attributes::all()) + 3 * varying + self.input.reader);
-        vec![("blocks", 2 * self.threads * block), self.filling_blocks(), ("index", self.written_index())]
+        vec![("blocks", 2 * self.threads * block), self.block_buffer_memory(), ("index", self.written_index())]
     }
 
     /// Returns the memory that the zstd compressors of all threads take, at the compression level `level` and for tiles

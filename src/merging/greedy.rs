@@ -22,11 +22,11 @@ const FEW: usize = 64;
 /// Leader of every node, and statistics of how the leaders were found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
-    /// Index of the leader of every node. A node that joined no other is its own leader.
+    /// Index of the leader of every node: the node that it joined, or the node itself if it joined no other.
     pub leader_of: Vec<u32>,
     /// Number of nodes that joined another node, which is their leader.
     pub joins: usize,
-    /// Number of parallel rounds in which nodes were assigned to leaders.
+    /// Number of parallel rounds in which nodes were assigned to leaders (the nodes that other nodes join).
     pub rounds: usize,
     /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
     pub sequential: bool,
@@ -53,9 +53,9 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
 /// Value in `leader_of` of a node without a decision. A decided node has the index of its leader there.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Assigns every node to a leader, by the sequential greedy rule of this module. `rank`: rank of every node, a
-/// permutation of 0..N. `pairs`: pairs (leader, member) that passed all tests, in any order, in which the leader has
-/// the lower rank.
+/// Assigns every node to a leader (the node that it joins, or itself), by the sequential greedy rule of this module,
+/// and returns the assignment. `rank`: rank of every node, a permutation of 0..N. `pairs`: pairs (leader, member) that
+/// passed all tests, in any order, in which the leader has the lower rank.
 ///
 /// With `limit`, only the first `limit` joins are made, in the order of the leader's rank, then of the member's. The
 /// members of all later joins stay single.

@@ -58,12 +58,13 @@ impl MergeGroups {
         self.leaders.is_empty()
     }
 
-    /// Returns the row of every group's leader, increasing.
+    /// Returns the row of every group's leader, the Gaussian into which the others are merged; rows are increasing.
     pub fn leaders(&self) -> &[u32] {
         &self.leaders
     }
 
-    /// Returns the rows of all Gaussians of group `group`, its leader included, increasing.
+    /// Returns the rows of all Gaussians of group number `group`, including its leader (the Gaussian into which the
+    /// others are merged); rows are increasing.
     pub fn members(&self, group: usize) -> &[u32] {
         &self.members[self.start[group] as usize..self.start[group + 1] as usize]
     }

@@ -2,7 +2,7 @@
 //! and covariance (method.md, section 5).
 //!
 //! ```text
-//! states at the reference frame ─▶ neighbors ─▶ gates ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy
+//! states at the reference frame ─▶ neighbors ─▶ appearance ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy
 //! frames ──▲
 //! ```
 //!
@@ -11,20 +11,20 @@
 //!
 //! Peak memory per survivor: its state, held by the caller; the proxy states before and after a pass (each at most half
 //! as many as survivors); and [`BYTES_PER_SURVIVOR`]. To this add [`BYTES_PER_PAIR`] for each candidate pair that is
-//! measured in one call, and [`BYTES_PER_PASSING`] for each pair that passed all tests. There are at most
+//! measured in one call, and [`BYTES_PER_PASSED_PAIR`] for each pair that passed all tests. There are at most
 //! `max_neighbors` pairs per survivor; 3.5 were measured for evenly distributed Gaussians. The memory of the callback
 //! is not included.
 
-pub mod gates;
+pub mod appearance;
 pub mod greedy;
 mod groups;
-pub mod known;
-pub mod merged;
+pub mod merged_sequence;
 pub mod moments;
 pub mod motion;
 pub mod motion_pass;
 pub mod neighbors;
 pub mod proxy;
+pub mod similarity_cache;
 pub(crate) mod trajectories;
 pub mod tree;
 pub mod voxels;
@@ -35,11 +35,11 @@ use serde::{Deserialize, Serialize};
 use crate::model::hash_id;
 use crate::model::{Attributes, Gaussians};
 use crate::recipe;
-use gates::{Appearance, AppearanceThresholds};
+use appearance::{Appearance, AppearanceThresholds};
 pub use groups::MergeGroups;
-use known::BYTES_PER_CACHED_PAIR;
 use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
+use similarity_cache::BYTES_PER_CACHED_PAIR;
 use tree::TreePoint;
 
 /// Bytes of memory per survivor (Gaussian left by pruning) during a merging pass, beside its state. The terms are, in
@@ -49,13 +49,13 @@ use tree::TreePoint;
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Bytes of memory per candidate pair in one call of `measure`, beside the memory of the measurement itself: the pair,
-/// its copy in the list of pairs to measure, two known similarities ([`known::SimilarityCache`]; one for this pair and
-/// one for a pair of an earlier pass), and the motion similarity that is returned.
+/// its copy in the list of pairs to measure, two known similarities ([`similarity_cache::SimilarityCache`]; one for
+/// this pair and one for a pair of an earlier pass), and the motion similarity that is returned.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * BYTES_PER_CACHED_PAIR + size_of::<f64>();
 
 /// Bytes of memory per pair that passed all tests of a merging pass: the pair, and 4 bytes of spare capacity of the
 /// list.
-pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
+pub const BYTES_PER_PASSED_PAIR: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
 /// Number of nodes (single Gaussians or merged groups) whose neighbors one parallel task looks up.
 const CHUNK: usize = 1024;
@@ -66,7 +66,7 @@ pub struct Survivors<'a> {
     /// Attributes of all Gaussians at the reference frame. Of the SH coefficients, comparisons use only those of degree
     /// 0; proxies get those of all degrees.
     pub states: &'a Gaussians,
-    /// Rows of the survivors in `states`, increasing.
+    /// Rows of the survivors (Gaussians left by pruning) in `states`, increasing.
     pub rows: &'a [u32],
     /// Ids of the Gaussians in `states`, and the contribution C and the visibility of each id. Leaders are ranked by C;
     /// ties are broken by the hashes of the ids.
@@ -92,7 +92,7 @@ pub struct RequestedPairs<'a> {
 
 impl<'a> RequestedPairs<'a> {
     /// Returns each pair as two rows of [`Survivors::states`]. For a node that is a merged group, the row is that of
-    /// its leader.
+    /// its leader (the Gaussian into which the others are merged).
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
     }
@@ -128,9 +128,9 @@ pub struct PassCounts {
     pub sequential: bool,
 }
 
-/// Runs all merging passes of `recipe` over `survivors`. Every pass first merges nodes (Gaussians or merged groups)
-/// that coincide, then neighbors. A merge joins one or more nodes (members) to a leader: the node of the resulting
-/// group that ranks first by its contribution C.
+/// Runs all merging passes of `recipe` over `survivors` (Gaussians left by pruning). Every pass first merges nodes
+/// (Gaussians or merged groups) that coincide, then neighbors. A merge joins one or more nodes (members) to a leader:
+/// the node of the resulting group that ranks first by its contribution C.
 ///
 /// A member must pass three tests with its leader: 1 (place and size), 2 (color) and 3 (motion). `measure` provides the
 /// values for test 3: it returns the motion similarity of every requested pair, in the order of the request. A pair
@@ -279,10 +279,10 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 (`gates`) compare, and
-/// that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the set
-/// that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call of
-/// `take` gets at most `max_batch` pairs (at least 1).
+/// Finds sets of coincident nodes: nodes that are equal in every attribute that tests 1 and 2 ([`appearance`]) compare,
+/// and that pass these tests. Calls `take` with the pairs (leader, member) of each set. The leader is the node of the
+/// set that ranks first; all others are its members, however many there are. Pairs are ordered by leader, and each call
+/// of `take` gets at most `max_batch` pairs (at least 1).
 ///
 /// This step is needed because the neighbor search returns only a fixed number of nearest Gaussians. If more Gaussians
 /// than that coincide, each of them finds only neighbors that coincide with it. Without this step, they would not all

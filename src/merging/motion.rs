@@ -10,7 +10,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::gates::COSINE_EPSILON;
+use super::appearance::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, MotionSimilarity};
 
 /// Bytes of memory for one pair during the measurement.
@@ -23,7 +23,7 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
     /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; a step
-    /// in which a or b is zero counts as 0. The mean is over all frames in which both are alive
+    /// in which a or b is zero counts as 0. The mean is over all frames in which both are alive (opacity ≥ alpha_min)
     /// (`MotionParams::Literal`), or only over the steps that also begin in such a frame (`MotionParams::Runs`).
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
@@ -32,12 +32,12 @@ pub struct PairMeasure {
     pub squares: f64,
     /// Number n of steps (from one frame to the next) in the sums `dot` and `squares`.
     pub steps: u32,
-    /// Number of frames in which both Gaussians are alive.
+    /// Number of frames in which both Gaussians are alive (opacity ≥ alpha_min).
     pub common: u32,
-    /// Number of frames in which at least one of the Gaussians is alive.
+    /// Number of frames in which at least one of the Gaussians is alive (opacity ≥ alpha_min).
     pub union: u32,
     /// Maximum change of the offset x_i − x_j from its value at the reference frame, in scene units, over the frames in
-    /// which both are alive. Proxies are built from the offset at the reference frame.
+    /// which both are alive (opacity ≥ alpha_min). Proxies are built from the offset at the reference frame.
     pub drift: f64,
 }
 
@@ -48,15 +48,15 @@ impl PairMeasure {
     /// there are no steps (n = 0), or if neither Gaussian moves and σ = 0.
     ///
     /// `noise` is σ, the noise level of a step in scene units.
-    pub fn alignment(&self, noise: f64) -> f64 {
+    pub fn velocity_alignment(&self, noise: f64) -> f64 {
         let floor = 2.0 * f64::from(self.steps) * noise * noise;
         let denominator = self.squares + floor;
         if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
     }
 
-    /// Returns the fraction of frames in which only one of the two Gaussians is alive, among the frames in which at
-    /// least one is alive. Returns 1 if neither is ever alive.
-    pub fn one_alive_fraction(&self) -> f64 {
+    /// Returns the fraction of frames in which only one of the two Gaussians is alive (opacity ≥ alpha_min), among the
+    /// frames in which at least one is alive. Returns 1 if neither is ever alive.
+    pub fn fraction_with_one_alive(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
 }
@@ -86,21 +86,22 @@ impl MotionThresholds {
     }
 
     /// Returns the motion similarity of a pair, in [−1, 1]. The pair passes test 3 if the similarity exceeds the
-    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two Gaussians are never alive together, if
-    /// the fraction of frames with only one alive is too large, or if the two Gaussians drift too far apart.
+    /// minimum τ_m of the pass. Returns NaN, which exceeds nothing, if the two Gaussians are never alive (opacity ≥
+    /// alpha_min) together, if the fraction of frames with only one alive is too large, or if the two Gaussians drift
+    /// too far apart.
     pub fn similarity(&self, pair: &PairMeasure) -> f64 {
         let together =
-            pair.common > 0 && pair.drift <= self.max_drift && pair.one_alive_fraction() <= self.max_dead_time;
+            pair.common > 0 && pair.drift <= self.max_drift && pair.fraction_with_one_alive() <= self.max_dead_time;
         match self.trajectory {
             _ if !together => f64::NAN,
             MotionSimilarity::Cosine => pair.cosine,
-            MotionSimilarity::Alignment => pair.alignment(self.noise),
+            MotionSimilarity::Alignment => pair.velocity_alignment(self.noise),
         }
     }
 }
 
 /// Position of a node (Gaussian or merged group) at the present, the previous and the reference frame, and whether it
-/// is alive in the present and in the previous frame.
+/// is alive (opacity ≥ alpha_min) in the present and in the previous frame.
 #[derive(Debug, Clone, Copy)]
 struct NodeTrack {
     reference: [f32; 3],
@@ -134,7 +135,8 @@ pub struct PairMotion {
 impl PairMotion {
     /// Starts the measurement of `pairs`, each given as the indices of two nodes. `reference` yields the position of
     /// every node at the reference frame. `motion` selects the steps that count: for `Literal`, all steps that end in a
-    /// frame in which both nodes are alive; for `Runs`, only those that also begin in such a frame.
+    /// frame in which both nodes are alive (opacity ≥ alpha_min); for `Runs`, only those that also begin in such a
+    /// frame.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -160,7 +162,8 @@ impl PairMotion {
         }
     }
 
-    /// Adds the next frame. `state` gets the index of a node, and returns its position and whether it is alive.
+    /// Adds the next frame. `state` gets the index of a node, and returns its position and whether it is alive (opacity
+    /// ≥ alpha_min).
     pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);
@@ -287,9 +290,9 @@ mod tests {
         assert!(!merges(&slow, &path(|t| -0.01 * t as f32), 1.0));
         assert!(!merges(&slow, &path(|t| 0.1 * t as f32), 1.0));
         let opposite = measure(&slow, &path(|t| -0.01 * t as f32), MotionParams::Runs);
-        assert!((opposite.alignment(0.0) + 1.0).abs() < 1e-12);
+        assert!((opposite.velocity_alignment(0.0) + 1.0).abs() < 1e-12);
         let tenfold = measure(&slow, &path(|t| 0.1 * t as f32), MotionParams::Runs);
-        assert!((tenfold.alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
+        assert!((tenfold.velocity_alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
         assert!(merges_in_paper(&slow, &path(|t| 0.1 * t as f32)), "the cosine is blind to speed");
         assert!(!merges_in_paper(&slow, &path(|t| -0.01 * t as f32)));
         assert!(merges(&slow, &path(|t| 5.0 + 0.01 * t as f32), 1.0));
@@ -341,7 +344,7 @@ mod tests {
         let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
         let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
         let pair = measure(&long, &short, MotionParams::Runs);
-        assert_eq!((pair.common, pair.union, pair.steps, pair.one_alive_fraction()), (12, 16, 11, 0.25));
+        assert_eq!((pair.common, pair.union, pair.steps, pair.fraction_with_one_alive()), (12, 16, 11, 0.25));
         assert!(!merges(&long, &short, 1.0), "a quarter dead is more than a tenth");
     }
 

@@ -14,8 +14,8 @@ use rayon::prelude::*;
 
 use super::trajectories::{NEEDED, Trajectories};
 use crate::error::Result;
-use crate::merging::known::PairSimilarity;
 use crate::merging::motion::{MotionThresholds, NODE_BYTES, PAIR_BYTES, PairMotion};
+use crate::merging::similarity_cache::PairSimilarity;
 use crate::merging::voxels::voxel_order;
 use crate::model::{AttributeValues, opacity};
 use crate::outputs::container::FRAME_BLOCK;
@@ -127,8 +127,8 @@ impl PairMeter<'_> {
     }
 
     /// Gathers the trajectories of all Gaussians `ids` in a scratch file, in voxel order: sorted by the voxel (of side
-    /// `reach`) in which their position in `reference` lies. Fails if the source cannot be read or the scratch file
-    /// cannot be written.
+    /// `reach`) in which their position in `reference` lies. Returns the handle of this file. Fails if the source
+    /// cannot be read or the scratch file cannot be written.
     fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
@@ -149,7 +149,7 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = self.events.task("merge", "states", (ids.len() * frames) as u64);
-        let wanted = ReadPlan::new(0..frames).keeping_at_most(self.max_kept_frames);
+        let wanted = ReadPlan::new(0..frames).with_max_kept_frames(self.max_kept_frames);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state_buffer();
         for frame in 0..frames {

@@ -158,7 +158,7 @@ impl NeighborSearch<'_> {
                 }
             }
         }
-        let found = self.nearest.sorted();
+        let found = self.nearest.sort_by_distance();
         (found[..found.len().min(k)].iter().map(|&(_, index)| index), found.len() > k)
     }
 

@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::MergeGroups;
-use super::gates::unit_rotation;
+use super::appearance::unit_rotation;
 use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, ProxyHigherSh, ProxyOpacity, ProxyPosition};
@@ -28,8 +28,8 @@ const THOMSEN: f64 = 1.6075;
 pub struct ProxyState {
     /// Center, in scene units.
     pub position: DVec3,
-    /// Unit quaternion (w, x, y, z). Its axes are in the order of the leader's axes, and its sign is the one nearest to
-    /// the leader's quaternion.
+    /// Unit quaternion (w, x, y, z). Its axes are in the order of the axes of the leader (most important member of the
+    /// cluster), and its sign is the one nearest to the leader's quaternion.
     pub rotation: [f64; 4],
     /// Natural logarithms of the scales (scene units); always finite.
     pub log_scale: [f64; 3],
@@ -63,7 +63,7 @@ impl ProxyState {
 pub struct Importance<'a> {
     /// Id of each row of the table of Gaussians.
     pub ids: &'a [u32],
-    /// Contribution C (mean share in the renders, pixels) of each id.
+    /// Mean contribution C of each id to a render, in pixels.
     pub coverage: &'a [f64],
     /// Visibility Vis (share of the views in which the Gaussian is on screen) of each id.
     pub visibility: &'a [f64],

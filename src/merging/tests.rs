@@ -114,7 +114,7 @@ impl MergeScene {
         for i in 0..self.states.len() {
             let position = DVec3::from(self.states.position.row::<3>(i).map(f64::from));
             self.states.position.set_row(i, (rotation * position * scale + shift).to_array().map(|x| x as f32));
-            let q = rotation * gates::unit_rotation(self.states.rotation.row(i));
+            let q = rotation * appearance::unit_rotation(self.states.rotation.row(i));
             self.states.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
             let log_scale = self.states.log_scale.row::<3>(i).map(|s| s + scale.ln() as f32);
             self.states.log_scale.set_row(i, log_scale);

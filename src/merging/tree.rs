@@ -68,7 +68,7 @@ impl NearestPoints {
     }
 
     /// Returns the points found as (bits of the squared distance, index), nearest first, equal distances by index.
-    pub fn sorted(&mut self) -> &[(u64, u32)] {
+    pub fn sort_by_distance(&mut self) -> &[(u64, u32)] {
         if self.found.len() > self.wanted {
             self.drop_far();
         }

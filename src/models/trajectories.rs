@@ -15,7 +15,7 @@ use crate::files::ply::write::write_inria;
 use crate::files::sog::write::{SogErrors, visible_only, write_sog};
 use crate::files::spz::{SpzVersion, write_spz};
 use crate::limits::Limits;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::outputs::curves::write_curves;
@@ -111,8 +111,8 @@ fn write_merged(
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin_block(&times[of_block.clone()])?;
         for part in &parts {
-            let mut frames =
-                merged.open_together(part.clone(), &ReadPlan::new(of_block.clone()).keeping_at_most(FRAME_BLOCK))?;
+            let mut frames = merged
+                .open_together(part.clone(), &ReadPlan::new(of_block.clone()).with_max_kept_frames(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
                 frames.read(start, Attributes::all().difference(*varying), &mut constant)?;
@@ -194,7 +194,7 @@ pub fn write_sequence(
         _ => (),
     }
     let progress = events.task("emit", "frames", info.times.len() as u64);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
     for frame in 0..info.times.len() {
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
@@ -212,7 +212,7 @@ pub fn write_sequence(
 fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events: &Events) -> Result<Vec<String>> {
     let frames = source.info().times.len();
     let progress = events.task("emit", "frames", frames as u64);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
     let mut errors = SogErrors::default();
     for frame in 0..frames {
         let state = visible_only(states.read(frame)?);

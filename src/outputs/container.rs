@@ -27,7 +27,7 @@ pub const FRAME_BLOCK: usize = 32;
 /// Number of frames per tile in a container with error bounds. It is larger than [`FRAME_BLOCK`], because with error
 /// bounds the first frame of a tile takes as much space as all others together, and longer tiles have fewer first
 /// frames.
-pub const BOUNDED_FRAME_BLOCK: usize = 64;
+pub const FRAME_BLOCK_WITH_ERROR_BOUNDS: usize = 64;
 
 /// Encoding of the values in a container: compression and maximum errors.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +51,7 @@ impl Packing {
 
     /// Returns the number of frames per tile, which is larger if there are error bounds.
     pub fn frame_block(&self) -> usize {
-        if self.bounds == ErrorBounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
+        if self.bounds == ErrorBounds::default() { FRAME_BLOCK } else { FRAME_BLOCK_WITH_ERROR_BOUNDS }
     }
 
     /// Returns the number of frame blocks (ranges of consecutive frames) into which the frames of `source` are divided.
@@ -317,10 +317,11 @@ pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes the frames `frames` of `source` as one frame block. `presence` holds the [`BlockChange`] of each block of
-/// Gaussians in these frames. Calls `each` for every tile in the order of the container, with the index of its block of
-/// Gaussians, the index of its column, and the tile; `None` means that the tile equals that of the frame block before.
-/// Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the last call.
+/// Encodes the frames `frames` of `source` as one frame block (consecutive frames that are stored together). `presence`
+/// tells for each block of Gaussians which of its values have to be encoded. Calls `each` for every tile in the order
+/// of the container, with the index of its block of Gaussians, the index of its column, and the tile; `None` means that
+/// the tile equals that of the frame block before. Calls `advance` with the number of Gaussian states (Gaussians ×
+/// frames) encoded since the last call.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,

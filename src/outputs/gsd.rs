@@ -50,7 +50,7 @@ pub fn write_gsd(source: &dyn FrameSource, path: &Path, held: usize, events: &Ev
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let scratch = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
     let mut blocks = BufWriter::new(scratch);
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(held))?;
     let (mut frames, mut most, mut left_out) = (Vec::<Value>::new(), 0, 0);
     for frame in 0..info.times.len() {
         let packed = PackedFrame::new(states.read(frame)?);
@@ -116,7 +116,8 @@ struct PackedFrame {
 }
 
 impl PackedFrame {
-    /// Packs the visible Gaussians of `state` into textures, without those that have a value that is not finite.
+    /// Packs the visible Gaussians of `state` into textures and returns them. Leaves out Gaussians with a value that is
+    /// not finite.
     fn new(state: &Gaussians) -> PackedFrame {
         let visible = |&row: &usize| opacity(state.opacity_logit.row::<1>(row)[0]) >= MIN_VISIBLE_OPACITY;
         let seen: Vec<usize> = (0..state.len()).filter(visible).collect();

@@ -15,7 +15,7 @@ use zip::{CompressionMethod, DateTime};
 
 use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
-use crate::model::{self, Rows, Statistic};
+use crate::model::{self, Statistic, StatisticRows};
 
 /// Statistics and scores of N Gaussians, and whether the selection keeps each of them. Every slice has one value per
 /// Gaussian.
@@ -23,7 +23,7 @@ use crate::model::{self, Rows, Statistic};
 pub struct RowTable<'a> {
     /// Statistics, each a column of the table ([`Statistic::column_name`]). The peak contribution W, if measured, is
     /// the last column of the table.
-    pub rows: &'a Rows,
+    pub rows: &'a StatisticRows,
     /// Static score S_static of each Gaussian, from its contribution and shape.
     pub static_score: &'a [f64],
     /// Dynamic score S_dynamic of each Gaussian, from its motion and opacity.
@@ -158,13 +158,13 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::Flags;
+    use crate::model::AnomalyFlags;
 
     const N: usize = 3;
 
-    fn rows() -> Rows {
+    fn rows() -> StatisticRows {
         let ramp = |by: f64| (0..N).map(|i| (i as f64 + 0.1) * by).collect::<Vec<_>>();
-        Rows {
+        StatisticRows {
             d: vec![0.1, f64::NAN, 1e-300],
             kappa: ramp(2.0),
             v: ramp(1.0 / 3.0),
@@ -173,7 +173,7 @@ mod tests {
             w: ramp(0.2),
             e: vec![1.0, 1e12, f64::INFINITY],
             vis: ramp(0.3),
-            flags: vec![Flags::empty(); N],
+            flags: vec![AnomalyFlags::empty(); N],
         }
     }
 
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_column_of_wrong_length_is_named() {
-        let rows = Rows { w: Vec::new(), ..rows() };
+        let rows = StatisticRows { w: Vec::new(), ..rows() };
         let table = RowTable {
             rows: &rows,
             static_score: &[0.0; N],
@@ -268,7 +268,7 @@ mod tests {
 
     #[test]
     fn no_gaussians_give_empty_tables() {
-        let rows = Rows::default();
+        let rows = StatisticRows::default();
         let table = RowTable { rows: &rows, static_score: &[], dynamic_score: &[], score: &[], keep: &[] };
         let folder = tempfile::tempdir().unwrap();
         let (npz, csv) = (folder.path().join("a.npz"), folder.path().join("a.csv"));

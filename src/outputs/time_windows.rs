@@ -10,7 +10,7 @@ use std::path::Path;
 
 use crate::error::{Error, Result};
 use crate::files::ftgs::{
-    CENTER, ClipTimes, LOG_DEVIATION, MIN_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_exact_ftgs,
+    ClipTimes, LOG_TIME_DEVIATION, MIN_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY, write_exact_ftgs,
 };
 use crate::files::tsog::write::{MAX_FRAMES, write_tsog};
 use crate::files::tsog::{TimedGaussians, Timeline};
@@ -136,7 +136,7 @@ fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
 /// the frames to 0 to 1. Gaussians with values that are not finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
-    let mut states = FrameStates::open(source, &ReadPlan::all_frames().keeping_at_most(1))?;
+    let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(1))?;
     let (mut parts, mut frame_of) = (Vec::new(), Vec::new());
     for frame in 0..info.times.len() {
         let state = states.read(frame)?;
@@ -163,7 +163,7 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
 }
 
 /// Fits lines in time windows (linear motion with an opacity that is a Gaussian function of time) to all Gaussians of
-/// `source`, for the format `kind`.
+/// `source`, for the format `kind`. Returns the lines and the error of the fit.
 fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
@@ -171,7 +171,7 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     let times: Vec<f64> = info.times.iter().map(|&time| clip.to_unit(time)).collect();
     let (tolerance, form) = match kind {
         OutputKind::Tsog => (Tolerance::COMPACT, CurveForm::linear(0.0).with_intervals(COMPACT_INTERVALS)),
-        _ => (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_DEVIATION)),
+        _ => (Tolerance::default(), CurveForm::linear(std::f64::consts::SQRT_2 * MIN_TIME_DEVIATION)),
     };
     let found = map_tracks(source, &times, &progress, |track| {
         let mut misfit = FitError::default();
@@ -211,8 +211,8 @@ fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     line.sh.iter().enumerate().for_each(|(c, &value)| gaussians.sh.plane_mut(c)[row] = value);
     // The window of the fit is exp(−(dt/w)²), which has the standard deviation w/√2.
     let deviation = (line.width / std::f64::consts::SQRT_2).min(CONSTANT_DEVIATION);
-    params.format_specific.plane_mut(CENTER)[row] = narrow(line.center);
-    params.format_specific.plane_mut(LOG_DEVIATION)[row] = narrow(deviation.ln());
+    params.format_specific.plane_mut(TIME_CENTER)[row] = narrow(line.center);
+    params.format_specific.plane_mut(LOG_TIME_DEVIATION)[row] = narrow(deviation.ln());
     (0..3).for_each(|c| params.format_specific.plane_mut(VELOCITY + c)[row] = narrow(line.position[1][c]));
 }
 
@@ -233,10 +233,10 @@ mod tests {
         let params = &file.params;
         let own = |plane: usize, row: usize| f64::from(params.format_specific.plane(plane)[row]);
         let state = |row: usize| {
-            let dt = time - own(CENTER, row);
+            let dt = time - own(TIME_CENTER, row);
             let at = params.gaussians.position.row::<3>(row);
             let place = std::array::from_fn(|c| f64::from(at[c]) + own(VELOCITY + c, row) * dt);
-            let deviation = own(LOG_DEVIATION, row).exp().max(file.header.min_deviation);
+            let deviation = own(LOG_TIME_DEVIATION, row).exp().max(file.header.min_deviation);
             let alpha = opacity(params.gaussians.opacity_logit.row::<1>(row)[0]);
             (place, (alpha * (-0.5 * (dt / deviation).powi(2)).exp()).max(file.header.opacity_floor))
         };
@@ -285,7 +285,7 @@ mod tests {
         let fitted = fit(&scene, OutputKind::Ftgs, &Events::IGNORED).unwrap();
         let params = &fitted.lines.params;
         assert!(params.len() <= 40 && !params.is_empty());
-        assert!(params.format_specific.plane(LOG_DEVIATION).iter().all(|&log| f64::from(log) > 7.0));
+        assert!(params.format_specific.plane(LOG_TIME_DEVIATION).iter().all(|&log| f64::from(log) > 7.0));
         assert!(
             (VELOCITY..PARAMS_PER_GAUSSIAN).all(|plane| params.format_specific.plane(plane).iter().all(|&x| x == 0.0))
         );

@@ -16,8 +16,9 @@ pub struct SourceWithDeltas<'a> {
 }
 
 impl<'a> SourceWithDeltas<'a> {
-    /// Wraps `source`: adds `delta` and `trajectory` to its Gaussians, and keeps SH coefficients up to `sh_degree`
-    /// only. If both deltas are empty and `source` has no higher SH degree, its frames are returned unchanged.
+    /// Creates a source of the frames of `source` with these changes: adds `delta` and `trajectory` to its Gaussians,
+    /// and keeps the SH coefficients up to `sh_degree` only. If both deltas are empty and `source` has no higher SH
+    /// degree, its frames are returned unchanged.
     pub fn new(
         source: Box<dyn FrameSource + 'a>,
         delta: &'a ParamDelta,

@@ -9,8 +9,8 @@ use crate::model::{Attributes, Gaussians};
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
-    /// Resizes the attributes `want` of `state` to `count` Gaussians and divides them into slices, one set for each
-    /// block of [`GAUSSIANS_PER_BLOCK`] Gaussians.
+    /// Resizes the attributes `want` of `state` to `count` Gaussians. Divides their values into mutable slices, one set
+    /// for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians, and returns these sets in order.
     pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> =
             (0..count.div_ceil(GAUSSIANS_PER_BLOCK)).map(|_| BlockSlices(Vec::new())).collect();

@@ -107,7 +107,8 @@ pub struct ViewStates<'a, const S: usize> {
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool.
+    /// Renders the subject (source) with index `subject` over `background` on all threads of the pool, and returns the
+    /// image.
     ///
     /// If the subject has features, the renderer blends these in place of colors, and the decoder of its model computes
     /// the color of each pixel from them. `background` is then ignored.
@@ -177,7 +178,7 @@ pub fn for_each_view_batch<const S: usize>(
     max_batch: BatchLimits,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).keeping_at_most(max_batch.held);
+    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).with_max_kept_frames(max_batch.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);

@@ -85,9 +85,9 @@ pub fn scoring_views(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames:
     select_evenly_over_frames(&left, scan.look_pictures, frames)
 }
 
-/// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians that are ever alive are alive
-/// in one of them, provided that each is alive without a gap. `life` holds for each Gaussian the number of frames in
-/// which it is alive, out of `frames` frames.
+/// Returns how many evenly spaced frames are needed so that at least 99% of the Gaussians that are ever alive (opacity
+/// ≥ alpha_min) are alive in one of them, provided that each is alive without a gap. `life` holds for each Gaussian the
+/// number of frames in which it is alive, out of `frames` frames.
 pub fn frames_to_cover(life: &[u32], frames: usize) -> usize {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
     if lives.is_empty() {

@@ -12,7 +12,7 @@ use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::Forecast;
-use crate::journal::records::LeftOut;
+use crate::journal::records::OmittedWork;
 use crate::memory_plan::{Budget, MemoryPlan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::RunPlan;
@@ -58,7 +58,7 @@ pub struct DryRunReport {
     /// Expected time and memory of the run.
     pub forecast: Forecast,
     /// Stages that would be omitted, with reasons.
-    pub left_out: Vec<LeftOut>,
+    pub left_out: Vec<OmittedWork>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
@@ -112,7 +112,7 @@ pub fn dry_run(request: &Request) -> Result<DryRunReport> {
         would_write: std::iter::once(output.clone()).chain(companion_names(&request.output, output_kind)).collect(),
         output,
         output_kind,
-        counts: run.counts_text(),
+        counts: run.planned_counts_text(),
         forecast,
         left_out: journal.left_out,
         notes: scene.notes,

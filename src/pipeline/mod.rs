@@ -120,7 +120,7 @@ fn run_stages(
     let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::measured_statistics).unwrap_or_default());
     let _numbered =
         scene.events.begin_run(&stage_seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
-    let input = InputSummary::from_scene(scene)?.without_folders();
+    let input = InputSummary::from_scene(scene)?.with_file_names_only();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let sh_degree = match request.recipe.bands.bands {
         ShDegreeRule::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),

@@ -231,7 +231,7 @@ fn finish_measuring(measuring: Measuring<'_>, measure: &MeasureStages, scene: &m
         None => {
             let found = measuring.finish(&complete);
             // The frames were measured with all Gaussians, before some of them proved to have NaN or infinity.
-            match measure.score.absent_ids(&found.scanned.rows).is_empty() {
+            match measure.score.non_finite_ids_to_drop(&found.scanned.rows).is_empty() {
                 true => Ok(found),
                 false => Err("Gaussians with NaN or infinity are dropped from all frames"),
             }

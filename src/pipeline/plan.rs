@@ -16,7 +16,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
-use crate::pruning::visible::VisibilityStage;
+use crate::pruning::visibility::VisibilityStage;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
@@ -232,8 +232,8 @@ impl RunPlan {
     }
 
     /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn is_open_ended(&self) -> bool {
-        self.search.is_some() || self.stages.is_open_ended()
+    pub fn has_uncertain_duration(&self) -> bool {
+        self.search.is_some() || self.stages.has_uncertain_duration()
     }
 
     /// Returns a line of text for each divisible stage, whose work several processes can share. The line holds the name
@@ -244,7 +244,7 @@ impl RunPlan {
     }
 
     /// Returns a line of text for display that states how many Gaussians ranking and refinement leave.
-    pub fn counts_text(&self) -> String {
+    pub fn planned_counts_text(&self) -> String {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
@@ -255,7 +255,7 @@ impl RunPlan {
         let search = self.search.as_ref().map(SearchStage::parameters);
         let left_out = self.stages.omitted_stages_text();
         let lines = parameters.chain(search).chain(left_out).map(|line| format!("\n  {line}"));
-        self.counts_text() + &lines.collect::<String>()
+        self.planned_counts_text() + &lines.collect::<String>()
     }
 
     /// Checks that a run which reads `input` may write its output. Called before the input is opened.

@@ -48,7 +48,8 @@ pub struct Planning<'a> {
     pub prunes: bool,
     /// Whether survivors (Gaussians that are not removed) are merged.
     pub merges: bool,
-    /// Refinement stage, which fits the survivors to renders of the original; `None` if nothing is refined.
+    /// Refinement stage, which fits the survivors (Gaussians left by pruning) to renders of the original; `None` if
+    /// nothing is refined.
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,
@@ -65,7 +66,7 @@ impl Planning<'_> {
 
     /// Returns whether refinement chooses the SH degree for a requested size on disk. If so, the run refines, for each
     /// degree, as many Gaussians as fit the size, and takes the degree with the best quality.
-    pub fn chooses_degree(&self) -> bool {
+    pub fn chooses_sh_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
     }

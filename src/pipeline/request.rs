@@ -14,7 +14,7 @@ use crate::scene::InputOptions;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PruneOrMerge {
-    /// Prunes Gaussians, then merges the survivors.
+    /// Prunes Gaussians, then merges the survivors (Gaussians left by pruning).
     #[default]
     Both,
     /// Only prunes Gaussians (the paper's "pruned").

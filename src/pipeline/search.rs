@@ -34,8 +34,8 @@ use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{ViewSet, select_views};
 use crate::scene::stamps;
+use crate::scene::view_selection::{ViewSet, select_views};
 use crate::source::FrameSource;
 
 /// Name of this stage in plans, progress and summaries.
@@ -134,7 +134,7 @@ impl SearchStage {
                 vec![("states", whole), ("readers", reader), ("held", held), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)],
             ]
             .concat(),
-            fixed: vec![work.filling_blocks()],
+            fixed: vec![work.block_buffer_memory()],
         };
         let (seconds, reads) = repeated.iter().fold((0.0, 0.0), |(s, r), stage| (s + stage.seconds, r + stage.reads));
         let largest = repeated.iter().chain([&measured]).max_by_key(|stage| stage.bytes(work));

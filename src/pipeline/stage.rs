@@ -207,7 +207,7 @@ pub struct StageList {
     /// Plan of how many Gaussians ranking and refinement leave.
     pub counts: CountPlan,
     /// Whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    is_open_ended: bool,
+    has_uncertain_duration: bool,
 }
 
 impl StageList {
@@ -238,13 +238,13 @@ impl StageList {
     }
 
     /// Records that the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn set_open_ended(&mut self) {
-        self.is_open_ended = true;
+    pub fn set_uncertain_duration(&mut self) {
+        self.has_uncertain_duration = true;
     }
 
     /// Returns whether the amount of work depends on intermediate results, so that the time of the run is less certain.
-    pub fn is_open_ended(&self) -> bool {
-        self.is_open_ended
+    pub fn has_uncertain_duration(&self) -> bool {
+        self.has_uncertain_duration
     }
 
     /// Returns all stages in the order in which they run.
@@ -278,7 +278,7 @@ impl StageList {
                 None => journal.leave_out(*what, why),
                 Some(ResourceEstimate { seconds, reads, .. }) => {
                     let seconds = seconds / work.threads as f64;
-                    journal.record_saving(*what, why, SavedCost::Stage { seconds, reads });
+                    journal.leave_out_with_saving(*what, why, SavedCost::Stage { seconds, reads });
                 }
             }
         }

@@ -14,7 +14,7 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    FieldSummary, FlagSummary, Forecast, LeftOut, QualitySummary, RefinedSummary, ShDegreeSummary, StageRecord,
+    FieldSummary, FlagSummary, Forecast, OmittedWork, QualitySummary, RefinedSummary, ShDegreeSummary, StageRecord,
     TermSummary, number, sizes,
 };
 use crate::merging::PassCounts;
@@ -130,7 +130,7 @@ impl InputSummary {
 
 impl InputSummary {
     /// Returns the description with the path reduced to its last component, for a file that may be published.
-    pub fn without_folders(self) -> InputSummary {
+    pub fn with_file_names_only(self) -> InputSummary {
         InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
 }
@@ -246,7 +246,7 @@ pub struct Summary {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub archive: Option<ArchiveSummary>,
     /// Stages that the run omitted, with reasons.
-    pub left_out: Vec<LeftOut>,
+    pub left_out: Vec<OmittedWork>,
     /// Notes for the user.
     pub notes: Vec<String>,
     /// Paths of the files of the result, relative to the folder of the summary. Overwriting the result replaces these

@@ -56,7 +56,7 @@ pub(super) fn forecast(
     let work = scene.workload();
     let shortest = stages.shortest_estimates(&work, &scene.limits, measured, found.hardly_seen);
     let estimates = stages.remaining_estimates(&work, &scene.limits, measured);
-    Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak_bytes()))
+    Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.has_uncertain_duration(), plan.peak_bytes()))
 }
 
 /// Result of a calibration of time estimates.

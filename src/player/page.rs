@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{policy_digest, policy_meta_element};
 use crate::model::{Camera, Rig, Split};
-use crate::scene::outside::{MIN_ANGLE, RigCone, training_cameras};
+use crate::scene::views_outside::{MIN_ANGLE, RigCone, training_cameras};
 
 /// File name of the player page in an output folder.
 pub const INDEX_FILE: &str = "index.html";
@@ -114,7 +114,7 @@ pub fn training_rig(rig: &Rig) -> Option<PageRig> {
     let all = training_cameras(rig);
     let step = all.len().div_ceil(RIG_CAMERAS).max(1);
     let cone = RigCone::new(&all.into_iter().step_by(step).collect::<Vec<Camera>>());
-    let faces: Vec<[f64; 3]> = cone.faces().iter().map(|face| face.to_array()).collect();
+    let faces: Vec<[f64; 3]> = cone.inward_face_normals().iter().map(|face| face.to_array()).collect();
     (!faces.is_empty()).then(|| PageRig { focus: cone.focus().to_array(), faces, tolerance: MIN_ANGLE.sin() })
 }
 
@@ -304,7 +304,7 @@ fn inline(json: &serde_json::Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::player::lattice::PlayerSteps;
+    use crate::player::quantization::PlayerSteps;
 
     fn stage(name: &str) -> PageScene {
         let track = PageSequence {

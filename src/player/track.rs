@@ -1,7 +1,7 @@
 //! Encoding of a sequence for the page: a first state, then groups of frames as differences in time.
 //!
 //! Input: a source of frames. Output: chunks of bytes, in order. Memory: one state, and the quantized values of the
-//! frames of one group, which are at most [`GROUP_VALUES`] unless the group has only one frame.
+//! frames of one group, which are at most [`MAX_VALUES_PER_FRAME_GROUP`] unless the group has only one frame.
 //!
 //! Chunk 0 holds the first frame with every scalar component (such as the x of the position). Each later chunk holds
 //! one group of consecutive frames, with the components of varying attributes. To decode a chunk, only this chunk and
@@ -23,7 +23,7 @@ use flate2::write::ZlibEncoder;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::lattice::{PlayerSteps, check_positions, component_count, component_range, quantize_into};
+use super::quantization::{PlayerSteps, check_positions, component_count, component_range, quantize_into};
 use crate::error::{Error, Result};
 use crate::model::{Attributes, Gaussians};
 use crate::passes::FrameStates;
@@ -32,7 +32,7 @@ use crate::source::{FrameSource, ReadPlan};
 
 /// Maximum number of quantized values of a group of frames, which are in memory at once. A group of one frame may have
 /// more.
-pub const GROUP_VALUES: usize = 1 << 23;
+pub const MAX_VALUES_PER_FRAME_GROUP: usize = 1 << 23;
 /// Maximum number of frames of a group. The page must decode a whole group to jump to another time.
 const GROUP_FRAMES: usize = 20;
 /// Compression level of deflate. Differences are mostly noise, so higher levels gain little for their time.
@@ -71,7 +71,7 @@ impl PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
         let of_frame = info.varying.width(sh_degree).max(1) * info.count.max(1);
-        let together = (GROUP_VALUES / of_frame).clamp(1, GROUP_FRAMES);
+        let together = (MAX_VALUES_PER_FRAME_GROUP / of_frame).clamp(1, GROUP_FRAMES);
         // Groups are about equally long, because each costs about the same to start.
         let groups = (frames.len().saturating_sub(1)).div_ceil(together);
         let varying = if groups == 0 { Attributes::empty() } else { changing(info.varying) };
@@ -118,7 +118,7 @@ pub fn encode(
 ) -> Result<()> {
     let Some(&first) = frames.first() else { return Ok(()) };
     let progress = events.task("view", "frames", frames.len() as u64);
-    let mut states = FrameStates::open(source, &ReadPlan::new(frames.iter().copied()).keeping_at_most(held))?;
+    let mut states = FrameStates::open(source, &ReadPlan::new(frames.iter().copied()).with_max_kept_frames(held))?;
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
     let mut points = vec![0; component_count(degree) * count];

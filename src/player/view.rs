@@ -10,13 +10,13 @@ use crate::limits::Limits;
 use crate::memory_plan::{MemoryPlan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
-use crate::player::lattice::{PlayerSteps, component_count};
 use crate::player::page::{ChunkFiles, INDEX_FILE, PageModel, PageScene, cameras, mean_up, training_rig};
 use crate::player::poster::{self, render_poster};
-use crate::player::track::{GROUP_VALUES, PageSequence, encode};
+use crate::player::quantization::{PlayerSteps, component_count};
+use crate::player::track::{MAX_VALUES_PER_FRAME_GROUP, PageSequence, encode};
 use crate::progress::Events;
 use crate::scene::open_compressed;
-use crate::scene::pictures::render_background;
+use crate::scene::view_selection::render_background;
 use crate::scene::{InputOptions, first_frame_box, open_scene, scratch_beside};
 
 /// Name of the stage, for progress and the memory plan.
@@ -79,10 +79,11 @@ fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
 }
 
-/// Writes the page that plays the model, or two models side by side.
+/// Writes the page that plays the model, or two models side by side. Returns the paths, the number of frames and the
+/// size of the page.
 ///
-/// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values ([`GROUP_VALUES`]), and
-/// the render of the poster.
+/// Memory: the Gaussians of one model at one frame, a group of its frames as quantized values
+/// ([`MAX_VALUES_PER_FRAME_GROUP`]), and the render of the poster.
 ///
 /// # Errors
 /// Fails if the inputs, the cameras or the output are invalid. Nothing is written then.
@@ -225,7 +226,7 @@ fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
             per_gaussian,
         ],
         // The group, eight of its components as differences and as bytes, and the compressed chunk.
-        fixed: vec![work.filling_blocks(), render, ("group", 10 * of_all.min(GROUP_VALUES as u64))],
+        fixed: vec![work.block_buffer_memory(), render, ("group", 10 * of_all.min(MAX_VALUES_PER_FRAME_GROUP as u64))],
     }
 }
 

@@ -31,8 +31,9 @@ pub struct VisibleContribution {
 }
 
 impl VisibleContribution {
-    /// Converts the sums and maxima in `found` to contributions C and peaks W. `pictures`: number of views that were
-    /// rendered; only every `pixel_stride`-th column and row of their pixels was rendered.
+    /// Converts the sums and maxima in `found` to contributions C (mean per view, pixels) and peaks W (largest weight
+    /// in a pixel), and returns these. `pictures`: number of views that were rendered; only every `pixel_stride`-th
+    /// column and row of their pixels was rendered.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.in_pixels(i) * per_pixel / pictures.max(1) as f64).collect();
@@ -123,7 +124,7 @@ impl RunningContribution {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::DemoScene;
-    use crate::model::{Flags, Gaussians, Rig, Rows, SequenceInfo, Split, ViewSchedule};
+    use crate::model::{AnomalyFlags, Gaussians, Rig, SequenceInfo, Split, StatisticRows, ViewSchedule};
     use crate::passes::scoring_views;
     use crate::pruning::{Overrides, select};
     use crate::recipe::{self, Recipe};
@@ -284,7 +285,7 @@ mod tests {
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
         let zeros = || vec![0.0; count];
-        let rows = Rows {
+        let rows = StatisticRows {
             d: zeros(),
             kappa: zeros(),
             v: zeros(),
@@ -293,7 +294,7 @@ mod tests {
             w: seen.peak,
             e: zeros(),
             vis: vec![1.0; count],
-            flags: vec![Flags::empty(); count],
+            flags: vec![AnomalyFlags::empty(); count],
         };
         let scores = score::score(&rows, 2, &recipe.score);
         let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();

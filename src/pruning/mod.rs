@@ -9,7 +9,7 @@ pub mod contribution;
 mod ranking;
 pub mod removal;
 pub mod score;
-pub mod visible;
+pub mod visibility;
 
 pub use ranking::Ranking;
 

@@ -51,8 +51,8 @@ pub(super) struct Orders {
     stage_2: usize,
 }
 
-/// Sorts all Gaussians in the two orders of [`Orders`]. `candidates`: number of Gaussians that stage 1 keeps. `passes`:
-/// for each Gaussian, whether it passes stage 2.
+/// Sorts all Gaussians twice: by the score of stage 1, and by the criterion of stage 2. Returns both orders.
+/// `candidates`: number of Gaussians that stage 1 keeps. `passes`: for each Gaussian, whether it passes stage 2.
 pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();

@@ -50,7 +50,7 @@ pub fn removal_error(
         pictures,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
-            renderer.removal_error(state, PixelGrid::centered(stride).viewed_from(camera), background, errors);
+            renderer.removal_error(state, PixelGrid::centered(stride).sampled_view(camera), background, errors);
             advance();
         },
     )?;

@@ -13,7 +13,7 @@ use crate::journal::records::{FlagSummary, SavedCost, TermSummary};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
-use crate::model::{Attributes, Flags, Gaussians, Rows};
+use crate::model::{AnomalyFlags, Attributes, Gaussians, StatisticRows};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{frames_to_cover, gather};
 use crate::pruning;
@@ -31,12 +31,12 @@ pub(crate) const NAME: &str = "score";
 
 /// Bytes of memory per Gaussian, while scoring, for its statistics, its scores and the selection of Gaussians to keep.
 pub const SCORING_BYTES_PER_GAUSSIAN: u64 =
-    (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
+    (StatisticRows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// Returns the named parts of the memory per Gaussian, in bytes, that stay in use after scoring: the selection of
 /// Gaussians to keep, and the statistics unless these are in a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
-    let rows = if limits.statistics_on_disk { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
+    let rows = if limits.statistics_on_disk { 0 } else { StatisticRows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
@@ -45,8 +45,8 @@ pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
 pub struct ScoreStage {
     /// Whether motion that could be rounding noise of the positions is set to zero.
     pub snap_noise: bool,
-    /// Policy for Gaussians with NaN or infinity in an attribute: stop with an error, drop them, or keep them
-    /// unchanged.
+    /// Policy for Gaussians with NaN or infinity in an attribute: the run stops with an error, drops them, or keeps
+    /// them unchanged.
     pub non_finite: NonFinite,
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
@@ -83,8 +83,8 @@ pub struct Scored {
     /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
     /// Gaussians.
     pub absent: Vec<u32>,
-    /// Reference frame (the frame in which most Gaussians are alive, at which Gaussians are compared for merging), and
-    /// the extent of the scene at this frame.
+    /// Reference frame, at which Gaussians are compared for merging (the frame with the most Gaussians alive, opacity ≥
+    /// alpha_min), and the extent of the scene at this frame.
     pub reference: ReferenceFrame,
     /// Noise level of a position, in scene units: the distance between neighboring f32 values at the scene's largest
     /// coordinate.
@@ -116,13 +116,13 @@ impl ScoreStage {
                 ("sorting", pruning::WORKING_BYTES_PER_GAUSSIAN as u64),
                 ("states", work.state_bytes(Attributes::POSITION | Attributes::LOG_SCALE)),
             ],
-            fixed: vec![work.filling_blocks()],
+            fixed: vec![work.block_buffer_memory()],
         }
     }
 
     /// Returns the ids, in increasing order, of the Gaussians that are dropped because one of their values is not
     /// finite. There are none if the recipe does not drop such Gaussians.
-    pub fn absent_ids(&self, rows: &Rows) -> Vec<u32> {
+    pub fn non_finite_ids_to_drop(&self, rows: &StatisticRows) -> Vec<u32> {
         if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
@@ -170,7 +170,7 @@ impl ScoreStage {
                     .extend(all.iter().copied().filter(|&id| is_inside(&corners, state.position.row(id as usize))));
             }
             let mut drop = self.user.drop.clone();
-            let absent = self.absent_ids(&rows);
+            let absent = self.non_finite_ids_to_drop(&rows);
             match self.non_finite {
                 NonFinite::Error => refuse_non_finite(scene, &rows)?,
                 NonFinite::Drop => drop.extend(&absent),
@@ -217,11 +217,11 @@ fn is_inside(corners: &[f64; 6], position: [f32; 3]) -> bool {
     (0..3).all(|axis| (corners[axis]..=corners[axis + 3]).contains(&f64::from(position[axis])))
 }
 
-fn non_finite(rows: &Rows) -> impl Iterator<Item = u32> {
-    (0..rows.len() as u32).filter(|&id| rows.flags[id as usize].contains(Flags::NON_FINITE))
+fn non_finite(rows: &StatisticRows) -> impl Iterator<Item = u32> {
+    (0..rows.len() as u32).filter(|&id| rows.flags[id as usize].contains(AnomalyFlags::NON_FINITE))
 }
 
-fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
+fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     let ids: Vec<u32> = non_finite(rows).collect();
     if ids.is_empty() {
         return Ok(());
@@ -234,21 +234,22 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
-/// Counts the Gaussians with unusual values, such as NaN, for each kind of unusual value.
-fn flags(rows: &Rows) -> FlagSummary {
+/// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
+fn flags(rows: &StatisticRows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
-        non_finite: count(Flags::NON_FINITE),
-        zero_rotation: count(Flags::ZERO_ROTATION),
-        snapped_d: count(Flags::SNAPPED_D),
-        snapped_kappa: count(Flags::SNAPPED_KAPPA),
+        non_finite: count(AnomalyFlags::NON_FINITE),
+        zero_rotation: count(AnomalyFlags::ZERO_ROTATION),
+        snapped_d: count(AnomalyFlags::SNAPPED_D),
+        snapped_kappa: count(AnomalyFlags::SNAPPED_KAPPA),
         never_alive: rows.life.iter().filter(|&&life| life == 0).count(),
         never_in_view: rows.vis.iter().filter(|&&vis| vis == 0.0).count(),
     }
 }
 
-/// Fails if Gaussians are alive but none is in any view. This happens if the cameras belong to another scene.
-fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
+/// Fails if Gaussians are alive (opacity ≥ alpha_min) but none is in any view. This happens if the cameras belong to
+/// another scene.
+fn check_views(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
     let seen = rows.vis.iter().filter(|&&vis| vis > 0.0).count();
     if alive > 0 && seen == 0 {
@@ -293,7 +294,7 @@ impl Scored {
     ///
     /// # Errors
     /// Fails if the statistics are in a scratch file that cannot be read back.
-    pub fn rows(&self) -> Result<Cow<'_, Rows>> {
+    pub fn rows(&self) -> Result<Cow<'_, StatisticRows>> {
         self.statistics.rows()
     }
 
@@ -359,7 +360,7 @@ impl Scored {
                 let why = format!("{} is the same in every frame", column.name());
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
-                journal.record_saving(saved_reads(column), why, SavedCost::Values { bytes });
+                journal.leave_out_with_saving(saved_reads(column), why, SavedCost::Values { bytes });
             }
         }
         if info.sh_degree == 0 {
@@ -384,8 +385,8 @@ impl Scored {
     }
 }
 
-/// Returns the median number of frames in which a Gaussian is alive. Gaussians that are never alive are ignored; if all
-/// are, returns 0.
+/// Returns the median number of frames in which a Gaussian is alive (opacity ≥ alpha_min). Gaussians that are never
+/// alive are ignored; if all are, returns 0.
 fn median_life(life: &[u32]) -> u32 {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&frames| frames > 0).collect();
     let middle = lives.len() / 2;

@@ -45,7 +45,8 @@ pub enum MotionParams {
     /// at least `alpha_min`), even if it is not alive in the frame before. The divisor is the number of frames in which
     /// it is alive; for the curvature, this number minus 2.
     Literal,
-    /// Only steps between consecutive frames in which the Gaussian is alive count. The divisor is their number.
+    /// Only steps between consecutive frames in which the Gaussian is alive (opacity ≥ alpha_min) count. The divisor is
+    /// their number.
     Runs,
 }
 

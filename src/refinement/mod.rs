@@ -119,13 +119,14 @@ impl RefineStage {
         RefineStage { sh_degree: 0, ..self }
     }
 
-    /// Returns a copy of this stage whose parameter deltas do not vary with time.
+    /// Returns a copy of this stage whose parameter deltas (values that refinement adds to the stored parameters) do
+    /// not vary with time.
     pub fn with_constant_deltas(self) -> RefineStage {
         RefineStage { knots: 0, ..self }
     }
 
     /// Returns a copy of this stage with the numbers of optimization steps multiplied by `part` and rounded up, and
-    /// with deltas that do not vary with time.
+    /// with parameter deltas (values that refinement adds to the stored parameters) that do not vary with time.
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
         RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
@@ -164,8 +165,8 @@ impl RefineStage {
         (part * self.steps as f64).ceil() as usize
     }
 
-    /// Returns the number of keyframes of the time-varying parameter delta for the input described by `work`; 0 if the
-    /// delta is constant in time.
+    /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame,
+    /// interpolated between keyframes) for the input described by `work`; 0 if the delta is constant in time.
     fn keyframes_for(&self, work: &Workload) -> usize {
         match (work.input.jacobian, work.frames) {
             // The number of frames of a stream is not known in advance, so the maximum number of keyframes is assumed.
@@ -201,9 +202,9 @@ impl RefineStage {
         let read = [("readers", work.input.reader), ("held", work.kept_frames_bytes(limits, Attributes::all()))];
         let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
-        // With a deformation field, no reader is open while steps are made, and either two more states and what the field
-        // computes without time are held while states are evaluated again, or one state per thread while views are
-        // rendered.
+        // With a deformation field, no reader is open while steps are made, and either two more states and what the
+        // field computes without time are held while states are evaluated again, or one state per thread while views
+        // are rendered.
         let is_deformed = work.input.jacobian > 0;
         let states = if is_deformed { 4 + work.threads.max(2) } else { 6 + work.threads };
         let left_readers = if is_deformed { [("readers", 0), ("held", 0)] } else { read };
@@ -269,7 +270,7 @@ impl RefineStage {
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
-                work.filling_blocks(),
+                work.block_buffer_memory(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
                 ("views", whole_views.max(views_of_steps)),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
@@ -285,8 +286,9 @@ pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> 
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
-/// Returns the number of optimization steps of the time-varying delta, which are run after `steps` optimization steps
-/// of the constant delta: two thirds of `steps`.
+/// Returns the number of optimization steps of the time-varying delta (values that refinement adds to each frame): two
+/// thirds of `steps`. They are run after `steps` optimization steps of the constant delta (values that refinement adds
+/// to the stored parameters).
 fn along_time(steps: usize) -> usize {
     2 * steps / 3
 }

@@ -95,15 +95,16 @@ impl Adam {
         self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
     }
 
-    /// Returns the delta and resets it to 0. The caller has to add the returned delta to the start parameters.
+    /// Returns the delta (current parameters minus start parameters) and resets it to 0. The caller has to add the
+    /// returned delta to the start parameters.
     pub fn take_delta(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
     }
 
-    /// Restarts the optimizer with the delta `change` and with running means of 0. Attributes that `change` does not
-    /// have get a delta of 0.
+    /// Restarts the optimizer at the start parameters plus `change`, with running means of 0. Attributes without values
+    /// in `change` begin at the start parameters.
     pub fn restart(&mut self, change: &ParamDelta) {
         self.take_delta();
         for column in (self.columns & change.attributes()).iter() {
@@ -115,14 +116,14 @@ impl Adam {
         self.done = 0;
     }
 
-    /// Returns the values that a checkpoint stores and [`Adam::resume`] takes: delta, running means, and number of
-    /// steps.
+    /// Returns the values that a checkpoint stores and [`Adam::resume`] takes: delta (current parameters minus start
+    /// parameters), running means of the gradient and its square, and number of steps.
     pub fn checkpoint(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
 
-    /// Restores the delta, running means and number of steps that [`Adam::checkpoint`] returned for an optimizer with
-    /// the same start parameters.
+    /// Restores the values that [`Adam::checkpoint`] returned for an optimizer with the same start parameters: delta
+    /// (current parameters minus start parameters), running means, and number of steps.
     pub fn resume(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }

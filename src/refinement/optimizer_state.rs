@@ -29,11 +29,12 @@ pub(super) struct StepParams {
     pub(super) loss: Loss,
 }
 
-/// Minimum number of frames per keyframe of a delta that varies with time ([`TrajectoryDelta`]).
+/// Minimum number of frames per keyframe of the time-varying delta ([`TrajectoryDelta`]: values that refinement adds to
+/// each frame, interpolated between keyframes).
 const FRAMES_PER_KEYFRAME: usize = 4;
 
-/// Returns the number of keyframes, at most `max_keyframes`, of the time-varying delta for a sequence of `frames`
-/// frames. Returns 0 instead of 1, because one keyframe does not vary with time.
+/// Returns the number of keyframes, at most `max_keyframes`, of the time-varying delta (values that refinement adds to
+/// each frame) for a sequence of `frames` frames. Returns 0 instead of 1, because one keyframe does not vary with time.
 pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     let keyframe_count = max_keyframes.min(frames / FRAMES_PER_KEYFRAME);
     if keyframe_count > 1 { keyframe_count } else { 0 }
@@ -59,20 +60,21 @@ pub(super) struct OptimizerState<'a> {
     /// Indices of the frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Attributes,
-    /// State of each frame in `frames`, without the delta that the optimizer `descent` holds.
+    /// State of each frame in `frames`, without the changes (delta) that the optimizer `descent` has made.
     linearized: LinearizedFrames,
-    /// Stored parameters without the delta that the optimizer `descent` holds. Used only if the model has a deformation
-    /// field.
+    /// Stored parameters without the changes (delta) that the optimizer `descent` has made. Used only if the model has
+    /// a deformation field.
     stored: StoredParams,
-    /// Part of the constant delta that `stored` and `linearized` already include. The optimizer `descent` holds
-    /// the rest.
+    /// Part of the constant delta (change of the stored parameters since the start of refinement) that `stored` and
+    /// `linearized` already include. The optimizer `descent` holds the rest.
     before: ParamDelta,
     fixed: Vec<bool>,
     /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
     /// derivatives its deformation field cannot compute.
     step_params: StepParams,
     descent: Adam,
-    /// One optimizer per keyframe of the time-varying delta; empty if the delta is constant in time.
+    /// One optimizer per keyframe of the time-varying delta (values that refinement adds to each frame); empty if the
+    /// delta is constant in time.
     course: Vec<Adam>,
     /// For each Gaussian, the attributes that vary between frames; no attributes if the model has a deformation field.
     changing: Vec<Attributes>,
@@ -147,7 +149,7 @@ impl<'a> OptimizerState<'a> {
         if deformation.is_some() {
             optimizer.reevaluate_states()?;
         } else {
-            let wanted = ReadPlan::new(optimizer.frames.clone()).keeping_at_most(scene.limits.max_kept_frames);
+            let wanted = ReadPlan::new(optimizer.frames.clone()).with_max_kept_frames(scene.limits.max_kept_frames);
             let mut states = FrameStates::open(result, &wanted)?;
             let mut linearized = LinearizedFramesWriter::new(&scene.scratch, varying)?;
             for &frame in &optimizer.frames {
@@ -171,8 +173,8 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Replaces the optimizer `descent` by a new one, with a delta of 0, for the Gaussians in `linearized`. Also sets
-    /// the stride that suits the number of these Gaussians.
+    /// Replaces the optimizer `descent` by a new one, which has not changed anything yet, for the Gaussians in
+    /// `linearized`. Also sets the stride that suits the number of these Gaussians.
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
@@ -198,7 +200,7 @@ impl<'a> OptimizerState<'a> {
         true
     }
 
-    /// Returns the time-varying delta: one parameter delta per keyframe.
+    /// Returns the time-varying delta, the values that refinement adds to each frame: one set of values per keyframe.
     pub(super) fn course(&self) -> TrajectoryDelta {
         TrajectoryDelta(self.course.iter().map(|knot| knot.delta().clone()).collect())
     }
@@ -279,7 +281,7 @@ impl<'a> OptimizerState<'a> {
         moved.position
     }
 
-    /// Restarts the optimizer from the total constant delta `change`, an earlier result of [`OptimizerState::change`]
+    /// Restarts the optimizer at the start parameters plus `change`, an earlier result of [`OptimizerState::change`]
     /// with the same Gaussians.
     ///
     /// # Errors
@@ -325,7 +327,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Computes the current state of frame `frames[k]`, with constant and time-varying deltas added, into `now`.
+    /// Computes the current state of frame `frames[k]`, including all changes that refinement has made so far, into
+    /// `now`.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
         let change = self.descent.delta();
@@ -350,8 +353,8 @@ impl<'a> OptimizerState<'a> {
         self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
     }
 
-    /// Makes one optimization step of the delta that is constant in time, on target view `k` with the learning rates of
-    /// `schedule`.
+    /// Makes one optimization step of the constant delta (change of the stored parameters), on target view `k` with the
+    /// learning rates of `schedule`.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read or written.
@@ -365,7 +368,8 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Makes one optimization step of the time-varying delta, on target view `k` with the learning rates of `schedule`.
+    /// Makes one optimization step of the time-varying delta (values added to each frame), on target view `k` with the
+    /// learning rates of `schedule`.
     ///
     /// # Errors
     /// Fails if a scratch file cannot be read.

@@ -19,7 +19,7 @@ use crate::metrics::decibels_text;
 use crate::progress::Progress;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
-use crate::scene::between::SplitMix64;
+use crate::scene::views_between::SplitMix64;
 use crate::source::FrameSource;
 
 /// Minimum and maximum number of optimization steps between two renderings of the validation views. Within these limits
@@ -75,7 +75,7 @@ impl RefineStage {
             journal.run_stage(NAME, count, scene.source(), |journal| {
                 let targets =
                     Targets::new(scene, self.pictures, self.stored_stride(scene.workload().pixels, count), false)?;
-                scene.work.end_shard_before(NAME)?;
+                scene.work.end_shard_run_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.split());
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
             })
@@ -110,7 +110,7 @@ struct EpochSampler {
     pictures: Vec<usize>,
     at: usize,
     random: SplitMix64,
-    /// Number of views taken since the beginning.
+    /// Number of views taken from the random order so far, over all epochs.
     taken: usize,
 }
 
@@ -180,18 +180,19 @@ struct ResumePoint<Checkpoint, Best> {
     best_state: Option<Best>,
 }
 
-/// Parameter deltas that have had the best validation quality in the final optimization steps.
+/// Parameter deltas (values that refinement adds to the model) that have had the best validation quality in the final
+/// optimization steps.
 #[derive(Clone, Serialize, Deserialize)]
 struct BestState<Delta, Trajectory> {
     before: RenderQuality,
     best: RenderQuality,
-    /// Validation quality of the best delta among those that are constant in time.
+    /// Best validation quality of renders of the model with values added that are constant in time.
     constant: RenderQuality,
-    /// Constant part of the best delta.
+    /// Part of the best change found so far that is constant in time: values to add to the stored parameters.
     delta: Delta,
     /// Factor on the learning rates, reduced whenever the validation quality became worse.
     rate_factor: f32,
-    /// Time-varying part of the best delta.
+    /// Part of the best change found so far that varies with time: values to add to each frame.
     trajectory: Trajectory,
     mean: MeanDelta<Delta>,
 }
@@ -200,12 +201,12 @@ struct BestState<Delta, Trajectory> {
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct MeanDelta<Delta> {
     delta: Delta,
-    /// Number of deltas in the mean.
+    /// Number of steps over which the mean is taken so far.
     count: u32,
 }
 
 impl MeanDelta<ParamDelta> {
-    /// Updates the mean with one more delta, `next`.
+    /// Updates the mean with `next`, the values that refinement adds to the parameters after one more step.
     fn add(&mut self, mut next: ParamDelta) {
         self.count += 1;
         let part = 1.0 / self.count as f32;
@@ -216,7 +217,7 @@ impl MeanDelta<ParamDelta> {
 }
 
 /// Progress of a phase that continues from a checkpoint: number of optimization steps done, learning rates, and, in the
-/// final steps, the best deltas so far.
+/// final steps, the best parameter deltas (added values) so far.
 type Resumed = (usize, RateSchedule, Option<BestState<ParamDelta, TrajectoryDelta>>);
 
 impl<'a> RefineRun<'a> {
@@ -315,7 +316,8 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs the final optimization steps on the model `reduction`. Returns this model with the best deltas found.
+    /// Runs the final optimization steps on the model `reduction`. Returns this model with the added values that have
+    /// given the best validation quality.
     pub(crate) fn refine_best(
         &mut self,
         mut reduction: CompressedModel,
@@ -337,8 +339,8 @@ impl<'a> RefineRun<'a> {
         Ok(reduction)
     }
 
-    /// Returns the number of keyframes of the time-varying delta; 0 if deltas are constant in time, as for inputs
-    /// without explicit frames.
+    /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame); 0 if the
+    /// added values are constant in time, as for inputs without explicit frames.
     fn keyframe_count(&self) -> usize {
         match self.scene.input.has_explicit_frames() {
             true => keyframe_count(self.refine.knots, self.scene.source().info().times.len()),
@@ -346,8 +348,9 @@ impl<'a> RefineRun<'a> {
         }
     }
 
-    /// Returns the number of steps of the time-varying delta that follow `steps` steps of the constant delta; 0 if
-    /// deltas do not vary with time.
+    /// Returns the number of optimization steps of the time-varying delta (values added to each frame), which follow
+    /// `steps` steps of the constant delta (values added to the stored parameters); 0 if there is no time-varying
+    /// delta.
     fn steps_along_time(&self, steps: usize) -> usize {
         if self.keyframe_count() > 0 { along_time(steps) } else { 0 }
     }
@@ -441,9 +444,9 @@ impl<'a> RefineRun<'a> {
         Ok(left)
     }
 
-    /// Runs `steps` optimization steps of the delta that is constant in time, then the steps of the time-varying delta.
-    /// Returns the deltas with the best validation quality. Records in `journal` the gain in validation PSNR, or the
-    /// reason why nothing was gained.
+    /// Runs `steps` optimization steps of the constant delta (values added to the stored parameters), then the steps of
+    /// the time-varying delta (values added to each frame). Returns the deltas with the best validation quality.
+    /// Records in `journal` the gain in validation PSNR, or the reason why nothing was gained.
     fn final_steps(
         &mut self,
         optimizer: &mut OptimizerState<'_>,
@@ -563,7 +566,8 @@ impl<'a> RefineRun<'a> {
 }
 
 impl BestState<ParamDelta, TrajectoryDelta> {
-    /// Creates the best state before any optimization step: the delta `delta`, with the validation quality `before`.
+    /// Creates the best state before any optimization step: `delta` is the change of the parameters so far, and
+    /// `before` the validation quality with this change.
     fn new(before: RenderQuality, delta: ParamDelta) -> Self {
         BestState {
             before,
@@ -576,7 +580,7 @@ impl BestState<ParamDelta, TrajectoryDelta> {
         }
     }
 
-    /// Returns a version of this state for a checkpoint, which borrows the deltas instead of copying them.
+    /// Returns a version of this state for a checkpoint, which borrows the parameter deltas instead of copying them.
     fn checkpoint(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
         let BestState { before, best, constant, ref delta, rate_factor, ref trajectory, ref mean } = *self;
         let mean = MeanDelta { delta: &mean.delta, count: mean.count };

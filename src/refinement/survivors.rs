@@ -38,7 +38,7 @@ pub(super) fn survivors(errors: &[u64], count: usize, fixed: &[bool], positions:
         left -= 1;
         nearest.start_query(i, positions.row(i as usize), 1, f64::INFINITY);
         tree.search(&points, &mut nearest);
-        if let Some(&(_, neighbor)) = nearest.sorted().first() {
+        if let Some(&(_, neighbor)) = nearest.sort_by_distance().first() {
             is_protected[neighbor as usize] = true;
         }
     }

@@ -11,8 +11,8 @@ use crate::model::{Camera, FrameView, hash_id};
 use crate::passes::{BatchLimits, RenderedSource, VIEWS_PER_FRAME, ViewStates, for_each_view_batch, select_evenly};
 use crate::render::{Image, PixelGrid, Renderer, SampledView};
 use crate::scene::Scene;
-use crate::scene::between::{SplitMix64, cameras_between};
-use crate::scene::outside::cameras_outside;
+use crate::scene::views_between::{SplitMix64, cameras_between};
+use crate::scene::views_outside::cameras_outside;
 
 /// Name of the cache entry of the target views.
 pub(crate) const NAME: &str = "targets";
@@ -82,9 +82,9 @@ enum Purpose {
 }
 
 impl Targets {
-    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Of training views only every
-    /// `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth view is a test view;
-    /// otherwise there are no test views.
+    /// Renders `max_views` views of the original; fewer if they would need too many bytes. Returns these target views.
+    /// Of training views only every `stride`-th column and row of pixels is rendered. If `has_test_views`, every fourth
+    /// view is a test view; otherwise there are no test views.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or the scratch file cannot be written.
@@ -101,7 +101,7 @@ impl Targets {
                 BatchLimits::one_frame(&scene.limits),
                 |views| {
                     let picture = |(k, view): (usize, &ViewStates<'_, 1>)| {
-                        let view_on_grid = targets.grid(next + k, stride).viewed_from(view.camera);
+                        let view_on_grid = targets.grid(next + k, stride).sampled_view(view.camera);
                         narrow(&Renderer::on_all_threads().render(view.states[0], view_on_grid, scene.background))
                     };
                     let made: Vec<Vec<u16>> = views.par_iter().enumerate().map(picture).collect();
@@ -155,7 +155,7 @@ impl Targets {
     /// Returns the camera of target view `k` with the grid of the pixels to render. [`Targets::values`] returns the
     /// target colors of the same pixels if it gets the same `stride`.
     pub(super) fn view(&self, k: usize, stride: NonZeroU32) -> SampledView<'_> {
-        self.grid(k, stride).viewed_from(self.camera(k))
+        self.grid(k, stride).sampled_view(self.camera(k))
     }
 
     /// Returns the camera of target view `k`.

@@ -3,7 +3,7 @@
 use super::film::FilmPanel;
 use super::findings::{ResultData, WorstPlaceImages};
 use super::run::RunFiles;
-use super::shown::ShownImage;
+use super::shown_images::ShownImage;
 
 /// Comparison of one compressed model with the original, for the report page.
 pub(super) struct Analysis {
@@ -13,7 +13,7 @@ pub(super) struct Analysis {
     pub(super) run: RunFiles,
     /// Renders that the page shows, as images.
     pub(super) shown: Vec<ShownImage>,
-    /// Animations that the page shows.
+    /// Animations that the page shows for this compressed model.
     pub(super) films: Vec<FilmPanel>,
     /// Images of the places with the worst damage: one pair of images for each failure mode that can be judged.
     pub(super) close: Vec<WorstPlaceImages>,

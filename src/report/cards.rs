@@ -4,7 +4,7 @@
 use super::analysis::Analysis;
 use super::findings::ResultData;
 use super::html::{bytes, count, db, escape, figure, percent};
-use crate::evaluation::found::ByModel;
+use crate::evaluation::results::OriginalAndCompressed;
 use crate::models::ModelSize;
 
 /// Returns the HTML of the head of the page: names of the models, verdict, and changes. The changes of a single result
@@ -119,7 +119,7 @@ fn milliseconds(value: f64) -> String {
 /// Returns the parts of the size (such as Gaussians and deformation field) that both models have and that take more
 /// than 1% of the compressed model's bytes, as (name, bytes of the original, bytes of the compressed model). Returns an
 /// empty list if there are fewer than two such parts.
-pub(super) fn size_parts(size: &ByModel<ModelSize>) -> Vec<(&'static str, u64, u64)> {
+pub(super) fn size_parts(size: &OriginalAndCompressed<ModelSize>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named_parts().into_iter().zip(size.compressed.named_parts());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
     // Parts below a hundredth of the whole are left out.

@@ -3,7 +3,7 @@
 use super::analysis::Analysis;
 use super::film::{IMAGE_NAMES, JPEG_QUALITY};
 use super::html::{db, escape, figure};
-use super::shown::{MEDIAN, ShownImage, WORST};
+use super::shown_images::{MEDIAN, ShownImage, WORST};
 
 /// Returns the HTML of two sliders for the compressed models `results`: one for the render with the median PSNR, and
 /// one for the worst render. A slider shows two images of one view with a movable border between them. `names` has the

@@ -1,16 +1,16 @@
 //! Failure modes (kinds of damage that the paper names), detected in renders.
 //!
-//! Input: the kinds of every Gaussian ([`mod@super::traits`]: fast, thin or changing in appearance) and the renders of
-//! both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst place, and a
-//! verdict. The visibility of a kind is known exactly: the original is rendered once more with colors that encode the
-//! kinds, which gives for every pixel the share w of each kind.
+//! Input: the kinds of every Gaussian ([`mod@super::gaussian_kinds`]: fast, thin or changing in appearance) and the
+//! renders of both models. Output, for each kind: the error where the kind is visible, the error elsewhere, the worst
+//! place, and a verdict. The visibility of a kind is known exactly: the original is rendered once more with colors that
+//! encode the kinds, which gives for every pixel the share w of each kind.
 //!
 //! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. Memory:
 //! per thread one more render, and the original's state without its colors.
 
 use serde::{Deserialize, Serialize};
 
-use super::traits::{GaussianKind, KindFlags};
+use super::gaussian_kinds::{GaussianKind, KindFlags};
 use crate::evaluation::RenderedViews;
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{AttributeValues, Camera, Gaussians, SH_C0};
@@ -73,7 +73,7 @@ pub enum Verdict {
 /// Render in which a failure mode is worst.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WorstPlace {
-    /// Index of the render in [`crate::evaluation::found::Evaluation::views`].
+    /// Index of the render in [`crate::evaluation::results::Evaluation::views`].
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
@@ -127,7 +127,7 @@ pub struct FailureMode {
 /// Numbers and contribution of the Gaussians of one kind (fast, thin or changing in appearance). They come from the
 /// statistics, not from the compared renders.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct KindMembers {
+pub struct KindTotals {
     /// Number of Gaussians of this kind.
     pub count: usize,
     /// Two numbers of Gaussians of this kind: dropped, and merged. `None` without an index map (file that maps input to
@@ -139,9 +139,9 @@ pub struct KindMembers {
     pub shares: (f64, f64),
 }
 
-/// Renders the Gaussians `state` with colors that encode their kinds (`traits`): red, green and blue of a pixel are the
-/// shares of the three kinds in it.
-pub fn shares_of_pixels(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
+/// Renders the Gaussians `state` with colors that encode their kinds (`traits`), and returns the image: red, green and
+/// blue of a pixel are the shares of the three kinds in it.
+pub fn render_kind_shares(state: &Gaussians, traits: &[KindFlags], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
         // Color is 0.5 + SH_C0 · coefficient.
@@ -163,7 +163,7 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[KindFlags], camera: &Camera
 /// # Panics
 /// Panics if the sizes of the two renders and of the camera's images differ.
 pub fn sum_errors(state: &Gaussians, traits: &[KindFlags], camera: &Camera, taken: &RenderedViews) -> ViewErrorSums {
-    let shares = shares_of_pixels(state, traits, camera);
+    let shares = render_kind_shares(state, traits, camera);
     let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut found = ViewErrorSums { pixels: (width * height) as f64, ..ViewErrorSums::default() };
@@ -204,7 +204,12 @@ fn brightness(image: &Image) -> Vec<f64> {
 /// [`Verdict`] whether these errors are perceptible and much larger than elsewhere. `members` has the counts and the
 /// contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the frame and the view
 /// of each render.
-pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], names: &[(usize, u32)]) -> FailureMode {
+pub fn assess_failure_mode(
+    kind: GaussianKind,
+    members: KindTotals,
+    seen: &[ViewErrorSums],
+    names: &[(usize, u32)],
+) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
     let sum = |value: fn(&FailureSums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
@@ -255,9 +260,9 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[ViewErrorSums], n
 /// Returns two texts for a kind of Gaussian: the name of its failure mode, and a description of the Gaussians of this
 /// kind.
 fn described(kind: GaussianKind) -> (&'static str, String) {
-    use super::traits::{
-        COLOR_CHANGE, MAX_STILL_MOTION, MIN_FAST_MOTION, MIN_NON_RIGID_CHANGE, MIN_THIN_RATIO, NEIGHBORS,
-        OPACITY_CHANGE,
+    use super::gaussian_kinds::{
+        MAX_STILL_MOTION, MIN_COLOR_CHANGE, MIN_FAST_MOTION, MIN_NON_RIGID_CHANGE, MIN_OPACITY_CHANGE, MIN_THIN_RATIO,
+        NEIGHBORS,
     };
     match kind {
         GaussianKind::Motion => (
@@ -276,8 +281,8 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
                 "Gaussians that stand still (up to {}% of the extent per frame) while their opacity varies by {} or \
                  their color by {} (standard deviation) or more",
                 100.0 * MAX_STILL_MOTION,
-                OPACITY_CHANGE,
-                COLOR_CHANGE
+                MIN_OPACITY_CHANGE,
+                MIN_COLOR_CHANGE
             ),
         ),
     }

@@ -11,7 +11,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use super::shown::{MEDIAN, ShownImage, brighter, difference, shrink, shrinkage};
+use super::shown_images::{MEDIAN, ShownImage, brighter, difference, shrink, shrinkage};
 use crate::error::{Error, Result};
 use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
@@ -19,7 +19,7 @@ use crate::memory_plan::Workload;
 use crate::metrics::psnr;
 use crate::model::FrameView;
 use crate::render::Image;
-use crate::scene::pictures::select_frames;
+use crate::scene::view_selection::select_frames;
 
 /// Maximum number of animated views: the view of the worst render, and the view of the median render if it is another
 /// one.
@@ -30,7 +30,7 @@ pub const FRAMES: usize = 24;
 pub const MAX_PIXELS: u64 = 90_000;
 /// Maximum number of pixels of a difference image in an animation. It is lower than [`MAX_PIXELS`], because noise in
 /// difference images takes most bytes.
-pub const MAX_PIXELS_OF_DIFFERENCE: u64 = 30_000;
+pub const MAX_DIFFERENCE_PIXELS: u64 = 30_000;
 /// JPEG quality of the images of animations, from 1 to 100.
 pub const JPEG_QUALITY: u8 = 80;
 
@@ -91,11 +91,8 @@ pub fn render_films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPa
         let made = side.render_pairs(&pictures, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));
-            let images = [
-                small(original, MAX_PIXELS)?,
-                small(compressed, MAX_PIXELS)?,
-                small(&bright, MAX_PIXELS_OF_DIFFERENCE)?,
-            ];
+            let images =
+                [small(original, MAX_PIXELS)?, small(compressed, MAX_PIXELS)?, small(&bright, MAX_DIFFERENCE_PIXELS)?];
             Ok((psnr(compressed, original), shrinkage(original, MAX_PIXELS), images))
         })?;
         let shrunk = made.first().map_or(1, |made| made.1);

@@ -5,9 +5,9 @@ use serde::Serialize;
 use super::failure::FailureMode;
 use super::film::FilmPanel;
 use super::histogram::Histogram;
-use super::shown::ChosenRender;
-use crate::evaluation::found::{Evaluation, ViewScores};
+use super::shown_images::ChosenRender;
 use crate::evaluation::precision::PrecisionDiagram;
+use crate::evaluation::results::{Evaluation, ViewScores};
 use crate::evaluation::trade_off::TradeOff;
 use crate::journal::records::RenderTime;
 
@@ -47,8 +47,8 @@ pub struct ResultData {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_time: Option<RenderTime>,
     /// Measurements of the failure modes, one per kind of Gaussian (fast, thin, …) in the order of
-    /// [`super::traits::GaussianKind::ALL`]. They tell whether the loss is visible where Gaussians of this kind are
-    /// visible.
+    /// [`super::gaussian_kinds::GaussianKind::ALL`]. They tell whether the loss is visible where Gaussians of this kind
+    /// are visible.
     pub failure_modes: Vec<FailureMode>,
     /// Histograms of the scores of kept, merged and dropped Gaussians; `None` without an index map (file that maps
     /// input to output Gaussians).

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::run::Fate;
 use crate::files::csv::table;
-use crate::model::{Rows, Statistic, StatisticAccess};
+use crate::model::{Statistic, StatisticAccess, StatisticRows};
 use crate::statistics::score::{ScoredQuantity, Scores};
 
 /// Maximum number of bins of a histogram.
@@ -19,14 +19,14 @@ const BINS: usize = 40;
 /// bin.
 const DEEPEST: f64 = 1e-8;
 
-/// Three values, one for each fate of Gaussians: kept, merged, dropped.
+/// One value for each fate of Gaussians: kept, merged, dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ByFate<T> {
     /// Value for Gaussians that remain unchanged.
     pub kept: T,
     /// Value for Gaussians that were merged into a proxy (Gaussian that replaces a cluster).
     pub merged: T,
-    /// Value for Gaussians that were removed.
+    /// Value for Gaussians that were removed without being merged.
     pub dropped: T,
 }
 
@@ -62,7 +62,7 @@ pub struct Histogram {
 
 /// Returns the histograms of every score and statistic, with separate counts for each fate (kept, merged, dropped).
 /// `frames` is the number of frames.
-pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
+pub fn histograms(rows: &StatisticRows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
         ("S", "the whole score", &scores.score),

@@ -2,8 +2,9 @@
 //!
 //! Input: the original, one or more compressed models, their cameras, and the files that `compress` wrote beside its
 //! results. Output: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
-//! The steps are `run` (files of `compress`), `traits` (Gaussians at risk), the evaluation observed by `failure`,
-//! `histogram`, `shown` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`, `details`.
+//! The steps are `run` (files of `compress`), `gaussian_kinds` (Gaussians at risk), the evaluation observed by
+//! `failure`, `histogram`, `shown_images` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`,
+//! `details`.
 //!
 //! Memory: the memory of an evaluation or of scoring, which run one after the other, and the page.
 
@@ -17,16 +18,16 @@ pub mod failure;
 mod failure_section;
 pub mod film;
 mod findings;
+pub mod gaussian_kinds;
 pub mod histogram;
 mod html;
 mod page;
 pub mod precision;
 mod quality;
 pub mod run;
-pub mod shown;
+pub mod shown_images;
 mod tables;
 pub mod trade_off;
-pub mod traits;
 mod verdict;
 
 use std::fs;
@@ -42,7 +43,7 @@ use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, chec
 use crate::files::text::read_text;
 use crate::journal::Journal;
 use crate::journal::records::TermSummary;
-use crate::model::{Camera, Gaussians, Rows, Split, ViewSchedule};
+use crate::model::{Camera, Gaussians, Split, StatisticRows, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::measure::MeasureStages;
@@ -52,12 +53,12 @@ use crate::scene::Scene;
 pub use findings::{ReportData, ResultData};
 
 use analysis::Analysis;
-use failure::{FailureMode, KindMembers, judge, sum_errors};
+use failure::{FailureMode, KindTotals, assess_failure_mode, sum_errors};
 use findings::WorstPlaceImages;
+use gaussian_kinds::{GaussianKind, KindFlags, contribution_shares, kind_flags};
 use histogram::histograms;
 use run::{Fate, RunFiles};
-use shown::{ChosenRender, ShownImage, choose_renders, create_images, with_scores_of};
-use traits::{GaussianKind, KindFlags, contribution_shares, kind_flags};
+use shown_images::{ChosenRender, ShownImage, choose_renders, create_images, with_scores_from};
 
 /// File name of the report page.
 pub const PAGE_FILE: &str = "report.html";
@@ -144,7 +145,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     let measure = MeasureStages::new(&recipe, side.scene.has_cameras, UserOverrides::default());
     side.plan_memory(options.original.memory, |work, limits| {
         let mut needs = measure.resource_estimates(work, limits, MeasuredOnArrival::default());
-        needs.push(traits::resource_estimate(work));
+        needs.push(gaussian_kinds::resource_estimate(work));
         needs.extend(evaluation::resource_estimates(work, limits).into_iter().map(|mut need| {
             need.per_gaussian.push(("rows", SCORING_BYTES_PER_GAUSSIAN + 8));
             need.fixed.push(("films", film::memory_bytes(work)));
@@ -170,11 +171,14 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
         None => side.observe(look)?,
         Some(compared) => (compared, side.observe_sharded("failure", look)?),
     };
-    side.scene.work.end_shard_before("the page")?;
+    side.scene.work.end_shard_run_before("the page")?;
     let names: Vec<(usize, u32)> = evaluation.views.iter().map(|picture| (picture.frame, picture.view)).collect();
-    let failure_modes: Vec<FailureMode> =
-        GaussianKind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
-    let choices = wanted.map_or_else(|| choose_renders(&evaluation), |wanted| with_scores_of(&evaluation, wanted));
+    let failure_modes: Vec<FailureMode> = GaussianKind::ALL
+        .iter()
+        .zip(members)
+        .map(|(&kind, members)| assess_failure_mode(kind, members, &seen, &names))
+        .collect();
+    let choices = wanted.map_or_else(|| choose_renders(&evaluation), |wanted| with_scores_from(&evaluation, wanted));
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
     let films = film::render_films(&side, &shown)?;
     let render_time = if render_time { side.render_time()? } else { None };
@@ -188,7 +192,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_ti
     let data = ResultData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
         pictures: evaluation.views.clone(),
-        evaluation: evaluation.without_folders(),
+        evaluation: evaluation.with_file_names_only(),
         render_time,
         failure_modes,
         histograms,
@@ -247,7 +251,7 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;
-    for split in [Some(Split::Train), None, scene.rig.held_out()] {
+    for split in [Some(Split::Train), None, scene.rig.held_out_split()] {
         let schedule = scene.rig.schedule(times, split)?;
         if schedule.pair_count() == 0 {
             continue;
@@ -281,12 +285,12 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
 /// Returns for each kind of Gaussian the counts and the contribution of its Gaussians, from their statistics `rows`.
 /// `traits` has the kinds of every Gaussian. `fates` is `None` without an index map (file that maps input to output
 /// Gaussians).
-fn members(rows: &Rows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindMembers; 3] {
+fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -> [KindTotals; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = contribution_shares(rows, traits, |i| fate(i) != Fate::Kept);
     std::array::from_fn(|kind| {
         let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
-        KindMembers {
+        KindTotals {
             count: traits.iter().filter(|of| of[kind]).count(),
             fates: fates.map(|_| (with(Fate::Dropped), with(Fate::Merged))),
             shares: shares[kind],
@@ -306,14 +310,14 @@ fn show_again(
     let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
     let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
     let (mut shown, mut close) = (Vec::new(), Vec::new());
-    let made = side.render_again(&places, |place, state, camera, taken| {
+    let made = side.render_views_again(&places, |place, state, camera, taken| {
         for choice in choices.iter().filter(|choice| choice.place == place) {
             shown.push(create_images(choice, &taken)?);
         }
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
-            let shares = failure::shares_of_pixels(state, traits, camera);
+            let shares = failure::render_kind_shares(state, traits, camera);
             let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
-            let part = |image| shown::data_uri(&failure::crop(image, corner));
+            let part = |image| shown_images::data_uri(&failure::crop(image, corner));
             let images = [part(&taken.original)?, part(&taken.compressed)?];
             close.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
         }

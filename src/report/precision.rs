@@ -8,8 +8,8 @@ use super::document::{document, figure_of, links, list};
 use super::html::{count, escape, figure, file_name};
 use super::trade_off::Chart;
 use crate::evaluation::precision::{
-    ADDED_ERROR, COUNT_ERROR, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, RENDER_ERROR,
-    SELECTION_DISTANCE, axis_label,
+    ADDED_ERROR, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PrecisionCurve, PrecisionDiagram, PrecisionKnob,
+    PrecisionSetting, RENDER_ERROR, axis_label,
 };
 
 /// File name of the page that the command `precision` writes.
@@ -98,7 +98,10 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     // Errors of renders come first.
     errors.sort_by_key(|error| {
         (
-            [ADDED_ERROR, RENDER_ERROR, SELECTION_DISTANCE, COUNT_ERROR].iter().position(|of| of == error).unwrap_or(4),
+            [ADDED_ERROR, RENDER_ERROR, KEPT_SET_JACCARD_DISTANCE, KEPT_COUNT_ERROR]
+                .iter()
+                .position(|of| of == error)
+                .unwrap_or(4),
             *error,
         )
     });

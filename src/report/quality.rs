@@ -4,7 +4,7 @@
 use super::analysis::Analysis;
 use super::chart::{BarChart, ChartAxis, Plot, Series};
 use super::document::figure_of;
-use crate::evaluation::found::{Comparison, FrameMeans, QualityMeans, ViewMeans};
+use crate::evaluation::results::{Comparison, FrameMeans, QualityMeans, ViewMeans};
 
 /// Maximum number of views in a chart. If there are more views, only the worst are shown.
 const MOST_VIEWS: usize = 16;

@@ -2,7 +2,7 @@
 
 use super::failure::{FailureMode, Verdict};
 use super::html::percent;
-use crate::evaluation::found::Evaluation;
+use crate::evaluation::results::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
 
 /// Words of the verdict, each with the minimum mean PSNR in dB for which it is used. The root mean square error is

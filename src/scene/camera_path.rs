@@ -1,6 +1,6 @@
 //! Path of cameras through given cameras.
 
-use super::between::{interpolated_camera, meeting_point};
+use super::views_between::{interpolated_camera, meeting_point};
 use crate::model::Camera;
 
 /// Returns `count` cameras on the path through all of `stops`, in order, from the first to the last. Between two stops,

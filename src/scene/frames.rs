@@ -10,13 +10,13 @@ impl Scene {
     /// Makes the Gaussians with the ids `ids` (in increasing order) invisible in all later reads of the scene's frames.
     /// Gaussians that an earlier call made invisible become visible again, unless they are in `ids`. The cache keys of
     /// stage results include these ids.
-    pub fn set_absent(&self, ids: &[u32]) {
-        self.work.set_absent(ids);
+    pub fn set_excluded_ids(&self, ids: &[u32]) {
+        self.work.set_excluded_ids(ids);
         self.absent.set(ids);
     }
 
-    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_absent`]) are invisible in
-    /// it.
+    /// Returns the source of the scene's frames. Gaussians that are absent (see [`Scene::set_excluded_ids`]) are
+    /// invisible in it.
     pub fn source(&self) -> &dyn FrameSource {
         if self.absent.is_empty() { self.input.source() } else { self }
     }
@@ -69,7 +69,7 @@ mod tests {
         let absent = [3, 4, 700, 1499];
         let whole = gather_all(scene.source(), 2, Attributes::all()).unwrap();
         let others: Vec<u32> = (0..1500).filter(|id| !absent.contains(id)).collect();
-        scene.set_absent(&absent);
+        scene.set_excluded_ids(&absent);
         let hidden = gather_all(scene.source(), 2, Attributes::all()).unwrap();
         let expected = whole.pick(&others);
         assert!(hidden.pick(&others) == expected);
@@ -77,7 +77,7 @@ mod tests {
         assert_eq!(render(&hidden, camera, [0.2; 3]).data, render(&expected, camera, [0.2; 3]).data);
         let [found, expected] = [&hidden, &expected].map(|state| RobustBox::from_positions(&state.position));
         assert_eq!((found.low, found.high), (expected.low, expected.high));
-        scene.set_absent(&[]);
+        scene.set_excluded_ids(&[]);
         assert!(gather_all(scene.source(), 2, Attributes::all()).unwrap() == whole);
     }
 
@@ -85,7 +85,7 @@ mod tests {
     fn readers_of_id_lists_hide_absent_gaussians() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        scene.set_absent(&[7]);
+        scene.set_excluded_ids(&[7]);
         let mut state = Gaussians::zeros(0, scene.info().sh_degree);
         scene.source().open(Ids::List(&[9, 7, 3])).unwrap().read(0, Attributes::all(), &mut state).unwrap();
         let is_absent = |row: usize| state.opacity_logit.row::<1>(row) == [f32::NEG_INFINITY];

@@ -1,16 +1,16 @@
 //! A scene: an input together with its cameras. Every command that reads frames starts by opening one.
 
 mod absent;
-pub mod between;
 pub mod camera_path;
 mod compressed;
 mod frames;
 mod input;
 mod open;
-pub mod outside;
 pub mod photographs;
-pub mod pictures;
 mod stream;
+pub mod view_selection;
+pub mod views_between;
+pub mod views_outside;
 mod work;
 
 use std::path::PathBuf;
@@ -122,7 +122,7 @@ impl Scene {
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
     ) -> Result<()> {
         let plan = MemoryPlan::fit_budget(self.workload(), budget, &self.events, needs)?;
-        plan.send_times(budget.tell, &self.events);
+        plan.send_stage_times(budget.tell, &self.events);
         self.apply_plan(&plan);
         Ok(())
     }

@@ -6,8 +6,8 @@ use glam::DVec3;
 
 use super::Scene;
 use super::input::{InputOptions, OpenedInput, load_cameras};
-use super::pictures::no_view_error;
 use super::stream::open_packed_stream;
+use super::view_selection::no_view_error;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
 use crate::files::cameras::{TimeConvention, TimesSource};

@@ -166,7 +166,7 @@ impl FrameQuota {
 }
 
 /// Bytes of memory per frame while a stream is packed: its time stamp and, if statistics are computed, the number of
-/// Gaussians alive in it. Both are in lists that grow by being copied to twice their length.
+/// Gaussians alive (opacity ≥ alpha_min) in it. Both are in lists that grow by being copied to twice their length.
 const PER_FRAME: u64 = 2 * (8 + 4);
 
 /// Estimates the memory of packing a stream of `frames` frames, of which `held` are in memory at a time. `measuring`

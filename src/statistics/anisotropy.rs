@@ -2,7 +2,7 @@
 //! scales: the canonical scales of the model, or else those of the reference frame (the frame in which most Gaussians
 //! are alive).
 
-use crate::model::{AttributeValues, Flags, Rows};
+use crate::model::{AnomalyFlags, AttributeValues, StatisticRows};
 use crate::recipe::Anisotropy;
 
 /// Smallest scale for the logarithmic form of E, as a fraction of the scene extent; smaller scales are raised to it.
@@ -20,16 +20,16 @@ const MAX_LOG_RATIO: f64 = 700.0;
 ///
 /// # Panics
 /// Panics if `rows` and `log_scale` differ in the number of Gaussians.
-pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Anisotropy, extent: f64) {
+pub fn fill_anisotropy(rows: &mut StatisticRows, log_scale: &AttributeValues, kind: Anisotropy, extent: f64) {
     assert_eq!(rows.len(), log_scale.len(), "one row per Gaussian");
     let floor = (SCALE_FLOOR * extent).ln();
     rows.e = (0..rows.len())
         .map(|i| {
             let mut log: [f32; 3] = log_scale.row(i);
             if !log.iter().all(|x| x.is_finite()) {
-                rows.flags[i] |= Flags::NON_FINITE;
+                rows.flags[i] |= AnomalyFlags::NON_FINITE;
             }
-            if rows.flags[i].contains(Flags::NON_FINITE) {
+            if rows.flags[i].contains(AnomalyFlags::NON_FINITE) {
                 return 0.0;
             }
             log.sort_unstable_by(f32::total_cmp);
@@ -47,10 +47,10 @@ pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Aniso
 mod tests {
     use super::*;
 
-    fn anisotropy_and_flags(log_scale: [f32; 3], kind: Anisotropy, extent: f64) -> (f64, Flags) {
+    fn anisotropy_and_flags(log_scale: [f32; 3], kind: Anisotropy, extent: f64) -> (f64, AnomalyFlags) {
         let mut column = AttributeValues::zeros(3, 1);
         column.set_row(0, log_scale);
-        let mut rows = Rows { d: vec![0.0], flags: vec![Flags::empty()], ..Rows::default() };
+        let mut rows = StatisticRows { d: vec![0.0], flags: vec![AnomalyFlags::empty()], ..StatisticRows::default() };
         fill_anisotropy(&mut rows, &column, kind, extent);
         (rows.e[0], rows.flags[0])
     }
@@ -78,7 +78,7 @@ mod tests {
     fn non_finite_scales_are_flagged_and_give_zero() {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let (e, flags) = anisotropy_and_flags([0.0, bad, 1.0], Anisotropy::Ratio, 1.0);
-            assert!(e == 0.0 && flags.contains(Flags::NON_FINITE));
+            assert!(e == 0.0 && flags.contains(AnomalyFlags::NON_FINITE));
         }
     }
 }

@@ -12,11 +12,11 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Flags, Rows, Statistic, StatisticAccess};
+use crate::model::{AnomalyFlags, Statistic, StatisticAccess, StatisticRows};
 
 /// Statistics of N Gaussians, one row per Gaussian, in memory or in a temporary file.
 pub(crate) enum StatisticsRows {
-    Memory(Rows),
+    Memory(StatisticRows),
     Spilled(SpilledRows),
 }
 
@@ -37,16 +37,18 @@ impl Serialize for StatisticsRows {
 
 impl<'de> Deserialize<'de> for StatisticsRows {
     fn deserialize<D: Deserializer<'de>>(from: D) -> std::result::Result<StatisticsRows, D::Error> {
-        Rows::deserialize(from).map(StatisticsRows::Memory)
+        StatisticRows::deserialize(from).map(StatisticsRows::Memory)
     }
 }
 
 impl StatisticsRows {
-    /// Writes `rows` to an unnamed temporary file in `folder`, and frees their memory.
+    /// Moves `rows` from memory to an unnamed temporary file in `folder`. Returns the handle from which the rows can be
+    /// read again.
+    ///
     ///
     /// # Errors
     /// Fails if the file cannot be created or written.
-    pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<StatisticsRows> {
+    pub(crate) fn aside(rows: StatisticRows, folder: &Path) -> Result<StatisticsRows> {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {
             match statistic.accessors() {
@@ -62,7 +64,7 @@ impl StatisticsRows {
     }
 
     /// Returns all rows; reads them if they are in the temporary file.
-    pub(crate) fn rows(&self) -> Result<Cow<'_, Rows>> {
+    pub(crate) fn rows(&self) -> Result<Cow<'_, StatisticRows>> {
         match self {
             StatisticsRows::Memory(rows) => Ok(Cow::Borrowed(rows)),
             StatisticsRows::Spilled(spilled) => spilled.rows().map(Cow::Owned),
@@ -90,8 +92,8 @@ impl StatisticsRows {
 }
 
 impl SpilledRows {
-    fn rows(&self) -> Result<Rows> {
-        let mut rows = Rows::default();
+    fn rows(&self) -> Result<StatisticRows> {
+        let mut rows = StatisticRows::default();
         for &column in &self.columns {
             match column.accessors() {
                 StatisticAccess::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
@@ -99,7 +101,7 @@ impl SpilledRows {
             }
         }
         let flags: Vec<u8> = self.values(&self.columns)?;
-        rows.flags = flags.into_iter().map(Flags::from_bits_retain).collect();
+        rows.flags = flags.into_iter().map(AnomalyFlags::from_bits_retain).collect();
         Ok(rows)
     }
 
@@ -128,7 +130,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         for (count, peak) in [(0, false), (1, true), (1000, true), (1000, false)] {
             let column = |by: f64| (0..count).map(|i| (i as f64 - 7.3) * by).collect::<Vec<_>>();
-            let rows = Rows {
+            let rows = StatisticRows {
                 d: column(0.1),
                 kappa: column(-0.0),
                 v: column(1e-300),
@@ -137,20 +139,21 @@ mod tests {
                 w: if peak { column(0.01) } else { Vec::new() },
                 e: column(1e12),
                 vis: column(0.3),
-                flags: (0..count).map(|i| Flags::from_bits_retain(i as u8)).collect(),
+                flags: (0..count).map(|i| AnomalyFlags::from_bits_retain(i as u8)).collect(),
             };
             let statistics = StatisticsRows::aside(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);
             let StatisticsRows::Spilled(spilled) = &statistics else { panic!("the rows are not spilled") };
             let without = if peak { 0 } else { Statistic::W.bytes() };
-            let bytes = ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64;
+            let bytes = ((StatisticRows::BYTES_PER_GAUSSIAN - without) * count) as u64;
             let ends_before = |byte: u64| spilled.file.read(byte, &mut [0]).is_err();
             assert!(ends_before(bytes) && (bytes == 0 || !ends_before(bytes - 1)), "{bytes} bytes were declared");
             assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         }
-        let message = StatisticsRows::aside(Rows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
+        let message =
+            StatisticsRows::aside(StatisticRows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
         assert!(message.contains("nowhere"), "{message}");
     }
 }

@@ -14,7 +14,7 @@ pub(super) struct LifeSpans {
     sum: Vec<f64>,
     sum_of_squares: Vec<f64>,
     frames: Vec<u32>,
-    /// Number of Gaussians alive in the frame that was added last.
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in the frame that was added last.
     alive: u32,
     /// Number of frames that repeat the opacities of the first frame and are not counted in `frames` yet.
     repeats: u32,
@@ -56,15 +56,16 @@ impl LifeSpans {
         all
     }
 
-    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive in it. All
-    /// frames in between must also have had these opacities, so every α − α₁ is 0.
+    /// Adds a frame with the same opacities as the first frame, and returns how many Gaussians are alive (opacity ≥
+    /// alpha_min) in it. All frames in between must also have had these opacities, so every α − α₁ is 0.
     #[inline(always)]
     pub(super) fn repeat_frame(&mut self) -> u32 {
         self.repeats += 1;
         self.alive
     }
 
-    /// Adds the frames counted by `repeats` to the counts in `frames`; must be called before results are read.
+    /// Adds the repeated frames that were counted so far to the number of frames in which each Gaussian is alive
+    /// (opacity ≥ alpha_min). Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {
@@ -74,7 +75,7 @@ impl LifeSpans {
         }
     }
 
-    /// Returns for each Gaussian the number of frames so far in which it was alive.
+    /// Returns for each Gaussian the number of frames so far in which it was alive (opacity ≥ alpha_min).
     pub(super) fn frames(&self) -> &[u32] {
         &self.frames
     }

@@ -19,11 +19,11 @@ use std::mem::size_of;
 use crate::model::AttributeValues;
 use crate::recipe;
 
-/// Bit in the history of a Gaussian: it was alive in the previous frame.
+/// Bit in the history of a Gaussian: it was alive (opacity ≥ alpha_min) in the previous frame.
 const ALIVE: u8 = 1;
-/// Bit in the history of a Gaussian: it was alive in the frame before the previous one.
+/// Bit in the history of a Gaussian: it was alive (opacity ≥ alpha_min) in the frame before the previous one.
 const ALIVE_BEFORE: u8 = 2;
-/// Bit in the history of a Gaussian: it was alive in some frame before the previous one.
+/// Bit in the history of a Gaussian: it was alive (opacity ≥ alpha_min) in some frame before the previous one.
 const BORN_BEFORE: u8 = 4;
 
 /// Sums over the frames so far from which the trajectory magnitude D and the curvature κ of a block of Gaussians
@@ -32,15 +32,17 @@ pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
     /// Number of the latest frames whose opacities equal those of the frame before them, so that the same Gaussians are
-    /// alive. `steps`, `turns` and `history` do not count these frames yet. Used only by `MotionParams::Runs`.
+    /// alive (opacity ≥ alpha_min). `steps`, `turns` and `history` do not count these frames yet. Used only by
+    /// `MotionParams::Runs`.
     steady: u32,
     /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
     previous: AttributeValues,
     before: AttributeValues,
     sum_step2: Vec<f64>,
     sum_turn: Vec<f64>,
-    /// Length of the turn (second difference of the position) about the last frame in which the Gaussian was alive. It
-    /// is added to `sum_turn` only if the Gaussian is alive in a later frame. Used only by `MotionParams::Literal`.
+    /// Length of the turn (second difference of the position) about the last frame in which the Gaussian was alive
+    /// (opacity ≥ alpha_min). It is added to `sum_turn` only if the Gaussian is alive in a later frame. Used only by
+    /// `MotionParams::Literal`.
     pending: Vec<f64>,
     /// Number of steps summed in `sum_step2`; `turns` is the number of turns summed in `sum_turn`. Used only by
     /// `MotionParams::Runs`; `MotionParams::Literal` divides by numbers that follow from the life span instead.
@@ -142,8 +144,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds the frames counted by `steady` to `steps`, `turns` and `history`, and sets the sums of Gaussians that are
-    /// not alive to 0; must be called before results are read.
+    /// Adds the frames with unchanged opacities that were counted so far to the numbers of steps and turns of each
+    /// Gaussian. Sets the sums of steps and turns of Gaussians that are not alive (opacity ≥ alpha_min) to 0. Must be
+    /// called before results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
@@ -187,7 +190,7 @@ impl MotionSums {
 
     /// Returns the trajectory magnitude D of every Gaussian, in scene units per frame; 0 if none of its steps from
     /// frame to frame counts. The table of this module shows which steps count. `life` holds the number of frames in
-    /// which each Gaussian is alive; the definition `Literal` divides by it.
+    /// which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by it.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
@@ -195,7 +198,7 @@ impl MotionSums {
 
     /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if no turn (second difference of its
     /// positions) counts. The table of this module shows which turns count. `life` holds the number of frames in which
-    /// each Gaussian is alive; the definition `Literal` divides by `life` − 2.
+    /// each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by `life` − 2.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()

@@ -4,7 +4,7 @@
 //! 1.2 ulp, where one ulp is the distance between neighboring f32 values. All coordinates of a scene share one offset,
 //! so the ulp of the largest coordinate is used for every Gaussian.
 
-use crate::model::{Flags, Rows};
+use crate::model::{AnomalyFlags, StatisticRows};
 
 /// Trajectory magnitude D below which motion counts as rounding noise, in ulp of the scene's largest coordinate.
 const D_NOISE_ULP: f64 = 2.0;
@@ -30,15 +30,15 @@ pub fn ulp(x: f32) -> f64 {
 /// Sets every trajectory magnitude D below 2 ulp and curvature κ below 4 ulp of `largest_coordinate` to exactly 0,
 /// flags these rows, and returns how many values of D and of κ were set to 0. `largest_coordinate` is the largest
 /// |coordinate| of the whole scene, at least 0. Values that are 0 already are neither flagged nor counted.
-pub fn snap_noise_to_zero(rows: &mut Rows, largest_coordinate: f32) -> SnapCounts {
+pub fn snap_noise_to_zero(rows: &mut StatisticRows, largest_coordinate: f32) -> SnapCounts {
     let ulp = ulp(largest_coordinate);
     SnapCounts {
-        d: snap_below(&mut rows.d, D_NOISE_ULP * ulp, &mut rows.flags, Flags::SNAPPED_D),
-        kappa: snap_below(&mut rows.kappa, KAPPA_NOISE_ULP * ulp, &mut rows.flags, Flags::SNAPPED_KAPPA),
+        d: snap_below(&mut rows.d, D_NOISE_ULP * ulp, &mut rows.flags, AnomalyFlags::SNAPPED_D),
+        kappa: snap_below(&mut rows.kappa, KAPPA_NOISE_ULP * ulp, &mut rows.flags, AnomalyFlags::SNAPPED_KAPPA),
     }
 }
 
-fn snap_below(values: &mut [f64], floor: f64, flags: &mut [Flags], flag: Flags) -> usize {
+fn snap_below(values: &mut [f64], floor: f64, flags: &mut [AnomalyFlags], flag: AnomalyFlags) -> usize {
     let mut snapped = 0;
     for (value, flags) in values.iter_mut().zip(flags) {
         if *value > 0.0 && *value < floor {
@@ -65,14 +65,14 @@ mod tests {
     #[test]
     fn only_values_between_zero_and_the_floor_are_snapped() {
         let floor = 2.0 * ulp(1e6);
-        let mut rows = Rows {
+        let mut rows = StatisticRows {
             d: vec![0.0, floor * 0.99, floor],
             kappa: vec![floor, 2.0 * floor, 0.0],
-            flags: vec![Flags::empty(); 3],
-            ..Rows::default()
+            flags: vec![AnomalyFlags::empty(); 3],
+            ..StatisticRows::default()
         };
         assert_eq!(snap_noise_to_zero(&mut rows, 1e6), SnapCounts { d: 1, kappa: 1 });
         assert_eq!((rows.d, rows.kappa), (vec![0.0, 0.0, floor], vec![0.0, 2.0 * floor, 0.0]));
-        assert_eq!(rows.flags, [Flags::SNAPPED_KAPPA, Flags::SNAPPED_D, Flags::empty()]);
+        assert_eq!(rows.flags, [AnomalyFlags::SNAPPED_KAPPA, AnomalyFlags::SNAPPED_D, AnomalyFlags::empty()]);
     }
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Camera, Gaussians, Rows, SequenceInfo, ViewSchedule};
+use crate::model::{Camera, Gaussians, SequenceInfo, StatisticRows, ViewSchedule};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
@@ -23,8 +23,8 @@ use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan, wanted};
 pub struct ScanResult {
     /// Statistics, one row per Gaussian. The trajectory magnitude D and the curvature κ still include rounding noise;
     /// the anisotropy E is not filled yet.
-    pub rows: Rows,
-    /// Number of Gaussians alive in each frame.
+    pub rows: StatisticRows,
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in each frame.
     pub alive_per_frame: Vec<u32>,
     /// Largest |coordinate| of all positions in all frames, scene units.
     pub largest_coordinate: f32,
@@ -77,8 +77,9 @@ pub fn scan_blocks(
 impl ScanResult {
     /// Converts the result of a scan that read only the frames `frames` (increasing) into a result for the whole
     /// sequence, which has `all` frames. Life spans grow in proportion. Frames that were not read have no Gaussians
-    /// alive. Sets D, κ and V to 0, because steps between the frames that were read are not the steps of the sequence.
-    pub fn for_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
+    /// alive (opacity ≥ alpha_min). Sets D, κ and V to 0, because steps between the frames that were read are not the
+    /// steps of the sequence.
+    pub fn extrapolate_to_all_frames(mut self, frames: &[usize], all: usize) -> ScanResult {
         let mut alive_per_frame = vec![0; all];
         frames.iter().zip(&self.alive_per_frame).for_each(|(&frame, &alive)| alive_per_frame[frame] = alive);
         let in_all = |life: u32| (life as usize * all).div_ceil(frames.len().max(1)) as u32;
@@ -99,9 +100,9 @@ impl ScanResult {
 }
 
 /// Joins consecutive blocks of Gaussians, each given by its rows and its largest coordinate, into one result.
-/// `alive_per_frame` holds the number of Gaussians alive in each frame.
-fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
-    let mut rows = Rows::default();
+/// `alive_per_frame` holds the number of Gaussians alive (opacity ≥ alpha_min) in each frame.
+fn joined(blocks: impl IntoIterator<Item = (StatisticRows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
+    let mut rows = StatisticRows::default();
     let mut largest_coordinate = 0.0f32;
     for (mut block, largest) in blocks {
         rows.append(&mut block);

@@ -49,7 +49,8 @@ pub struct FootprintPlanes<'a> {
 pub struct CoverageSums<'a> {
     /// Sum of covered pixels times opacity, as a multiple of 2^−exponent px ([`CoverageScale::exponent`]).
     pub coverage: &'a mut [u64],
-    /// Number of (frame, view) pairs in which the Gaussian is alive and its bounding box overlaps the image.
+    /// Number of (frame, view) pairs in which the Gaussian is alive (opacity ≥ alpha_min) and its bounding box overlaps
+    /// the image.
     pub touched: &'a mut [u32],
 }
 

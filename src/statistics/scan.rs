@@ -8,7 +8,7 @@ use super::motion::MotionSums;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
 use super::state::{BlockState, CHUNK};
-use crate::model::{Attributes, Camera, Flags, Gaussians, Rows};
+use crate::model::{AnomalyFlags, Attributes, Camera, Gaussians, StatisticRows};
 
 /// Bytes of memory that a [`BlockScan`] takes per Gaussian, independent of the number of frames.
 pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
@@ -60,10 +60,10 @@ pub struct BlockStatistics {
     pub first_id: usize,
     /// Statistics, one row per Gaussian. The anisotropy `e` is 0 until [`super::fill_anisotropy`]; the trajectory
     /// magnitude D and the curvature κ include rounding noise until [`super::snap_noise_to_zero`]. All statistics of a
-    /// Gaussian with [`Flags::NON_FINITE`] are 0.
-    pub rows: Rows,
-    /// Number of the block's Gaussians alive in each frame, for the frames that [`BlockScan::take_alive_counts`] has
-    /// not returned. Gaussians with NaN values are included.
+    /// Gaussian with [`AnomalyFlags::NON_FINITE`] are 0.
+    pub rows: StatisticRows,
+    /// Number of the block's Gaussians alive (opacity ≥ alpha_min) in each frame, for the frames that
+    /// [`BlockScan::take_alive_counts`] has not returned. Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
@@ -118,8 +118,8 @@ impl<'a> BlockScan<'a> {
         self.uncarried = 0;
     }
 
-    /// Returns how many of the block's Gaussians are alive in each frame added since the last call, and forgets these
-    /// numbers.
+    /// Returns how many of the block's Gaussians are alive (opacity ≥ alpha_min) in each frame added since the last
+    /// call, and forgets these numbers.
     pub fn take_alive_counts(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
     }
@@ -209,7 +209,7 @@ impl<'a> BlockScan<'a> {
         let resolution = plan.coverage_resolution_px();
         let sum = |(&coverage, &carried): (&u64, &u32)| (u128::from(carried) << CARRY_BITS) + u128::from(coverage);
         let life = self.life.frames();
-        let mut rows = Rows {
+        let mut rows = StatisticRows {
             d: self.motion.magnitude(life),
             kappa: self.motion.curvature(life),
             v: self.life.variance(),
@@ -230,9 +230,9 @@ impl<'a> BlockScan<'a> {
     }
 }
 
-fn clear_non_finite(rows: &mut Rows) {
+fn clear_non_finite(rows: &mut StatisticRows) {
     for i in 0..rows.len() {
-        if rows.flags[i].contains(Flags::NON_FINITE) {
+        if rows.flags[i].contains(AnomalyFlags::NON_FINITE) {
             rows.clear(i);
         }
     }

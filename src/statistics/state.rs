@@ -4,7 +4,7 @@
 use std::mem::size_of;
 use std::ops::Range;
 
-use crate::model::{self, AttributeValues, Attributes, Flags, Gaussians};
+use crate::model::{self, AnomalyFlags, AttributeValues, Attributes, Gaussians};
 
 /// Largest ln(scale); larger values are clamped to it. A scale of e¹⁰⁰ scene units causes no overflow later, and such a
 /// Gaussian already covers every view entirely.
@@ -24,20 +24,20 @@ pub(super) struct BlockState {
     /// For each chunk of Gaussians, whether rotations or scales have changed since the axes (rotation times scales)
     /// were computed.
     axes_outdated: Vec<bool>,
-    pub(super) flags: Vec<Flags>,
+    pub(super) flags: Vec<AnomalyFlags>,
     /// Largest finite |coordinate| of the positions so far, scene units.
     pub(super) largest_coordinate: f32,
 }
 
 impl BlockState {
-    pub(super) const BYTES_PER_GAUSSIAN: usize = 10 * size_of::<f64>() + size_of::<Flags>();
+    pub(super) const BYTES_PER_GAUSSIAN: usize = 10 * size_of::<f64>() + size_of::<AnomalyFlags>();
 
     pub(super) fn new(len: usize) -> Self {
         BlockState {
             opacity: vec![0.0; len],
             axes: std::array::from_fn(|_| vec![0.0; len]),
             axes_outdated: vec![false; len.div_ceil(CHUNK)],
-            flags: vec![Flags::empty(); len],
+            flags: vec![AnomalyFlags::empty(); len],
             largest_coordinate: 0.0,
         }
     }
@@ -74,7 +74,7 @@ impl BlockState {
     fn flag_non_finite(&mut self, column: &AttributeValues) {
         for c in 0..column.width() {
             for (flags, x) in self.flags.iter_mut().zip(column.plane(c)) {
-                *flags |= if x.is_finite() { Flags::empty() } else { Flags::NON_FINITE };
+                *flags |= if x.is_finite() { AnomalyFlags::empty() } else { AnomalyFlags::NON_FINITE };
             }
         }
     }
@@ -85,7 +85,7 @@ impl BlockState {
         let [w, x, y, z]: [&[f32]; 4] = std::array::from_fn(|c| &rotation.plane(c)[..n]);
         for (i, flags) in self.flags.iter_mut().enumerate() {
             let zero = (w[i] == 0.0) & (x[i] == 0.0) & (y[i] == 0.0) & (z[i] == 0.0);
-            *flags |= if zero { Flags::ZERO_ROTATION } else { Flags::empty() };
+            *flags |= if zero { AnomalyFlags::ZERO_ROTATION } else { AnomalyFlags::empty() };
         }
     }
 

@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap_noise_to_zero, ulp};
 use crate::diagnostics::selfcheck::oracle::statistics as oracle;
 use crate::model::hash_id;
-use crate::model::{Attributes, Camera, Flags, Gaussians, ViewSchedule};
+use crate::model::{AnomalyFlags, Attributes, Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 
 fn recipe(motion: MotionParams) -> ScanParams {
@@ -251,13 +251,13 @@ fn non_finite_values_clear_only_their_own_row() {
             let (t, i) = (k, 37 * k + 5);
             frames[t].column_mut(column).plane_mut(0)[i] = bad;
             let got = scan(&frames, &schedule, &recipe).rows;
-            assert!(got.flags[i].contains(Flags::NON_FINITE), "{} = {bad} is flagged", column.name());
+            assert!(got.flags[i].contains(AnomalyFlags::NON_FINITE), "{} = {bad} is flagged", column.name());
             let zeros = [got.d[i], got.kappa[i], got.v[i], got.c[i], got.vis[i], f64::from(got.life[i])];
             assert_eq!(zeros, [0.0; 6], "{} = {bad}", column.name());
             for j in (0..300).filter(|&j| j != i) {
                 assert_eq!(
                     (got.d[j], got.c[j], got.flags[j]),
-                    (expected.rows.d[j], expected.rows.c[j], Flags::empty())
+                    (expected.rows.d[j], expected.rows.c[j], AnomalyFlags::empty())
                 );
             }
         }
@@ -273,7 +273,7 @@ fn zero_quaternion_is_flagged_and_counts_as_identity() {
     let expected = scan(&frames, &schedule, &recipe).rows;
     frames[2].rotation.set_row(0, [0.0, -0.0, 0.0, 0.0]);
     let got = scan(&frames, &schedule, &recipe).rows;
-    assert_eq!((got.c, got.flags), (expected.c, vec![Flags::ZERO_ROTATION, Flags::empty()]));
+    assert_eq!((got.c, got.flags), (expected.c, vec![AnomalyFlags::ZERO_ROTATION, AnomalyFlags::empty()]));
 }
 
 /// Returns three values of one Gaussian in one view: the area that it covers (pixels) and its visibility, both from the

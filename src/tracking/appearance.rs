@@ -27,8 +27,8 @@ pub(super) struct ComparedAppearance {
     /// Size: root mean square of the three scales, scene units. `ln_size` is its natural log.
     pub(super) size: f32,
     pub(super) ln_size: f32,
-    /// Shape: covariance divided by its trace, as xx, yy, zz, and √2 times xy, xz, yz. The factor √2 makes the sum of
-    /// squares equal that of all nine entries of the matrix.
+    /// Shape: covariance divided by its trace, as xx, yy, zz, and √2 times xy, xz, yz. With the factor √2, the squared
+    /// distance of two shapes equals that of the two 3×3 matrices.
     shape: [f32; 6],
     opacity: f32,
     /// Base color (without view dependence): red, green, blue; 0 to 1 is the range of a screen.

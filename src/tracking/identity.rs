@@ -26,8 +26,8 @@ pub struct OrderDifference {
     /// Difference in appearance between Gaussians at the same index: sum of the squared differences in size, shape,
     /// opacity and base color, each divided by the difference that adds 1 to the cost of a link.
     pub appearance_difference: f64,
-    /// Difference in appearance, computed as `appearance_difference`, between unrelated Gaussians, which are paired as
-    /// for `apart`.
+    /// Difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of the
+    /// first frame and i + N/2 of the second).
     pub unrelated_pairs: f64,
     /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is
     /// at most half of `apart`, and `appearance_difference` is at most half of `unrelated_pairs`.

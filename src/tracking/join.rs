@@ -27,8 +27,9 @@ const MAX_SHARED_FRAMES: u8 = 4;
 /// Rules by which tracks are joined. Tracks that satisfy the second rule also satisfy the first.
 const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
-/// Joiner of tracks that belong to the same Gaussian. It joins once by the rule `ALIKE` and once by the rule `CLOSE`.
-/// Every frame is passed to it after the [`Linker`] has linked the frame.
+/// Joiner of tracks that belong to the same Gaussian. It computes two alternative results: the tracks joined by the
+/// rule `ALIKE`, and the tracks joined by the stricter rule `CLOSE`. Every frame is passed to it after the [`Linker`]
+/// has linked the frame.
 pub struct Joiner([JoinedTracks; 2]);
 
 /// Pairs of tracks that are or may be joined by one of the two [`RULES`].
@@ -38,7 +39,7 @@ struct JoinedTracks {
     pairs: Vec<TrackPair>,
     /// For each track the number of the earlier track that it is joined to; `NONE` if there is none.
     predecessor: Vec<u32>,
-    /// For each track whether a later track has been joined to its end.
+    /// For each track, whether a later track that continues it has been joined to it.
     has_successor: Vec<bool>,
 }
 
@@ -87,8 +88,9 @@ impl Joiner {
         self.add_pairs(old, new);
     }
 
-    /// Adds the pairs of tracks that may be joined: a track of `new`, which begins in this frame, and a similar track
-    /// of `old`, which began earlier and may still continue.
+    /// Adds the pairs of tracks that may be joined. `new` holds the tracks that begin in this frame; `old` holds the
+    /// tracks that began earlier and may still continue. A pair consists of a track of `new` and a similar track of
+    /// `old`.
     fn add_pairs(&mut self, old: &[OpenTrack], new: &[OpenTrack]) {
         if old.is_empty() || new.is_empty() {
             return;

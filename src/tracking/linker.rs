@@ -67,7 +67,8 @@ impl Linker {
         self.born
     }
 
-    /// Links the Gaussians of the next frame, `state`, to tracks. The result does not depend on the number of threads.
+    /// Links the Gaussians of the next frame, `state`, to tracks. Returns the track of every Gaussian, and how the
+    /// frame was linked. The result does not depend on the number of threads.
     pub fn link(&mut self, state: &Gaussians) -> FrameLinks {
         let appearances = ComparedAppearance::all_from_state(state);
         let mut links = Links {

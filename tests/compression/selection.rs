@@ -2,7 +2,7 @@
 //! sections 2 to 4: sorted values for percentiles, loops for sums, one sort per stage.
 
 use crate::scene::{by_formula, scene, tiny};
-use splatsieve::model::Rows;
+use splatsieve::model::StatisticRows;
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{Anisotropy, LowScorePolicy, Recipe};
@@ -48,7 +48,7 @@ struct PlainScores {
     keep: Vec<bool>,
 }
 
-fn plain_scores(rows: &Rows, recipe: &Recipe) -> PlainScores {
+fn plain_scores(rows: &StatisticRows, recipe: &Recipe) -> PlainScores {
     let (score, select) = (&recipe.score, &recipe.select);
     let norm = |values: &[f64]| norm(values, score.norm_epsilon, score.clip_norm);
     let life: Vec<f64> = rows.life.iter().map(|&frames| f64::from(frames) / FRAMES).collect();

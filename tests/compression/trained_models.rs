@@ -4,7 +4,7 @@ use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
 use crate::scene::{arrays, shared, state, tiny};
-use splatsieve::model::{Gaussians, Rows, ViewSchedule};
+use splatsieve::model::{Gaussians, StatisticRows, ViewSchedule};
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{MotionParams, Recipe};
@@ -73,7 +73,7 @@ fn frames_agree(model: &Path) {
     }
 }
 
-fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
+fn rows(model: &Path, motion: MotionParams) -> (StatisticRows, f64) {
     let mut recipe = Recipe::preset("default").unwrap();
     recipe.scan.motion = motion;
     recipe.scan.snap_noise = false;

@@ -14,13 +14,13 @@ use splatsieve::files::cameras;
 use splatsieve::files::cameras::CameraOptions;
 use splatsieve::files::container::Container;
 use splatsieve::files::frame_stream::FrameStream;
-use splatsieve::files::in_memory;
+use splatsieve::files::parser_checks;
 use splatsieve::files::ply::check_header;
 use splatsieve::limits::ReadLimit;
 use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models;
 use splatsieve::models::OpenOptions;
-use splatsieve::models::archive::{kind_with_layout, unpack};
+use splatsieve::models::archive::{restored_output_kind, unpack};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::passes::gather;
 use splatsieve::recipe::Recipe;
@@ -259,7 +259,7 @@ fn archive(bytes: &[u8], folder: &InputFolder) -> Outcome {
     let path = folder.path("a.gsz");
     let (content, _) = archive::decode(bytes, &path, ReadLimit::NONE)?;
     let to = folder.path("unpacked");
-    let layout = kind_with_layout(&content, &path)?;
+    let layout = restored_output_kind(&content, &path)?;
     if layout == Some(OutputKind::Model) {
         fs::create_dir(&to)?;
     }
@@ -385,12 +385,12 @@ fn pickle(bytes: &[u8], folder: &InputFolder) -> Outcome {
 
 /// Reads a pickle that is not in a zip archive, with a memory limit of 1 MiB.
 fn pickle_bytes(bytes: &[u8], _: &InputFolder) -> Outcome {
-    in_memory::check_pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
+    parser_checks::check_pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
 }
 
 /// Reads JSON with the streaming parser of camera files.
 fn cameras_json(bytes: &[u8], _: &InputFolder) -> Outcome {
-    in_memory::check_cameras_json(bytes)?;
+    parser_checks::check_cameras_json(bytes)?;
     Ok(())
 }
 

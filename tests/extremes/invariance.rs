@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use splatsieve::files::container::Container;
-use splatsieve::model::{Attributes, Camera, Gaussians, Rig, Rows, Shot, Split};
+use splatsieve::model::{Attributes, Camera, Gaussians, Rig, Shot, Split, StatisticRows};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::FramesInMemory;
 use splatsieve::pipeline::score_scene;
@@ -31,7 +31,7 @@ struct GeneratedScene {
 
 /// Statistics of a [`GeneratedScene`], and its survivors.
 struct Measured {
-    rows: Rows,
+    rows: StatisticRows,
     keep: Vec<bool>,
 }
 

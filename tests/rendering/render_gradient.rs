@@ -4,10 +4,10 @@
 use std::path::Path;
 
 use glam::DVec3;
-use splatsieve::diagnostics::selfcheck::made::clouds::{
+use splatsieve::diagnostics::selfcheck::generated::clouds::{
     Random, plain_camera, random_gaussians, single_gaussian, tilted_camera,
 };
-use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
+use splatsieve::diagnostics::selfcheck::oracle::render as oracle;
 use splatsieve::model::{Attributes, Camera, Gaussians, Gradients, StoredParams};
 use splatsieve::models::ModelFolder;
 use splatsieve::render::{Image, Renderer, render};

@@ -3,10 +3,10 @@
 use std::num::NonZeroU32;
 
 use glam::DVec3;
-use splatsieve::diagnostics::selfcheck::made::clouds::{
+use splatsieve::diagnostics::selfcheck::generated::clouds::{
     plain_camera, random_gaussians, single_gaussian, tilted_camera,
 };
-use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
+use splatsieve::diagnostics::selfcheck::oracle::render as oracle;
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
 

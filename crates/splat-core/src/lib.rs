@@ -40,7 +40,7 @@ pub use ranges::format_ranges;
 pub use raw::StoredParams;
 pub use rig::{Rig, Shot, Split};
 pub use robust_box::RobustBox;
-pub use rows::{Flags, Rows, Statistic, StatisticAccess};
+pub use rows::{AnomalyFlags, Statistic, StatisticAccess, StatisticRows};
 pub use schedule::{FrameView, ViewSchedule};
 
 /// Value of the spherical-harmonic (SH) basis function of degree 0. A color is 0.5 + SH_C0 · f_dc, where f_dc is its

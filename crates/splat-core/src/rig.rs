@@ -66,12 +66,12 @@ impl Rig {
     pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
     /// Bytes of memory per file name in addition to its text: the overhead of the allocator.
-    pub const NAME_BYTES: u64 = 32;
+    pub const NAME_OVERHEAD_BYTES: u64 = 32;
 
     /// Returns the bytes of memory that all cameras and views take, including one [`ViewSchedule`] of them.
     pub fn bytes(&self) -> u64 {
         let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
-        let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_BYTES).sum();
+        let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_OVERHEAD_BYTES).sum();
         Rig::BYTES_PER_CAMERA * self.cameras.len() as u64 + Rig::BYTES_PER_VIEW * self.shots.len() as u64 + names
     }
 
@@ -89,7 +89,7 @@ impl Rig {
 
     /// Returns the split of the views that were held out of training: test, or validation if there are no test views.
     /// Returns `None` if all views are training views.
-    pub fn held_out(&self) -> Option<Split> {
+    pub fn held_out_split(&self) -> Option<Split> {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 

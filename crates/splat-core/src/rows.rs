@@ -1,7 +1,7 @@
 //! Statistics of every Gaussian over all frames, one array per statistic (docs/method.md, section 1).
 //!
-//! A new statistic is a field of [`Rows`] and a variant of [`Statistic`]. Tables, histograms, temporary files and
-//! memory plans then include it.
+//! A new statistic is a field of [`StatisticRows`] and a variant of [`Statistic`]. Tables, histograms, temporary files
+//! and memory plans then include it.
 
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 bitflags! {
     /// Anomalies of a Gaussian that the pass over all frames found.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-    pub struct Flags: u8 {
+    pub struct AnomalyFlags: u8 {
         /// A value in some frame was NaN or infinite.
         const NON_FINITE = 1;
         /// The quaternion was zero in some frame; the identity was used there.
@@ -21,35 +21,36 @@ bitflags! {
     }
 }
 
-/// Statistic that is computed for each Gaussian. The methods return its names, its meaning, and the array of [`Rows`]
-/// that holds its values.
+/// Statistic that is computed for each Gaussian. The methods return its names, its meaning, and the array of
+/// [`StatisticRows`] that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
-    /// Trajectory magnitude, see [`Rows::d`].
+    /// Trajectory magnitude, see [`StatisticRows::d`].
     D,
-    /// Curvature of the trajectory, see [`Rows::kappa`].
+    /// Curvature of the trajectory, see [`StatisticRows::kappa`].
     Kappa,
-    /// Variance of the opacity over time, see [`Rows::v`].
+    /// Variance of the opacity over time, see [`StatisticRows::v`].
     V,
-    /// Number of frames in which the opacity reaches a threshold, see [`Rows::life`].
+    /// Number of frames in which the opacity reaches a threshold, see [`StatisticRows::life`].
     Life,
-    /// Mean contribution to a render, see [`Rows::c`].
+    /// Mean contribution to a render, see [`StatisticRows::c`].
     C,
-    /// Anisotropy of the scales, see [`Rows::e`].
+    /// Anisotropy of the scales, see [`StatisticRows::e`].
     E,
-    /// Fraction of the views that the Gaussian touches, see [`Rows::vis`].
+    /// Fraction of the views that the Gaussian touches, see [`StatisticRows::vis`].
     Vis,
-    /// Largest blending weight in any pixel, see [`Rows::w`].
+    /// Largest blending weight in any pixel, see [`StatisticRows::w`].
     W,
 }
 
-/// Functions that return the array of a statistic from [`Rows`], the first for reading and the second for writing.
+/// Functions that return the array of a statistic from [`StatisticRows`], the first for reading and the second for
+/// writing.
 #[derive(Debug, Clone, Copy)]
 pub enum StatisticAccess {
     /// Statistic whose values are real numbers.
-    F64(fn(&Rows) -> &Vec<f64>, fn(&mut Rows) -> &mut Vec<f64>),
+    F64(fn(&StatisticRows) -> &Vec<f64>, fn(&mut StatisticRows) -> &mut Vec<f64>),
     /// Statistic whose values are numbers of frames.
-    U32(fn(&Rows) -> &Vec<u32>, fn(&mut Rows) -> &mut Vec<u32>),
+    U32(fn(&StatisticRows) -> &Vec<u32>, fn(&mut StatisticRows) -> &mut Vec<u32>),
 }
 
 /// Declaration of a statistic: its names, its meaning, and the array of its values.
@@ -149,7 +150,7 @@ impl Statistic {
         self.declaration().property
     }
 
-    /// Returns the functions that access the values of the statistic in [`Rows`].
+    /// Returns the functions that access the values of the statistic in [`StatisticRows`].
     pub const fn accessors(self) -> StatisticAccess {
         self.declaration().values
     }
@@ -165,7 +166,7 @@ impl Statistic {
 
 /// Statistics of N Gaussians. Every array has one entry per Gaussian, except that `w` may be empty.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Rows {
+pub struct StatisticRows {
     /// Trajectory magnitude D: root mean square of the distance moved between successive frames, scene units per frame.
     pub d: Vec<f64>,
     /// Curvature κ: mean norm of the second difference of the position over time, scene units per frame².
@@ -177,8 +178,8 @@ pub struct Rows {
     /// Contribution C to a render in pixels, mean over the views. The parameter `coverage` of the recipe selects the
     /// sum of alpha · transmittance over the pixels (`visible`), or the opacity times the projected area (`projected`).
     pub c: Vec<f64>,
-    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if the contribution [`Rows::c`]
-    /// is computed from projected areas.
+    /// Largest alpha · transmittance W in any pixel of any view, from 0 to 0.99. Empty if the contribution
+    /// [`StatisticRows::c`] is computed from projected areas.
     pub w: Vec<f64>,
     /// Anisotropy E of the canonical (time-independent) scales. The parameter `anisotropy` of the recipe selects the
     /// ratio of the largest scale to the smallest (`ratio`), or ln(largest scale / middle scale) (`log`).
@@ -187,13 +188,13 @@ pub struct Rows {
     /// touches the image.
     pub vis: Vec<f64>,
     /// Anomalies that the pass over all frames found.
-    pub flags: Vec<Flags>,
+    pub flags: Vec<AnomalyFlags>,
 }
 
-impl Rows {
+impl StatisticRows {
     /// Bytes of memory per Gaussian that all statistics, `w` included, and the flags take.
     pub const BYTES_PER_GAUSSIAN: usize = {
-        let (mut bytes, mut k) = (size_of::<Flags>(), 0);
+        let (mut bytes, mut k) = (size_of::<AnomalyFlags>(), 0);
         while k < Statistic::ALL.len() {
             bytes += Statistic::ALL[k].bytes();
             k += 1;
@@ -212,7 +213,7 @@ impl Rows {
     }
 
     /// Appends the statistics in `next`, which belong to the following block of Gaussians. Leaves `next` empty.
-    pub fn append(&mut self, next: &mut Rows) {
+    pub fn append(&mut self, next: &mut StatisticRows) {
         for statistic in Statistic::ALL {
             match statistic.accessors() {
                 StatisticAccess::F64(_, values) => values(self).append(values(next)),
@@ -248,20 +249,20 @@ mod tests {
 
     #[test]
     fn every_array_of_rows_belongs_to_one_statistic() {
-        let mut rows = Rows::default();
+        let mut rows = StatisticRows::default();
         for (k, statistic) in Statistic::ALL.into_iter().enumerate() {
             match statistic.accessors() {
                 StatisticAccess::F64(_, values) => values(&mut rows).push(k as f64),
                 StatisticAccess::U32(_, values) => values(&mut rows).push(k as u32),
             }
         }
-        let mut all = Rows::default();
+        let mut all = StatisticRows::default();
         all.append(&mut rows.clone());
         assert_eq!(all, rows);
-        let Rows { d, kappa, v, life, c, w, e, vis, flags: _ } = rows;
+        let StatisticRows { d, kappa, v, life, c, w, e, vis, flags: _ } = rows;
         let arrays = [&d, &kappa, &v, &c, &w, &e, &vis];
         assert!(arrays.iter().all(|array| array.len() == 1) && life.len() == 1);
         let bytes = arrays.map(|array| size_of_val(&array[..])).iter().sum::<usize>() + size_of_val(&life[..]);
-        assert_eq!(Rows::BYTES_PER_GAUSSIAN, bytes + size_of::<Flags>());
+        assert_eq!(StatisticRows::BYTES_PER_GAUSSIAN, bytes + size_of::<AnomalyFlags>());
     }
 }

@@ -21,11 +21,11 @@ use super::voxel::VoxelMask;
 /// Options of a trained field that change its evaluation and cannot be inferred from the shapes of its tensors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldConfig {
-    /// Attributes that the field changes, because the option that turns their head off (`no_dx`, `no_ds`, `no_dr`,
-    /// `no_do`, `no_dshs`) is false.
+    /// Attributes that the field changes, because the option that turns their head (output MLP) off (`no_dx`, `no_ds`,
+    /// `no_dr`, `no_do`, `no_dshs`) is false.
     pub deformed_attributes: Attributes,
-    /// Whether an additional head computes a mask, a factor on the stored attributes of each Gaussian. If true,
-    /// `empty_voxel` is ignored.
+    /// Whether an additional head (output MLP) computes a mask, a factor on the stored attributes of each Gaussian. If
+    /// true, `empty_voxel` is ignored.
     pub static_mlp: bool,
     /// Whether a voxel grid contains the mask, a factor on the stored attributes of each Gaussian.
     pub empty_voxel: bool,
@@ -43,7 +43,7 @@ pub struct FieldConfig {
 pub(super) enum Mask {
     /// The field has no mask: stored attributes are not multiplied by a factor before the deltas are added.
     None,
-    /// The last head of the field computes the mask, which varies with time (option `static_mlp`).
+    /// The last head (output MLP) of the field computes the mask, which varies with time (option `static_mlp`).
     Head,
     /// A voxel grid contains the mask, which is constant in time (option `empty_voxel`).
     Voxel(VoxelMask),
@@ -53,7 +53,8 @@ pub(super) enum Mask {
 /// the trunk (the MLP shared by all attributes) after ReLU: hidden layer, ReLU, output layer.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
-    /// Attribute whose deltas the head computes; `None` if it computes the mask of the option `static_mlp`.
+    /// Attribute whose deltas the head (output MLP) computes; `None` if it computes the mask of the option
+    /// `static_mlp`.
     pub(super) column: Option<Attributes>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
@@ -95,8 +96,8 @@ pub struct LayerBuffers {
     hidden: Vec<CacheLine>,
 }
 
-/// Returns the name of the head of an attribute in the state dict, and the option in `cfg_args` that turns this head
-/// on.
+/// Returns the name of the head (output MLP) of an attribute in the state dict, and the option in `cfg_args` that turns
+/// this head on.
 fn head_name(column: Attributes) -> (&'static str, &'static str) {
     match column {
         Attributes::POSITION => ("pos_deform", "no_dx=False"),

@@ -45,7 +45,7 @@ mod voxel;
 pub use deltas::Deltas;
 pub use field::{Field, FieldConfig, LayerBuffers, PreparedPositions};
 pub use network::{EncodedPositions, Network, PredictedMotion};
-pub use planes::{Box3, Tap, tap, unread_rows};
+pub use planes::{Box3, TexelPair, count_unread_time_rows, texel_pair};
 pub use tensors::{Tensor, Tensors};
 
 /// Compiles the example in the README of this crate as a documentation test.

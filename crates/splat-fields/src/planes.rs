@@ -67,7 +67,7 @@ impl Box3 {
         factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
     }
 
-    /// Converts a position `p` in scene units to normalized coordinates, which are −1 to 1 inside the box.
+    /// Returns the position `p` (scene units) in normalized coordinates, which are −1 to 1 inside the box.
     #[inline(always)]
     pub fn normalized(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
@@ -83,7 +83,7 @@ pub(super) struct Planes {
 
 /// Two neighboring texels along one axis, and their weights for linear interpolation at a coordinate between them.
 #[derive(Debug, Clone, Copy)]
-pub struct Tap {
+pub struct TexelPair {
     /// Index of the texel at or below the coordinate.
     pub low: u32,
     /// Index of the next texel, or `low` if there is no next one.
@@ -99,7 +99,7 @@ pub(super) struct PreparedPlanes {
     product: Vec<f32>,
     /// Texels and weights for interpolation along x, y and z in the three planes with time: `[rows, levels, 3]` with
     /// one row per Gaussian.
-    taps: Vec<Tap>,
+    taps: Vec<TexelPair>,
 }
 
 impl FeaturePlane {
@@ -126,7 +126,7 @@ impl FeaturePlane {
 
     /// Computes the bilinear sample of the plane into `out`, one value per channel. `a` and `b` say where to
     /// interpolate along the two axes.
-    fn sample(&self, a: Tap, b: Tap, out: &mut [f32]) {
+    fn sample(&self, a: TexelPair, b: TexelPair, out: &mut [f32]) {
         let channels = out.len();
         let corner = |ia, ib| self.texel(ia, ib, channels);
         let [ll, hl] = [corner(a.low, b.low), corner(a.high, b.low)];
@@ -146,11 +146,11 @@ impl FeaturePlane {
 /// Returns the two of `size` texels between which the normalized coordinate `u` lies, and the weight of the second one.
 /// The first and last texel lie at −1 and 1 (`align_corners`), and coordinates beyond them are clamped. A NaN
 /// coordinate gives a NaN fraction, hence NaN features.
-pub fn tap(u: f32, size: usize) -> Tap {
+pub fn texel_pair(u: f32, size: usize) -> TexelPair {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
     let low = x.floor();
-    Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
+    TexelPair { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
 /// Returns the number of rows at the start of a feature plane that are not read at any time ≥ 0, so that they need not
@@ -158,17 +158,17 @@ pub fn tap(u: f32, size: usize) -> Tap {
 ///
 /// `name` and `shape` are those of the tensor of the plane; its third extent is the number of rows. Rows span the times
 /// −1 to 1, but models use times from 0 on, so about half of each plane is never read.
-pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
+pub fn count_unread_time_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
-        (Some(place), &[1, _, rows, _]) if rows > 0 && TEMPORAL.contains(&place) => tap(0.0, rows).low as usize,
+        (Some(place), &[1, _, rows, _]) if rows > 0 && TEMPORAL.contains(&place) => texel_pair(0.0, rows).low as usize,
         _ => 0,
     }
 }
 
-/// Returns the channels of the two texels of `line` that `tap` lies between, and the weight of the second texel.
+/// Returns the channels of the two texels of `line` that `tap` names, and the weight of the second texel.
 #[inline(always)]
-pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
+pub(super) fn texels(line: &[f32], tap: TexelPair, channels: usize) -> ([&[f32]; 2], f32) {
     let texel = |at: u32| &line[at as usize * channels..][..channels];
     ([texel(tap.low), texel(tap.high)], tap.fraction)
 }
@@ -203,7 +203,7 @@ impl Planes {
 
     /// Returns the bytes of memory per Gaussian that [`PreparedPlanes`] takes.
     pub(super) fn bytes_per_gaussian(&self) -> usize {
-        4 * self.width() + 3 * self.levels.len() * size_of::<Tap>()
+        4 * self.width() + 3 * self.levels.len() * size_of::<TexelPair>()
     }
 
     /// Returns two corners of the box in scene units: the one mapped to normalized coordinates −1, then the one mapped
@@ -229,10 +229,10 @@ impl Planes {
                 (out, rest) = rest.split_at_mut(level.channels);
                 for (plane, &(_, a, b)) in level.spatial.iter().zip(&SPATIAL) {
                     let sample = &mut sample[..level.channels];
-                    plane.sample(tap(u[a], plane.size_a), tap(u[b], plane.size_b), sample);
+                    plane.sample(texel_pair(u[a], plane.size_a), texel_pair(u[b], plane.size_b), sample);
                     out.iter_mut().zip(&*sample).for_each(|(out, sample)| *out *= sample);
                 }
-                prepared.taps.extend(level.temporal.iter().zip(u).map(|(plane, u)| tap(u, plane.size_a)));
+                prepared.taps.extend(level.temporal.iter().zip(u).map(|(plane, u)| texel_pair(u, plane.size_a)));
             }
         }
         prepared
@@ -242,7 +242,7 @@ impl Planes {
     /// one axis of space. Returns, for every level, three lines: along x, y and z.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
-            let Tap { low, high, fraction } = tap(time, plane.size_b);
+            let TexelPair { low, high, fraction } = texel_pair(time, plane.size_b);
             let row =
                 |b: u32| &plane.texels[b as usize * plane.size_a * level.channels..][..plane.size_a * level.channels];
             row(low).iter().zip(row(high)).map(|(a, b)| a * (1.0 - fraction) + b * fraction).collect::<Vec<f32>>()

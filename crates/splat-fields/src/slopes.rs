@@ -7,10 +7,10 @@
 //! beyond the output.
 
 use super::linear::{CacheLine, LANES};
-use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, tap, texels};
+use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, texel_pair, texels};
 
 /// Returns the derivative of the texel coordinate with respect to the normalized coordinate `u`, for `size` texels.
-/// Returns 0 where [`tap`] clamps `u`.
+/// Returns 0 where [`texel_pair`] clamps `u`.
 fn texels_per_unit(u: f32, size: usize) -> f32 {
     if u.abs() <= 1.0 { (size - 1) as f32 / 2.0 } else { 0.0 }
 }
@@ -46,7 +46,7 @@ struct BilinearPatch<'a> {
 impl<'a> BilinearPatch<'a> {
     #[inline(always)]
     fn new(plane: &'a FeaturePlane, [a, b]: [f32; 2], channels: usize) -> Self {
-        let (tap_a, tap_b) = (tap(a, plane.size_a), tap(b, plane.size_b));
+        let (tap_a, tap_b) = (texel_pair(a, plane.size_a), texel_pair(b, plane.size_b));
         let corner = |a, b| plane.texel(a, b, channels);
         let at_low = [corner(tap_a.low, tap_b.low), corner(tap_a.high, tap_b.low)];
         let at_high = [corner(tap_a.low, tap_b.high), corner(tap_a.high, tap_b.high)];
@@ -126,7 +126,7 @@ impl Planes {
                 };
                 let section = |axis: usize| {
                     let size = level.temporal[axis].size_a;
-                    let (ends, fraction) = texels(&lines[axis], tap(u[axis], size), n);
+                    let (ends, fraction) = texels(&lines[axis], texel_pair(u[axis], size), n);
                     TimeLineSegment { ends, fraction, per_unit: texels_per_unit(u[axis], size) }
                 };
                 let [xy, xz, yz] = [patch(0), patch(1), patch(2)];

@@ -16,9 +16,9 @@
 //! | [`create_private_folder`] | mode 0700 | as on Linux | permissions of the parent |
 //! | [`sync_file`], [`sync_folder`] | both | both | files only |
 //! | [`is_cached`] | `preadv2` | unknown | unknown |
-//! | [`expect_pages`], [`release_pages`] | advice on pages | advice on pages | no effect: the system decides |
+//! | [`prefetch_pages`], [`release_pages`] | advice on pages | advice on pages | no effect: the system decides |
 //! | [`end_on_signals`] | SIGINT, SIGTERM, SIGHUP | as on Linux | Ctrl+C, Ctrl+Break, closed console |
-//! | [`report_cut_short_maps`] | SIGBUS handler | no effect | no effect: a mapped file cannot be truncated |
+//! | [`report_truncated_maps`] | SIGBUS handler | no effect | no effect: a mapped file cannot be truncated |
 //! | [`memory_limits`] | machine, control groups, process | machine, process | machine, job object |
 //! | [`peak_memory_bytes`] | `VmHWM` | `ru_maxrss` | peak working set |
 //! | [`reset_peak_memory`] | `clear_refs` | not possible | not possible |
@@ -64,22 +64,23 @@ compile_error!("this system is not supported: expected Linux, macOS or Windows")
 
 #[cfg(target_os = "linux")]
 pub use linux::{
-    is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory, return_freed_memory,
+    is_cached, memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory,
 };
 #[cfg(target_os = "macos")]
 pub use macos::{
-    is_cached, memory_limits, peak_memory_bytes, report_cut_short_maps, reset_peak_memory, return_freed_memory,
+    is_cached, memory_limits, peak_memory_bytes, report_truncated_maps, reset_peak_memory, return_freed_memory,
 };
 #[cfg(unix)]
 pub use unix::{
-    FolderHandle, create_private_folder, end_on_signals, expect_pages, is_standard_output, is_system_folder,
-    open_stream, open_without_waiting, private_permissions, read_exact_at, release_pages, sync_file, sync_folder,
+    FolderHandle, create_private_folder, end_on_signals, is_standard_output, is_system_folder, open_stream,
+    open_without_waiting, prefetch_pages, private_permissions, read_exact_at, release_pages, sync_file, sync_folder,
 };
 #[cfg(windows)]
 pub use windows::{
-    FolderHandle, create_private_folder, end_on_signals, expect_pages, is_cached, is_standard_output, is_system_folder,
-    memory_limits, open_stream, open_without_waiting, peak_memory_bytes, private_permissions, read_exact_at,
-    release_pages, report_cut_short_maps, reset_peak_memory, return_freed_memory, sync_file, sync_folder,
+    FolderHandle, create_private_folder, end_on_signals, is_cached, is_standard_output, is_system_folder,
+    memory_limits, open_stream, open_without_waiting, peak_memory_bytes, prefetch_pages, private_permissions,
+    read_exact_at, release_pages, report_truncated_maps, reset_peak_memory, return_freed_memory, sync_file,
+    sync_folder,
 };
 
 /// Identity of a file or folder. Two paths have the same identity if and only if both lead to the same file or folder.

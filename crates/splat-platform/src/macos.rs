@@ -15,7 +15,7 @@ pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
 
 /// Does nothing. macOS gives a process no information on the file that a page belongs to, so the signal SIGBUS, sent
 /// after a mapped file was truncated, ends the process.
-pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
+pub fn report_truncated_maps(_message: TruncatedMapMessage) {}
 
 /// Returns the physical memory of the machine and the limits that `ulimit` sets for the process.
 pub fn memory_limits() -> MemoryLimits {

@@ -49,7 +49,7 @@ impl PixelGrid {
     }
 
     /// Returns the view of `camera` in which only the pixels of this grid are rendered.
-    pub fn viewed_from(self, camera: &Camera) -> SampledView<'_> {
+    pub fn sampled_view(self, camera: &Camera) -> SampledView<'_> {
         SampledView { camera, grid: self }
     }
 
@@ -94,7 +94,7 @@ pub struct SampledView<'a> {
 
 impl<'a> From<&'a Camera> for SampledView<'a> {
     fn from(camera: &'a Camera) -> Self {
-        PixelGrid::ALL.viewed_from(camera)
+        PixelGrid::ALL.sampled_view(camera)
     }
 }
 

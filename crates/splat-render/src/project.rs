@@ -238,7 +238,8 @@ struct ProjectedSplats {
     /// Half the width in pixels of the ellipse on which alpha is half its maximum. Multiplied by the square root of
     /// [`Splat::cutoff`], it bounds the ellipse alpha ≥ 1/255.
     half_u: [f64; BLOCK],
-    /// Half the height in pixels of the ellipse on which alpha is half its maximum, used like `half_u`.
+    /// Half the height in pixels of the ellipse on which alpha is half its maximum. Multiplied by the square root of
+    /// [`Splat::cutoff`], it bounds the ellipse alpha ≥ 1/255.
     half_v: [f64; BLOCK],
     /// Radius of the footprint in pixels: three standard deviations along its longest axis, rounded up.
     radius: [f64; BLOCK],

@@ -53,7 +53,8 @@ impl Image {
     }
 }
 
-/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool.
+/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool, and returns the
+/// image.
 ///
 /// An image without pixels stays empty, and without Gaussians every pixel is `background`. Scales are clamped to e^±80.
 /// A zero quaternion counts as the identity; a NaN color counts as 0.
@@ -185,7 +186,7 @@ impl Renderer {
         seen: &mut Contribution,
     ) {
         assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
-        let view = CameraTerms::new(PixelGrid::centered(stride).viewed_from(camera));
+        let view = CameraTerms::new(PixelGrid::centered(stride).sampled_view(camera));
         self.prepare(gaussians, &view, false);
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
@@ -412,7 +413,7 @@ mod tests {
         let whole = renderer.render(&scene, &camera, [0.3; 3]);
         let mut bounded = 0;
         for grid in grids() {
-            let got = renderer.render(&scene, grid.viewed_from(&camera), [0.3; 3]);
+            let got = renderer.render(&scene, grid.sampled_view(&camera), [0.3; 3]);
             bounded += renderer.splats.splats.iter().filter(|splat| splat.drawn_tiles != Splat::UNBOUNDED).count();
             assert_eq!([got.width, got.height], grid.size([camera.width, camera.height]));
             for (k, pixel) in got.data.as_chunks::<3>().0.iter().enumerate() {
@@ -437,7 +438,7 @@ mod tests {
         };
         let stride = NonZeroU32::new(3).unwrap();
         let phases = (0..9).map(|k| PixelGrid::new(stride, [k % 3, k / 3]));
-        let parts: Vec<Gradients> = phases.map(|grid| gradient(grid.viewed_from(&camera))).collect();
+        let parts: Vec<Gradients> = phases.map(|grid| gradient(grid.sampled_view(&camera))).collect();
         let whole = gradient((&camera).into());
         for column in Attributes::all().iter() {
             let expected = whole.column(column).planes();
@@ -457,10 +458,10 @@ mod tests {
             let mut seen = Contribution::new(scene.len());
             renderer.contribution(&scene, &camera, NonZeroU32::new(grid.stride()).unwrap(), &mut seen);
             let mut errors = RemovalError::new(scene.len(), 0.1);
-            renderer.removal_error(&scene, grid.viewed_from(&camera), [0.3; 3], &mut errors);
+            renderer.removal_error(&scene, grid.sampled_view(&camera), [0.3; 3], &mut errors);
             let mut gradients = Gradients::new(scene.len(), Attributes::all(), 0);
             let loss = |image: &Image| (0.0, image.clone());
-            renderer.gradient(&scene, grid.viewed_from(&camera), [0.3; 3], loss, &mut gradients);
+            renderer.gradient(&scene, grid.sampled_view(&camera), [0.3; 3], loss, &mut gradients);
             (seen, errors, gradients)
         };
         for grid in grids() {

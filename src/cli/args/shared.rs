@@ -48,7 +48,8 @@ pub(in crate::cli) struct Trained {
     /// [default: flipped]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
     pub(in crate::cli) rot4d: Option<Rot4d>,
-    /// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero; players do not draw them [default: drop]
+    /// Handling of Gaussians of a .splatv or .ftgs.ply whose quaternion is zero; players do not draw them [default:
+    /// drop]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
     pub(in crate::cli) zero_rotation: Option<ZeroRotationArg>,
 }

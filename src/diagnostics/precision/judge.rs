@@ -9,7 +9,7 @@ use crate::model::{Attributes, Camera, FrameView};
 use crate::passes::{BatchLimits, RenderedSource, for_each_view_batch};
 use crate::render::{Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::{ViewSet, select_views};
+use crate::scene::view_selection::{ViewSet, select_views};
 use crate::source::Ids;
 
 /// Maximum number of views on which quality is measured.
@@ -34,7 +34,8 @@ pub(super) struct JudgedQuality {
 
 impl Judge {
     /// Renders the held-out (test) views of `scene`, or all views if none are held out. Of more than [`PICTURES`]
-    /// views, renders an evenly spaced selection of [`PICTURES`].
+    /// views, renders an evenly spaced selection of [`PICTURES`]. Returns these renders as the reference for
+    /// [`Judge::quality`].
     ///
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.

@@ -29,7 +29,7 @@ use crate::files::atomic::{Replace, SUMMARY_FILE, StagedFolder, TargetKind, chec
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
-use crate::model::{Rows, ViewSchedule};
+use crate::model::{StatisticRows, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stages::measure::MeasureStages;
@@ -41,7 +41,7 @@ use crate::report::precision::{PAGE_FILE, page};
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::statistics::pass::ScanResult;
 use crate::statistics::score::Scores;
-use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
+use crate::statistics::score::percentile_sketch::MAX_MANTISSA_BITS;
 use judge::Judge;
 
 /// Knob: parameter, or group of parameters, of which the command `precision` tries several values.
@@ -134,7 +134,7 @@ const SKETCH_BYTES: u64 = 4 << (9 + MAX_MANTISSA_BITS);
 /// Bytes of memory per Gaussian that are held from one setting to the next: two copies of the statistics, two of the
 /// contributions, two of the scores, and twelve lists of ids of kept Gaussians.
 const HELD_BYTES: u64 =
-    (2 * Rows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
+    (2 * StatisticRows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
 /// Data that the measurements of all settings share: the scene, the recipe, the statistics of the scan, and the
 /// conditions of measurement.
@@ -164,7 +164,8 @@ impl Bench<'_> {
     }
 }
 
-/// Measures all settings of the requested knobs on a model and writes the results to the output folder.
+/// Measures all settings of the requested knobs on a model and writes the results to the output folder. Returns the
+/// results.
 ///
 /// # Errors
 /// Fails if the input, the cameras, the recipe, the options or the output are invalid, or if a run fails. No files
@@ -209,7 +210,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     let mut notes = scene.notes.clone();
     scene.schedule = thin_frames(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
-    if scene.rig.held_out().is_none() {
+    if scene.rig.held_out_split().is_none() {
         notes.push("no views are held out: results are judged by views that are also used for ranking".to_owned());
     }
     let chosen = chosen_knobs(options, gaussians, frames, &mut notes);

@@ -8,18 +8,18 @@ use super::Bench;
 use crate::error::Result;
 use crate::evaluation::cost::Cost;
 use crate::evaluation::precision::{
-    ADDED_ERROR, COUNT_ERROR, ErrorSource, PERCENTILE_ERROR, PrecisionCurve, PrecisionKnob, PrecisionSetting,
-    RENDER_ERROR, SELECTION_DISTANCE, added_error, jaccard_distance, relative_l2,
+    ADDED_ERROR, ErrorSource, KEPT_COUNT_ERROR, KEPT_SET_JACCARD_DISTANCE, PERCENTILE_ERROR, PrecisionCurve,
+    PrecisionKnob, PrecisionSetting, RENDER_ERROR, added_error, jaccard_distance, relative_l2,
 };
 use crate::journal::Journal;
 use crate::pipeline::stages::measure::MeasureStages;
 use crate::pipeline::stages::rounds::Rounds;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::{Scored, UserOverrides};
-use crate::pruning::visible::VisibilityStage;
+use crate::pruning::visibility::VisibilityStage;
 use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
-use crate::statistics::score::sketch::MAX_MANTISSA_BITS;
+use crate::statistics::score::percentile_sketch::MAX_MANTISSA_BITS;
 use crate::statistics::score::{PercentilePasses, ScoredQuantity, Scores, score_with_passes};
 
 /// Numbers of views that are tried for the first ranking and for a pruning round. Numbers that exceed the number of
@@ -135,8 +135,9 @@ impl Bench<'_> {
                 let [c, w] = [l2(|contributions| &contributions.coverage), l2(|contributions| &contributions.peak)];
                 let scored = self.scored(Some(contributions))?;
                 let staying = relative_error(scored.selection.counts.kept, best.selection.counts.kept);
-                let errors =
-                    [("C", c), ("W", w), (COUNT_ERROR, staying)].map(|(name, error)| (name.to_owned(), error)).into();
+                let errors = [("C", c), ("W", w), (KEPT_COUNT_ERROR, staying)]
+                    .map(|(name, error)| (name.to_owned(), error))
+                    .into();
                 Ok(TriedRanking { value, step, cost, errors, kept: scored.ranking().best_ids(self.kept) })
             };
         let mut tried = Vec::with_capacity(variants.len() + 1);
@@ -211,7 +212,7 @@ impl Bench<'_> {
     }
 
     /// Measures the errors of percentiles that are found in one pass over the values, by histograms with several
-    /// numbers of mantissa bits. The reference is exact percentiles.
+    /// numbers of mantissa bits. The reference is exact percentiles. Returns the measurements.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
@@ -225,7 +226,7 @@ impl Bench<'_> {
             let selection = select(scores, &self.recipe.select, &Overrides::default())?;
             let errors = [
                 (PERCENTILE_ERROR, worst_percentile_error(scores, &exact)),
-                (COUNT_ERROR, relative_error(selection.counts.kept, staying)),
+                (KEPT_COUNT_ERROR, relative_error(selection.counts.kept, staying)),
             ];
             let errors = errors.map(|(name, error)| (name.to_owned(), error)).into();
             Ok(TriedRanking { value, step, cost, errors, kept: selection.ranking.best_ids(self.kept) })
@@ -269,7 +270,7 @@ impl Bench<'_> {
             let found = if kept == finest { best } else { self.judge.quality(self.scene, &kept)? };
             errors.extend(
                 [
-                    (SELECTION_DISTANCE, jaccard_distance(&kept, &finest)),
+                    (KEPT_SET_JACCARD_DISTANCE, jaccard_distance(&kept, &finest)),
                     (RENDER_ERROR, found.error),
                     (ADDED_ERROR, added_error(found.error, best.error)),
                 ]

@@ -38,7 +38,7 @@ const WHOLE: &str = "renders of the whole model: every held-out view of up to 12
 
 impl Bench<'_> {
     /// Measures complete runs that prune and then merge, with several merging radii and several numbers of merging
-    /// passes. All runs end at the same number of Gaussians.
+    /// passes. All runs end at the same number of Gaussians. Returns the measurements.
     pub(super) fn merging(&self) -> Result<PrecisionKnob> {
         let plain = self.recipe.without_refinement();
         let pass = plain.merge.passes.first().copied();
@@ -108,7 +108,7 @@ impl Bench<'_> {
     }
 
     /// Measures complete runs with several numbers of threads and several memory limits, and checks that their results
-    /// are equal byte for byte.
+    /// are equal byte for byte. Returns the measurements.
     pub(super) fn machine(&self) -> Result<PrecisionKnob> {
         let recipe = self.recipe.without_refinement();
         let mut expected = None;

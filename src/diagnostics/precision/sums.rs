@@ -11,7 +11,7 @@ use num_traits::Float;
 use super::Bench;
 use crate::error::Result;
 use crate::evaluation::precision::{ErrorSource, PrecisionCurve, PrecisionKnob, PrecisionSetting, relative_l2};
-use crate::model::{Attributes, Flags, Gaussians, ViewSchedule, opacity};
+use crate::model::{AnomalyFlags, Attributes, Gaussians, ViewSchedule, opacity};
 use crate::passes::FrameReaders;
 use crate::recipe::{self, MotionParams, Recipe};
 use crate::source::{BlockReader, Ids, ReadPlan};
@@ -98,7 +98,7 @@ impl Bench<'_> {
             return Ok(None);
         }
         let every = frames.div_ceil(MOST_FRAMES);
-        let finite = |id: &u32| !self.scanned.rows.flags[*id as usize].contains(Flags::NON_FINITE);
+        let finite = |id: &u32| !self.scanned.rows.flags[*id as usize].contains(AnomalyFlags::NON_FINITE);
         let ids: Vec<u32> = (0..info.count as u32).filter(finite).collect();
         let count = ids.len().min(GAUSSIANS);
         let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();

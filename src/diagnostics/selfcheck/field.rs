@@ -10,7 +10,7 @@ use crate::model::{Attributes, Gaussians};
 
 /// Compares the frame states that the program computes by a deformation field with the f64 definition of this field,
 /// for several configurations of the field. The error of a value is relative to 1 + |value|; the bound allows about 60
-/// roundings in f32.
+/// roundings in f32. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn states() -> CaseResult {
     CaseResult::new("deformation field", "states: planes, layers in f64", 5e-6, || {
         let mut worst = LargestError::default();

@@ -4,7 +4,7 @@
 use glam::{DMat3, DQuat, DVec3};
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, random_gaussians};
+use super::generated::clouds::{Random, random_gaussians};
 use crate::error::{Error, Result};
 use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::{Importance, merge_state, weights};
@@ -14,7 +14,7 @@ use crate::recipe::{MergeParams, ProxyOpacity, ProxyPosition, Recipe};
 
 /// Compares the mean and covariance Σ that the program computes for a mixture of Gaussians with those by the textbook
 /// formula in f64, which forms Σ as a matrix. Errors are relative to the largest entry of Σ. Rounding of a dozen
-/// Gaussians causes an error of about 1e-15.
+/// Gaussians causes an error of about 1e-15. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn mixture() -> CaseResult {
     CaseResult::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
@@ -38,7 +38,7 @@ pub(super) fn mixture() -> CaseResult {
 
 /// Merges a Gaussian with its exact copy, which must give the same scales again. The ratio of the smallest to the
 /// largest scale is 1 : 1e12, and each scale must be exact to 1e-12. A covariance matrix formed in f64 would lose the
-/// smallest scale entirely.
+/// smallest scale entirely. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn needle() -> CaseResult {
     CaseResult::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = LargestError::default();
@@ -54,7 +54,8 @@ pub(super) fn needle() -> CaseResult {
 
 /// Compares a proxy of five Gaussians with its members: mean and covariance as in [`mixture`], the SH coefficients with
 /// their weighted mean, and the opacity with 1 − Π(1 − α), where α are the opacities of the members. The members lie
-/// 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13.
+/// 1000 units from the origin, where the rounding of f64 changes their offsets by 1e-13. Returns the largest error,
+/// with the bound that it must not exceed.
 pub(super) fn proxy() -> CaseResult {
     CaseResult::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = random_gaussians(4, 5, 1);
@@ -88,7 +89,7 @@ pub(super) fn proxy() -> CaseResult {
 
 /// Merges eight exact copies of a Gaussian, once with each rule of [`ProxyOpacity`]; a ninth copy far away must stay
 /// alone. The proxy must have the position, scales and SH coefficients of the copies to the bit, and the opacity that
-/// the rule gives, in f32.
+/// the rule gives, in f32. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn duplicates() -> CaseResult {
     CaseResult::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = random_gaussians(6, 1, 0);

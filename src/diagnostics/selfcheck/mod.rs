@@ -11,7 +11,7 @@
 
 mod case;
 mod field;
-pub mod made;
+pub mod generated;
 mod merging;
 pub mod oracle;
 mod pictures;
@@ -74,7 +74,7 @@ pub struct SelfcheckReport {
     pub cases: Vec<CaseResult>,
 }
 
-/// Runs all cases of the self-check.
+/// Runs all cases of the self-check and returns their results.
 pub fn run() -> SelfcheckReport {
     let start = Instant::now();
     let cases: Vec<CaseResult> = CASES.iter().map(|case| case()).collect();

@@ -6,8 +6,8 @@ use std::num::NonZeroU32;
 use glam::DVec3;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
-use super::oracle::picture::{blended_indices, render_blended, render_view};
+use super::generated::clouds::{Random, plain_camera, random_gaussians, single_gaussian, tilted_camera};
+use super::oracle::render::{blended_indices, render_blended, render_view};
 use crate::metrics::{psnr, ssim};
 use crate::model::{Attributes, Camera, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};
@@ -17,7 +17,7 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 /// Compares the render of one Gaussian with the formula of its pixels, α·c + (1 − α)·background with α =
 /// o·exp(−r²/(2(f²s²/z² + 0.3))). The Gaussian has the color c, the opacity o and the scale s and lies at the distance
 /// z; the pixel is r px from its center, and the focal length is f px. In f32, values of 1 have an error of 6e-8, and
-/// exponentials a little more.
+/// exponentials a little more. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn one_gaussian() -> CaseResult {
     CaseResult::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
@@ -40,7 +40,8 @@ pub(super) fn one_gaussian() -> CaseResult {
 
 /// Compares a render of many Gaussians with the same render in f64, pixel by pixel. The program adds a few dozen values
 /// per pixel in f32. Skips the few pixels in which alpha or transmittance of a Gaussian is so close to a threshold of
-/// the renderer (relative difference below 1e-4) that f32 may decide differently.
+/// the renderer (relative difference below 1e-4) that f32 may decide differently. Returns the largest error, with the
+/// bound that it must not exceed.
 pub(super) fn many_gaussians() -> CaseResult {
     CaseResult::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (random_gaussians(1, 300, 3), tilted_camera(67, 45));
@@ -57,7 +58,8 @@ pub(super) fn many_gaussians() -> CaseResult {
 }
 
 /// Compares the sum and the maximum of alpha · transmittance over the pixels, for each Gaussian, with values computed
-/// in f64. Errors of the sum are relative to 1 + sum. The program sums in f32 over a tile of 256 pixels.
+/// in f64. Errors of the sum are relative to 1 + sum. The program sums in f32 over a tile of 256 pixels. Returns the
+/// largest error, with the bound that it must not exceed.
 pub(super) fn weights() -> CaseResult {
     CaseResult::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -75,6 +77,7 @@ pub(super) fn weights() -> CaseResult {
 
 /// Compares the removal error of each Gaussian with its definition, Σ‖render − render without the Gaussian‖² over the
 /// pixels, where both renders are in f64. The program computes the color behind a Gaussian as a difference in f32.
+/// Returns the largest error, with the bound that it must not exceed.
 pub(super) fn removal() -> CaseResult {
     CaseResult::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
         let (scene, camera) = undoubtful_scene();
@@ -97,7 +100,7 @@ pub(super) fn removal() -> CaseResult {
 
 /// Compares colors that the program computes from SH coefficients with the definition of the spherical harmonics by
 /// angles, K·P(cos θ)·cos mφ. The Legendre functions P come from a recurrence; K is the normalization. A color of 1 has
-/// an error of about 1e-7 in f32.
+/// an error of about 1e-7 in f32. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn harmonics() -> CaseResult {
     CaseResult::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();
@@ -127,7 +130,7 @@ pub(super) fn harmonics() -> CaseResult {
 /// Compares the 20 largest gradients of each attribute with finite differences. The gradients are those of the squared
 /// error of a render; the differences are those of the same error of f64 renders at parameter values that are 6e-5
 /// apart. Errors are relative to the expected gradient; the gradients of the program are f32 sums of terms of both
-/// signs.
+/// signs. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn gradients() -> CaseResult {
     CaseResult::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (random_gaussians(3, 40, 3), tilted_camera(33, 100));
@@ -170,7 +173,7 @@ pub(super) fn gradients() -> CaseResult {
 }
 
 /// Compares PSNR in dB with its value from an exact sum of squared whole numbers, and SSIM with its definition. The f64
-/// sums of 786,432 squares lose at most 1e-12.
+/// sums of 786,432 squares lose at most 1e-12. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn comparison() -> CaseResult {
     CaseResult::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);

@@ -1,13 +1,13 @@
 //! Self-check cases for percentiles, by which statistics are normalized and the scene extent is measured.
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::Random;
+use super::generated::clouds::Random;
 use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
 /// Compares the percentiles that the program finds by a histogram with the values of the same rank in the sorted list
-/// of all values. They must be equal to the bit.
+/// of all values. They must be equal to the bit. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn percentiles() -> CaseResult {
     CaseResult::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -24,7 +24,8 @@ pub(super) fn percentiles() -> CaseResult {
 }
 
 /// Compares the percentiles 1, 50 and 99 of the positions along each axis, which form a [`RobustBox`], with the values
-/// of the same rank in the sorted list of all positions. They must be equal to the bit.
+/// of the same rank in the sorted list of all positions. They must be equal to the bit. Returns the largest error, with
+/// the bound that it must not exceed.
 pub(super) fn robust_box() -> CaseResult {
     CaseResult::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();

@@ -5,10 +5,10 @@ use std::f64::consts::PI;
 use glam::{DMat3, DVec3};
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, tilted_camera};
+use super::generated::clouds::{Random, tilted_camera};
 use super::oracle::statistics::{OracleRow, row};
 use crate::error::Result;
-use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
+use crate::model::{Attributes, Camera, Gaussians, StatisticRows, ViewSchedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 use crate::statistics::{BlockScan, ScanPlan};
 
@@ -16,7 +16,8 @@ const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Run
 
 /// Compares the statistics of motion and opacity (D, κ, V and the number of frames in which a Gaussian is alive) with
 /// their definitions in f64, for Gaussians whose life spans have many gaps. In f64, a sum of 40 terms has a rounding
-/// error of about 1e-15; a variance loses a few more digits.
+/// error of about 1e-15; a variance loses a few more digits. Returns the largest error, with the bound that it must not
+/// exceed.
 pub(super) fn motion() -> CaseResult {
     CaseResult::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = random_frames(500, 40);
@@ -38,13 +39,13 @@ pub(super) fn motion() -> CaseResult {
 
 /// Compares D and κ of a Gaussian far from the origin with exact values. Each step of the Gaussian is a whole number of
 /// ulps (units in the last place) of its f32 position, so the differences are exact. A sum of 2000 squares in f64 loses
-/// at most 1e-14.
+/// at most 1e-14. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn motion_far_away() -> CaseResult {
     CaseResult::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
 /// Compares D and κ with exact values as [`motion_far_away`] does, but for subnormal positions and for positions whose
-/// squares overflow f32.
+/// squares overflow f32. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn motion_of_any_size() -> CaseResult {
     CaseResult::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
         compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
@@ -53,7 +54,8 @@ pub(super) fn motion_of_any_size() -> CaseResult {
 
 /// Compares D and κ of a Gaussian at unevenly spaced frames with a formula. All times t are whole numbers, and one
 /// coordinate of the Gaussian is t². With m as the mean time step, its velocity between the times t and t' is m·(t +
-/// t'), and its turns (second differences) are 2m². Sums have 40 terms in f64.
+/// t'), and its turns (second differences) are 2m². Sums have 40 terms in f64. Returns the largest error, with the
+/// bound that it must not exceed.
 pub(super) fn uneven_frames() -> CaseResult {
     CaseResult::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -76,7 +78,8 @@ pub(super) fn uneven_frames() -> CaseResult {
     })
 }
 
-/// Compares the statistics D, κ and V of Gaussians that are alive in 0 to 3 frames with exact values.
+/// Compares the statistics D, κ and V of Gaussians that are alive (opacity ≥ alpha_min) in 0 to 3 frames with exact
+/// values. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn short_lives() -> CaseResult {
     CaseResult::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
@@ -113,7 +116,8 @@ pub(super) fn short_lives() -> CaseResult {
 
 /// Compares the variance V of nearly constant opacities with a computation in two passes in f64: first the mean, then
 /// the deviations from it. Opacities of 0.9 that differ by 1e-6 have rounding errors of 1e-16, so V has a relative
-/// error below 1e-9. Moments about 0 would leave only 2 correct digits.
+/// error below 1e-9. Moments about 0 would leave only 2 correct digits. Returns the largest error, with the bound that
+/// it must not exceed.
 pub(super) fn steady_opacity() -> CaseResult {
     CaseResult::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
@@ -141,7 +145,7 @@ pub(super) fn steady_opacity() -> CaseResult {
 
 /// Compares the contribution C (projected area times opacity, in pixels) and the visibility of random Gaussians with a
 /// computation by full matrices in f64. Errors of C are relative to max(C, 1 px); the program sums C in units of about
-/// 3e-11 px.
+/// 3e-11 px. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn projected_area() -> CaseResult {
     CaseResult::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = random_frames(500, 3);
@@ -163,7 +167,8 @@ pub(super) fn projected_area() -> CaseResult {
 /// Compares the contribution C of a needle-shaped Gaussian with a formula for its projected area. The Gaussian has the
 /// variances a and b, in px², along its axes in the image, and these axes are rotated in the image plane. With 0.3 px²
 /// added to both variances, its projected covariance Σ has det Σ = (a + 0.3)(b + 0.3). A computation of det Σ from the
-/// entries of Σ would leave no correct digit. Errors are relative to max(C, 1 px), as in [`projected_area`].
+/// entries of Σ would leave no correct digit. Errors are relative to max(C, 1 px), as in [`projected_area`]. Returns
+/// the largest error, with the bound that it must not exceed.
 pub(super) fn needle_on_screen() -> CaseResult {
     CaseResult::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -204,7 +209,7 @@ pub(super) fn needle_on_screen() -> CaseResult {
 }
 
 /// Compares D and κ of one Gaussian with exact values, for each pair (from, unit) in `sizes`. The Gaussian moves along
-/// x from the position `from` by whole numbers of `unit`, both in scene units.
+/// x from the position `from` by whole numbers of `unit`, both in scene units. Returns the largest relative error.
 fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {
@@ -284,14 +289,14 @@ fn without_views(frames: usize) -> ViewSchedule {
 }
 
 /// Returns the statistics that the scan of the program computes for `frames` at evenly spaced times.
-fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
 /// Returns the statistics that the scan of the program computes for `frames` at `times`. Tells the scan which frames
 /// have the same opacities as the frame before, as the program's readers of models do.
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<StatisticRows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {

@@ -7,7 +7,7 @@ use std::path::Path;
 use gseq::Compression;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{Random, random_gaussians};
+use super::generated::clouds::{Random, random_gaussians};
 use crate::archive::{
     ATTRIBUTES, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorRole, TensorSteps,
     attribute_values, decode, encode, round_cloud, step_size,
@@ -23,7 +23,8 @@ use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Writes frames to a lossless container, reads them back, and compares every bit. The values include NaN and −0, and
-/// rotations that are the same in the last frame of a block of frames as in its first frame.
+/// rotations that are the same in the last frame of a block of frames as in its first frame. Returns the largest error,
+/// with the bound that it must not exceed.
 pub(super) fn container() -> CaseResult {
     CaseResult::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
@@ -38,7 +39,7 @@ pub(super) fn container() -> CaseResult {
 }
 
 /// Writes frames to a container with error bounds, reads them back, and compares the values. The unit of the error is
-/// the requested bound of the attribute.
+/// the requested bound of the attribute. Returns the largest error, with the bound that it must not exceed.
 pub(super) fn bounded_container() -> CaseResult {
     CaseResult::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
@@ -58,7 +59,8 @@ pub(super) fn bounded_container() -> CaseResult {
 }
 
 /// Encodes a model as an archive, decodes it, and compares the decoded values with the originals. The unit of the error
-/// is half a quantization step plus a rounding to f32.
+/// is half a quantization step plus a rounding to f32. Returns the largest error, with the bound that it must not
+/// exceed.
 pub(super) fn archive_grid() -> CaseResult {
     CaseResult::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
@@ -83,7 +85,8 @@ pub(super) fn archive_grid() -> CaseResult {
 
 /// Encodes a model as an archive, decodes it, and compares every bit, because the prediction and entropy coding of an
 /// archive are lossless. The decoded Gaussians must equal the original Gaussians after rounding to the quantization
-/// grid. The other stored data must equal the originals.
+/// grid. The other stored data must equal the originals. Returns the largest error, with the bound that it must not
+/// exceed.
 pub(super) fn archive_codes() -> CaseResult {
     CaseResult::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();

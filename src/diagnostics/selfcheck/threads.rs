@@ -3,7 +3,7 @@
 use std::fs;
 
 use super::case::{CaseResult, LargestError};
-use super::made::clouds::{random_gaussians, tilted_camera};
+use super::generated::clouds::{random_gaussians, tilted_camera};
 use crate::diagnostics::test_scene;
 use crate::diagnostics::test_scene::TestSceneOptions;
 use crate::error::{Error, Result};
@@ -16,6 +16,7 @@ use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
 /// Compares results computed on one thread with results computed on two threads. They must be equal byte for byte.
+/// Returns the largest error, with the bound that it must not exceed.
 pub(super) fn same_bytes() -> CaseResult {
     CaseResult::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (run_on(1)?, run_on(2)?);

@@ -36,7 +36,8 @@ pub(super) struct PublishLock {
 }
 
 impl PublishLock {
-    /// Waits until no other run moves a result to the name of `target`, then takes the lock.
+    /// Waits until no other run moves a result to the name of `target`, then takes the lock. Returns the lock, which is
+    /// released when it is dropped.
     ///
     /// # Errors
     /// Fails if the lock cannot be taken within a minute, because another run holds it or because a folder that this

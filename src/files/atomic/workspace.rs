@@ -214,8 +214,8 @@ pub struct ExitGuard(
 
 /// Removes all outputs of this process that do not have their final names yet. Called when the process is about to end.
 ///
-/// First waits until a result that is being moved to its final name is complete. Files outside workspaces (hidden
-/// output folders) stay.
+/// Returns a guard: as long as it exists, no thread of this process can begin or publish an output. First waits until a
+/// result that is being moved to its final name is complete. Files outside workspaces (hidden output folders) stay.
 pub fn remove_unfinished() -> ExitGuard {
     let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
@@ -255,7 +255,7 @@ fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
         Err(TryLockError::WouldBlock) => return Ok(None),
         // A run that removes a workspace deletes its lock file before it releases the lock. So if the lock file still
         // exists under its name, the workspace is not being removed.
-        Ok(()) if handle.names_file(LOCK, &file) => true,
+        Ok(()) if handle.entry_is_file(LOCK, &file) => true,
         Ok(()) => return Ok(None),
         Err(TryLockError::Error(_)) => false,
     };

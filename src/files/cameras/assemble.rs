@@ -149,7 +149,7 @@ impl Assembly {
         let mut image = listed.image;
         if let Some(image) = &mut image {
             image.shrink_to_fit();
-            let bytes = image.as_os_str().len() as u64 + Rig::NAME_BYTES;
+            let bytes = image.as_os_str().len() as u64 + Rig::NAME_OVERHEAD_BYTES;
             self.memory_counter.take(path, &place(Some(frame)), "the names of images", bytes)?;
         }
         let view = listed.view.unwrap_or(0);

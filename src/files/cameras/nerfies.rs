@@ -61,7 +61,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
 /// Keys in `dataset.json` of the lists of image names: all images, test images, training images.
 const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
 /// Bytes of memory per image name in addition to its text: its entries in a list and in two tables.
-const NAME_BYTES: u64 = 200;
+const NAME_OVERHEAD_BYTES: u64 = 200;
 
 /// Reads the three lists of image names in `file` and returns them in this order: all images, test images, training
 /// images. `train_ids` may be missing if `val_ids` is empty.
@@ -85,7 +85,7 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
                 let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
                 return Err(Error::input(file, place, "a list of names", name.describe()));
             };
-            counter.take(file, "", "the names of its images", name.len() as u64 + NAME_BYTES)?;
+            counter.take(file, "", "the names of its images", name.len() as u64 + NAME_OVERHEAD_BYTES)?;
             names[key].push(name);
             Ok(())
         },

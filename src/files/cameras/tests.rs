@@ -157,14 +157,14 @@ fn val_is_held_out_if_there_is_no_test_split() {
     let rig = load(folder(&files).path(), &CameraOptions::default()).unwrap();
     let count = |rig: &Rig, split| rig.shots.iter().filter(|shot| shot.split == split).count();
     assert_eq!((count(&rig, Split::Train), count(&rig, Split::Val), count(&rig, Split::Test)), (3, 2, 0));
-    assert_eq!(rig.held_out(), Some(Split::Val));
+    assert_eq!(rig.held_out_split(), Some(Split::Val));
     let test = transforms(&[0.6]);
     let with_test = [&files[..], &[("transforms_test.json", &test)]].concat();
     let rig = load(folder(&with_test).path(), &CameraOptions::default()).unwrap();
-    assert_eq!((count(&rig, Split::Val), count(&rig, Split::Test), rig.held_out()), (2, 1, Some(Split::Test)));
+    assert_eq!((count(&rig, Split::Val), count(&rig, Split::Test), rig.held_out_split()), (2, 1, Some(Split::Test)));
     let mut document = per_image(&[0.0]);
     document["frames"][0]["split"] = json!("val");
-    assert_eq!(load_json("cameras.json", &document).unwrap().held_out(), Some(Split::Val));
+    assert_eq!(load_json("cameras.json", &document).unwrap().held_out_split(), Some(Split::Val));
 }
 
 #[test]

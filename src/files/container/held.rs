@@ -36,7 +36,8 @@ impl HeldTiles {
     /// Bytes of memory of one slot, without tile values.
     pub(super) const BYTES_PER_SLOT: u64 = size_of::<TileSlot>() as u64;
 
-    /// Returns `slots` empty slots. No tile can be kept before [`HeldTiles::allow`] grants memory for values.
+    /// Creates storage for the decoded values of `slots` tiles. It is empty, and can hold no values until
+    /// [`HeldTiles::allow`] grants memory for them.
     pub(super) fn new(slots: usize) -> HeldTiles {
         let slots = (0..slots).map(|_| TileSlot::new()).collect();
         let locks = (0..LOCKS).map(|_| Mutex::default()).collect();

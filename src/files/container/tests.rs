@@ -111,7 +111,7 @@ fn frames_are_independent_of_order_and_of_held_frames() {
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
                 let mut reader = container.open(ids.clone()).unwrap();
-                reader.expect(&ReadPlan::all_frames().keeping_at_most(held));
+                reader.expect(&ReadPlan::all_frames().with_max_kept_frames(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
                     let want = if k % 7 == 0 { Attributes::all() } else { source.info().varying };
@@ -134,7 +134,7 @@ fn a_reader_keeps_no_more_than_allowed() {
     for ids in blocks(&scattered) {
         for held in [1, 3, FRAME_BLOCK] {
             let mut reader = TileReader::new(&container, &ids);
-            reader.expect(&ReadPlan::all_frames().keeping_at_most(held));
+            reader.expect(&ReadPlan::all_frames().with_max_kept_frames(held));
             let mut state = Gaussians::zeros(0, 1);
             for frame in 0..FRAMES {
                 reader.read(frame, Attributes::all(), &mut state).unwrap();
@@ -218,7 +218,7 @@ fn each_tile_is_read_once_for_all_planned_frames() {
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
                 let (_folder, container) = source.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
-                reader.expect(&ReadPlan::new(wanted).keeping_at_most(held));
+                reader.expect(&ReadPlan::new(wanted).with_max_kept_frames(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
                     reader.read(frame, Attributes::POSITION, &mut got).unwrap();
@@ -246,7 +246,7 @@ fn held_tiles_are_read_once_and_have_the_same_values() {
             container.hold_decoded(capacity);
             for ids in blocks(&scattered) {
                 for wanted in
-                    [ReadPlan::all_frames(), ReadPlan::all_frames().keeping_at_most(1), ReadPlan::new([7, 8, 40])]
+                    [ReadPlan::all_frames(), ReadPlan::all_frames().with_max_kept_frames(1), ReadPlan::new([7, 8, 40])]
                 {
                     let mut reader = container.open(ids.clone()).unwrap();
                     reader.expect(&wanted);

@@ -60,7 +60,7 @@ impl FrameValues {
 /// Memory in bytes per Gaussian, for each column (attribute) that varies over time:
 ///
 /// - 4 × width × frames kept, where width is the number of components. The frames kept are the frames of one frame
-///   block that the read plan lists, but at most the number given by [`ReadPlan::keeping_at_most`].
+///   block that the read plan lists, but at most the number given by [`ReadPlan::with_max_kept_frames`].
 /// - 8 × width in addition, if a whole frame block is kept.
 /// - For raw (uncompressed) tiles that are read whole, instead: the same amount of mapped memory if a whole frame block
 ///   may be kept, else none.

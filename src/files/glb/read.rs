@@ -178,8 +178,8 @@ fn chunks<'a>(map: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     Ok((text, binary.ok_or_else(|| cut(format!("{bytes} bytes in the binary chunk")))?))
 }
 
-/// Finds the only primitive with the extension in the JSON text `document`. Returns the index of the mesh that holds
-/// it, and the primitive. Fails if there is no such primitive or more than one.
+/// Finds the only primitive with the extension [`EXTENSION`] in the JSON text `document`. Returns the index of the mesh
+/// that holds the primitive, and the primitive. Fails if there is no such primitive or more than one.
 fn find_primitive<'a>(document: &'a Value, path: &Path) -> Result<(usize, &'a Value)> {
     let list = |value: &'a Value| value.as_array().map_or(&[][..], Vec::as_slice);
     let meshes = list(&document["meshes"]).iter().enumerate();

@@ -159,7 +159,7 @@ struct NestedValue<'a> {
 }
 
 impl<'a> NestedValue<'a> {
-    /// Returns the seed of the next value, which is nested one level deeper.
+    /// Returns the deserializer of a value that is nested one level deeper.
     fn next_level(&mut self) -> NestedValue<'_> {
         NestedValue { keep: self.keep, remaining: self.remaining, depth: self.depth + 1 }
     }

@@ -52,6 +52,7 @@ impl SogErrors {
 }
 
 /// Writes the Gaussians `state` to a `.sog` file at `path`, in Morton order. The bytes depend only on the Gaussians.
+/// Returns the largest errors of the stored values.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::write::MAX_FRAMES;
 use super::{DEFAULT_FRAMES, TimedGaussians, Timeline, TimelineEntry, TsogMeta, VERSION, Velocity, codes_per_frame};
 use crate::error::{Error, Result, quoted};
-use crate::files::ftgs::{CENTER, ClipTimes, FRAME_RATE, LOG_DEVIATION, VELOCITY};
+use crate::files::ftgs::{ClipTimes, FRAME_RATE, LOG_TIME_DEVIATION, TIME_CENTER, VELOCITY};
 use crate::files::json::{ParseAbort, read_from};
 use crate::files::sog::META_FILE;
 use crate::files::sog::images::{Range3, decode_16_bit};
@@ -138,8 +138,8 @@ fn read_timeline(
     let ([c0, s0], [c1, s1]) = (range("mins", entry.mins)?, range("maxs", entry.maxs)?);
     let range = checked(Range3 { mins: [c0, s0, 0.0], maxs: [c1, s1, 0.0] }, path, "timeline")?;
     for (i, code) in codes.enumerate() {
-        own.plane_mut(CENTER)[i] = range.decode(0, code[0]) as f32;
-        own.plane_mut(LOG_DEVIATION)[i] = range.decode(1, code[1]).ln() as f32;
+        own.plane_mut(TIME_CENTER)[i] = range.decode(0, code[0]) as f32;
+        own.plane_mut(LOG_TIME_DEVIATION)[i] = range.decode(1, code[1]).ln() as f32;
     }
     Ok(())
 }

@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::read::{is_tsog, read_tsog};
 use super::write::write_tsog;
 use super::{TimedGaussians, Timeline, codes_per_frame};
-use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY};
+use crate::files::ftgs::{ClipTimes, LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY};
 use crate::files::webp::RgbaImage;
 use crate::limits::ReadLimit;
 use crate::model::{AttributeValues, Gaussians, StoredParams, opacity};
@@ -35,8 +35,8 @@ fn timed(timeline: Timeline, sh_degree: usize) -> TimedGaussians {
             Timeline::Still => {}
             Timeline::Frames(frames) => own.plane_mut(0)[i] = (i % frames) as f32,
             Timeline::Windows => {
-                own.plane_mut(CENTER)[i] = 1.4 * noise(61, i) + 0.5;
-                own.plane_mut(LOG_DEVIATION)[i] = 2.0 * noise(62, i) - 2.0;
+                own.plane_mut(TIME_CENTER)[i] = 1.4 * noise(61, i) + 0.5;
+                own.plane_mut(LOG_TIME_DEVIATION)[i] = 2.0 * noise(62, i) - 2.0;
                 (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[i] = 6.0 * noise(63 + c, i));
             }
         }
@@ -123,9 +123,9 @@ fn windows_and_velocities_are_within_half_a_step() {
         let near = |a: f64, b: f64, within: f64, what: &str| {
             assert!((a - b).abs() <= 1.001 * within + 1e-6, "{what} of {row}: {a}, found {b}");
         };
-        let (a, b) = pair(CENTER);
+        let (a, b) = pair(TIME_CENTER);
         near(a, b, half_step("/timeline", 0, 65535.0), "center");
-        let (a, b) = pair(LOG_DEVIATION);
+        let (a, b) = pair(LOG_TIME_DEVIATION);
         near(a.exp(), b.exp(), half_step("/timeline", 1, 65535.0), "deviation");
         for c in 0..3 {
             let (a, b) = pair(VELOCITY + c);
@@ -218,18 +218,18 @@ fn wide_windows_keep_their_opacity_within_the_sequence() {
     let folder = tempfile::tempdir().unwrap();
     let mut written = timed(Timeline::Windows, 0);
     for i in 0..COUNT {
-        written.params.format_specific.plane_mut(CENTER)[i] = 60.0 * noise(5, i);
-        written.params.format_specific.plane_mut(LOG_DEVIATION)[i] = 3.0 + noise(6, i);
+        written.params.format_specific.plane_mut(TIME_CENTER)[i] = 60.0 * noise(5, i);
+        written.params.format_specific.plane_mut(LOG_TIME_DEVIATION)[i] = 3.0 + noise(6, i);
     }
     write_tsog(&written, &path(&folder)).unwrap();
     let found = read_tsog(&path(&folder), ReadLimit::NONE).unwrap();
     let state = |from: &TimedGaussians, row: usize, time: f64| {
         let own = |plane: usize| f64::from(from.params.format_specific.plane(plane)[row]);
         let alpha = opacity(from.params.gaussians.opacity_logit.plane(0)[row]);
-        let dt = time - own(CENTER);
+        let dt = time - own(TIME_CENTER);
         let at = from.params.gaussians.position.row::<3>(row);
         let place = [0, 1, 2].map(|c| f64::from(at[c]) + own(VELOCITY + c) * dt);
-        (place, alpha * (-0.5 * (dt / own(LOG_DEVIATION).exp()).powi(2)).exp())
+        (place, alpha * (-0.5 * (dt / own(LOG_TIME_DEVIATION).exp()).powi(2)).exp())
     };
     for row in 0..COUNT {
         let apart = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::check_positions;
-use crate::files::ftgs::{CENTER, LOG_DEVIATION, VELOCITY};
+use crate::files::ftgs::{LOG_TIME_DEVIATION, TIME_CENTER, VELOCITY};
 use crate::files::sog::images::{ImageSize, Range3, encode_16_bit, morton_order};
 use crate::files::sog::write::{NamedImages, SogErrors, encode, write_archive};
 use crate::model::{StoredParams, logit, opacity};
@@ -25,7 +25,8 @@ pub const MAX_FRAMES: usize = 1 << 16;
 /// all Gaussians, then the largest error. The unit is the middle one of a Gaussian's three scales.
 const MAX_8_BIT_ERRORS: [f64; 2] = [0.03, 0.25];
 
-/// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`.
+/// Writes `content` to a `.tsog` file at `path`, in Morton order. The bytes depend only on `content`. Returns the
+/// largest errors of the stored values.
 ///
 /// # Errors
 /// Fails if there are no Gaussians, or more than the images can hold; if there are too many frames; if a position is
@@ -78,7 +79,7 @@ fn narrowed(params: &StoredParams) -> StoredParams {
     let mut params = params.clone();
     for row in 0..params.len() {
         let own = |plane: usize| f64::from(params.format_specific.plane(plane)[row]);
-        let (center, deviation) = (own(CENTER), own(LOG_DEVIATION).exp());
+        let (center, deviation) = (own(TIME_CENTER), own(LOG_TIME_DEVIATION).exp());
         if deviation <= MAX_DEVIATION {
             continue;
         }
@@ -91,8 +92,8 @@ fn narrowed(params: &StoredParams) -> StoredParams {
         let place = [0, 1, 2].map(|c| (f64::from(at[c]) + velocity[c] * (moved - center)) as f32);
         params.gaussians.position.set_row(row, place);
         params.gaussians.opacity_logit.set_row(row, [logit(alpha) as f32]);
-        params.format_specific.plane_mut(CENTER)[row] = moved as f32;
-        params.format_specific.plane_mut(LOG_DEVIATION)[row] = MAX_DEVIATION.ln() as f32;
+        params.format_specific.plane_mut(TIME_CENTER)[row] = moved as f32;
+        params.format_specific.plane_mut(LOG_TIME_DEVIATION)[row] = MAX_DEVIATION.ln() as f32;
     }
     params
 }
@@ -122,8 +123,8 @@ fn encode_frames(
 fn encode_windows(params: &StoredParams, size: ImageSize, order: &[u32], images: &mut NamedImages) -> TimelineEntry {
     let window = |row: usize| {
         let deviation =
-            f64::from(params.format_specific.plane(LOG_DEVIATION)[row]).exp().max(f64::from(f32::MIN_POSITIVE));
-        [f64::from(params.format_specific.plane(CENTER)[row]), deviation, 0.0]
+            f64::from(params.format_specific.plane(LOG_TIME_DEVIATION)[row]).exp().max(f64::from(f32::MIN_POSITIVE));
+        [f64::from(params.format_specific.plane(TIME_CENTER)[row]), deviation, 0.0]
     };
     let range = Range3::from_rows((0..params.len()).map(window));
     let pair = encode_16_bit(size, order, |row| {
@@ -182,8 +183,8 @@ fn are_8_bits_enough(params: &StoredParams, range: &Range3) -> bool {
     let (mut squares, mut most) = (0.0, 0.0f64);
     for row in 0..params.len() {
         let own = |plane: usize| f64::from(params.format_specific.plane(plane)[row]);
-        let center = own(CENTER);
-        let reach = center.abs().max((1.0 - center).abs()).min(2.0 * own(LOG_DEVIATION).exp());
+        let center = own(TIME_CENTER);
+        let reach = center.abs().max((1.0 - center).abs()).min(2.0 * own(LOG_TIME_DEVIATION).exp());
         let mut scales = params.gaussians.log_scale.row::<3>(row);
         scales.sort_by(f32::total_cmp);
         let error = half_step * reach / f64::from(scales[1]).exp().max(1e-12);

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{kind_with_layout, read_archive, unpack};
+use super::{read_archive, restored_output_kind, unpack};
 use crate::archive::{self, ArchiveContent, EncodedArchive, FieldSteps, QuantizationSteps, TensorSteps};
 use crate::compressed_model::CompressedModel;
 use crate::limits::ReadLimit;
@@ -34,8 +34,8 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
 }
 
 /// Encodes the compressed model `reduction` of `model` as an archive with steps of 2^-16, restores it, and returns the
-/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the frames
-/// of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
+/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the
+/// frames of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
 ///
 /// # Panics
 /// Panics if a check fails.
@@ -51,7 +51,7 @@ pub(in crate::models) fn check_round_trip(
     let file = folder.path().join("a.gsz");
     fs::write(&file, &bytes).unwrap();
     let (decoded, _) = read_archive(&file, ReadLimit::NONE).unwrap();
-    let kind = kind_with_layout(&decoded, &file).unwrap().expect("a layout");
+    let kind = restored_output_kind(&decoded, &file).unwrap().expect("a layout");
 
     let times = &model.source().info().times;
     let open = |path: &Path| crate::models::open(path, options).unwrap().with_times(times.clone()).unwrap();

@@ -26,7 +26,8 @@ pub(super) const LAYOUT: &str = "layout";
 const MAX_GROWTH: u64 = 4;
 /// Number of bytes that the restored files may have in addition to [`MAX_GROWTH`] times the decoded archive.
 const BASE_BYTES: u64 = 1 << 20;
-/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per frame.
+/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per
+/// frame.
 const MAX_LAYOUT_BYTES: usize = 4 << 20;
 /// Maximum length in bytes of a path in an archive.
 const MAX_PATH: usize = 256;
@@ -76,11 +77,11 @@ pub(super) struct Span {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Values {
-    /// One row per Gaussian, in the order of the archive; each row consists of these fields.
+    /// One row per Gaussian, in the order of the archive; each row consists of the given fields.
     Rows(Vec<Field>),
     /// All values of the tensor with this name, as f32.
     Tensor(String),
-    /// This many zero bytes.
+    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
     Zeros(u64),
 }
 
@@ -99,9 +100,10 @@ pub(super) enum Field {
     Octaves(usize),
     /// Byte that is 255 times the value of the plane with this index.
     Byte(usize),
-    /// The next of the bytes that the archive holds per Gaussian beside its values, this many.
+    /// Bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::beside`]); the number of these
+    /// bytes.
     Bytes(usize),
-    /// This many zero bytes.
+    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
     Zeros(usize),
 }
 
@@ -146,12 +148,14 @@ impl Field {
     }
 }
 
-/// Returns the number of the first plane of the columns in a model of this SH degree.
+/// Returns the index, in an archive, of the first plane (scalar component) after those of the standard attributes. The
+/// planes from this index on hold values that only the model's format has. `sh_degree` determines the number of planes
+/// of the standard attributes.
 pub(super) fn first_column_plane(sh_degree: usize) -> usize {
     first_plane(Attributes::SH) + 3 * sh_coefficients(sh_degree)
 }
 
-/// Returns the number of the first plane of an attribute.
+/// Returns the index of the first plane (scalar component) of `attribute` in an archive.
 pub(super) fn first_plane(attribute: Attributes) -> usize {
     match attribute {
         Attributes::POSITION => 0,
@@ -182,7 +186,8 @@ fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
     None
 }
 
-/// Returns the name of the archive part with the bytes of file `k` that are no values.
+/// Returns the name under which an archive stores the remaining bytes of file `k`: all its bytes except the values that
+/// the archive holds as planes and tensors.
 pub(super) fn rest_name(k: usize) -> String {
     format!("file.{k}")
 }
@@ -309,7 +314,8 @@ impl Layout {
 }
 
 /// Returns the bytes of file `k`; `None` if its layout does not match the content. `beside` is the offset of the next
-/// bytes beside the values, and is advanced.
+/// unused byte in [`ArchiveContent::beside`], the bytes that are stored unchanged for each Gaussian. The function
+/// advances it past the bytes of this file.
 fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut usize) -> Option<Vec<u8>> {
     let mut rest = content.files.get(&rest_name(k))?.as_slice();
     let mut out = Vec::new();
@@ -332,7 +338,8 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut 
     Some(out)
 }
 
-/// Appends one row of `fields` per Gaussian to `out`; `None` if a field has no values.
+/// Appends one row of `fields` per Gaussian to `out`. Returns `None` if the content of the archive has no values for a
+/// field.
 fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {

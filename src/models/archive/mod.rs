@@ -106,11 +106,12 @@ pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
 }
 
 /// Returns the kind of output as which [`unpack`] restores the model that `content` holds in the layout of its own
-/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the archive.
+/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the
+/// archive.
 ///
 /// # Errors
 /// Fails if the layout is malformed.
-pub fn kind_with_layout(content: &ArchiveContent, path: &Path) -> Result<Option<OutputKind>> {
+pub fn restored_output_kind(content: &ArchiveContent, path: &Path) -> Result<Option<OutputKind>> {
     let layout = Layout::read(content, path)?;
     Ok(layout.map(|layout| match layout.files.first().filter(|_| !layout.folder) {
         Some(file) => OutputKind::from_path(Path::new(&file.path), None, OutputKind::Model),
@@ -119,7 +120,7 @@ pub fn kind_with_layout(content: &ArchiveContent, path: &Path) -> Result<Option<
 }
 
 /// Returns whether the archive holds a 4DGaussians model folder rather than a single PLY.
-pub fn is_folder(content: &ArchiveContent) -> bool {
+pub fn holds_model_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
@@ -146,7 +147,7 @@ impl OpenArchive {
             let model = layout.restore(&content, path, scratch.path())?;
             drop(content);
             open_restored(&model, path, options)?
-        } else if is_folder(&content) {
+        } else if holds_model_folder(&content) {
             unpack(&content, path, scratch.path())?;
             drop(content);
             (four_d_gaussians::ENTRY.open)(scratch.path(), options)?

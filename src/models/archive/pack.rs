@@ -1,7 +1,7 @@
 //! Makes the content of an archive from the files of a model, as its own renderer opens them.
 //!
-//! Input: a model that was written in its own format, and what its files hold. Output: [`ArchiveContent`] with the values of
-//! the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
+//! Input: a model that was written in its own format, and what its files hold. Output: [`ArchiveContent`] with the
+//! values of the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
 //! ([`super::layout`]). Memory: the files and their values.
 
 use std::fs;
@@ -37,7 +37,8 @@ pub(in crate::models) enum FileContent<'a> {
     Splatv,
     /// Weights of a network: a PyTorch state dict.
     Weights,
-    /// Gaussians as rows of the tensors of a checkpoint with the same objects as this one.
+    /// Gaussians as rows of the tensors of a checkpoint. The tensors are described for the checkpoint from which the
+    /// model was read; the file is a copy of it with the same tree of objects.
     Checkpoint(&'a RowTensors),
     /// Gaussians in the arrays of a NumPy archive; the function returns the axis that counts them and the attribute
     /// that an array holds.
@@ -98,12 +99,12 @@ impl RowField {
         RowField { kind: Field::Byte, bytes: 1, target }
     }
 
-    /// Creates a field that is stored exactly.
+    /// Creates a field of `bytes` bytes that an archive stores unchanged.
     fn exact(bytes: usize) -> RowField {
         RowField { kind: Field::Bytes, bytes, target: Target::Bytes }
     }
 
-    /// Creates a field that is restored as zero.
+    /// Creates a field of `bytes` bytes that an archive does not store, and restores as zeros.
     fn zeros(bytes: usize) -> RowField {
         RowField { kind: Field::Zeros, bytes, target: Target::Zeros }
     }
@@ -180,7 +181,7 @@ impl Packer {
                 self.npz(file, &bytes, axis)?
             }
             FileContent::Other if name == "cfg_args" => {
-                bytes = cfg_args::without_folders(&cfg_args::read(file)?, file)?.into_bytes();
+                bytes = cfg_args::with_file_names_only(&cfg_args::read(file)?, file)?.into_bytes();
                 Vec::new()
             }
             FileContent::Other => {
@@ -208,8 +209,9 @@ impl Packer {
         Ok(())
     }
 
-    /// Reads the values of the fields `fields` in one row per Gaussian, from byte `at` of a file with the content `bytes`.
-    /// Returns the span of the rows and its length in bytes.
+    /// Adds the rows of a file to the archive. The file has the content `bytes`, and the rows begin at byte `at`: one
+    /// row of the fields `fields` per Gaussian. Returns the [`Span`] that describes the rows, and their length in
+    /// bytes.
     fn rows(&mut self, file: &Path, bytes: &[u8], at: usize, fields: &[RowField]) -> Result<(Span, usize)> {
         let count = self.content.cloud.len();
         let stride: usize = fields.iter().map(|field| field.bytes).sum();
@@ -259,8 +261,8 @@ impl Packer {
         Ok((Span { at: at as u64, of: Values::Rows(coded) }, length))
     }
 
-    /// Adds a column with the values `planes`, and returns the number of its first plane. A name that exists gets a
-    /// number.
+    /// Adds a column with the values `planes`, and returns the index of its first plane (scalar component), counted
+    /// over all columns. If the name is taken, a number is appended to it.
     fn add_column(&mut self, name: &str, planes: Vec<Vec<f32>>) -> usize {
         let columns = &mut self.content.columns;
         let first = columns.iter().map(|column| column.values.width()).sum::<usize>();
@@ -277,7 +279,8 @@ impl Packer {
         first_column_plane(self.content.cloud.sh_degree()) + first
     }
 
-    /// Reads the rows of a PLY.
+    /// Adds the Gaussians of a PLY to the archive. Returns the spans (parts of the file with values) that were added,
+    /// each with its length in bytes.
     fn ply(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let ply = Ply::open(file)?;
         if ply.header().encoding != PlyEncoding::LittleEndian {
@@ -295,7 +298,8 @@ impl Packer {
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
-    /// Reads the Gaussians of a `.splatv`; see [`crate::files::splatv`] for their layout.
+    /// Adds the Gaussians of a `.splatv` file to the archive; see [`crate::files::splatv`] for their layout. Returns
+    /// the spans (parts of the file with values) that were added, each with its length in bytes.
     fn splatv(&mut self, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let splatv = Splatv::open(file)?;
         let at = splatv.start();
@@ -317,7 +321,9 @@ impl Packer {
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
-    /// Reads the tensors of a state dict. Tensors that are not f32 or share their values stay bytes of the file.
+    /// Adds the tensors of a state dict to the archive, except tensors that are not f32 or share their values; these
+    /// stay bytes of the file. Returns the spans (parts of the file with values) that were added, each with its length
+    /// in bytes.
     fn weights(&mut self, name: &str, file: &Path) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans: Vec<(Span, usize)> = Vec::new();
@@ -342,7 +348,9 @@ impl Packer {
         Ok(spans)
     }
 
-    /// Reads the tensors of a checkpoint with the same objects as that of `rows`.
+    /// Adds the tensors of a checkpoint to the archive. `rows` describes the tensors of the checkpoint from which the
+    /// model was read; `file` was written as a copy of it, so it has the same tree of objects. Returns the spans (parts
+    /// of the file with values) that were added, each with its length in bytes.
     fn checkpoint(&mut self, rows: &RowTensors, file: &Path, bytes: &[u8]) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans = Vec::new();
@@ -391,7 +399,9 @@ impl Packer {
         Ok(spans)
     }
 
-    /// Reads the arrays of a NumPy archive without compression.
+    /// Adds the arrays of a NumPy archive without compression to the archive. `axis` returns for an array which of its
+    /// axes counts the Gaussians, and the attribute that it holds. Returns the spans (parts of the file with values)
+    /// that were added, each with its length in bytes.
     fn npz(
         &mut self,
         file: &Path,
@@ -455,8 +465,8 @@ impl Packer {
     }
 }
 
-/// Returns the place of the PLY property `name` of a model with this SH degree. `has_all_degrees`: whether the
-/// properties `f_rest_*` are all coefficients of this degree.
+/// Returns the attribute or column of an archive in which the PLY property `name` is stored. `degree`: SH degree of the
+/// model. `has_all_degrees`: whether the properties `f_rest_*` are all coefficients of this degree.
 fn ply_target(name: &str, degree: usize, has_all_degrees: bool) -> Target {
     let stem = name.trim_end_matches(|c: char| c.is_ascii_digit());
     let number: Option<usize> = name[stem.len()..].parse().ok();

@@ -16,7 +16,7 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
-/// How the files in an archive of a model are opened: as the model itself was opened.
+/// Opens the files in an archive of a model in the way in which the model itself was opened.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
     open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
@@ -24,7 +24,8 @@ pub(in crate::models) struct Reopener {
 }
 
 impl Reopener {
-    /// Creates a record of opening a model by `open` with `options`.
+    /// Creates a value that opens archives of a model with the function `open` and the options `options`, with which
+    /// the model itself was opened.
     pub(in crate::models) fn new(
         open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
         options: &OpenOptions,

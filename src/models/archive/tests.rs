@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use super::layout::{Field, FileLayout, LAYOUT, Layout, Span, Values, plain_path, rest_name};
-use super::{kind_with_layout, unpack};
+use super::{restored_output_kind, unpack};
 use crate::archive::{ArchiveContent, Column};
 use crate::deform::Tensor;
 use crate::model::{AttributeValues, Gaussians};
@@ -81,10 +81,10 @@ fn a_single_file_has_the_kind_of_its_name() {
     for (name, kind) in [("model.splatv", OutputKind::Splatv), ("m.ftgs.ply", OutputKind::Ftgs)] {
         let files = vec![FileLayout { path: name.to_owned(), spans: Vec::new() }];
         let content = with_layout(&Layout { folder: false, files });
-        assert_eq!(kind_with_layout(&content, Path::new("a.gsz")).unwrap(), Some(kind));
+        assert_eq!(restored_output_kind(&content, Path::new("a.gsz")).unwrap(), Some(kind));
     }
-    assert_eq!(kind_with_layout(&with_layout(&layout()), Path::new("a.gsz")).unwrap(), Some(OutputKind::Model));
-    assert_eq!(kind_with_layout(&content(), Path::new("a.gsz")).unwrap(), None);
+    assert_eq!(restored_output_kind(&with_layout(&layout()), Path::new("a.gsz")).unwrap(), Some(OutputKind::Model));
+    assert_eq!(restored_output_kind(&content(), Path::new("a.gsz")).unwrap(), None);
 }
 
 #[test]

@@ -192,7 +192,7 @@ fn raw(ply: &Ply) -> Result<StoredParams> {
     Ok(StoredParams { gaussians, format_specific: own })
 }
 
-/// Returns the size in bytes of the files that a renderer opens, divided into parts.
+/// Returns the size in bytes of the files that a renderer opens: the point cloud file, the network and `cfg_args`.
 fn size_of(paths: &Paths) -> Result<ModelSize> {
     let (cloud, field) = (bytes_read_for([&*paths.point_cloud])?, bytes_read_for([&*paths.network])?);
     Ok(ModelSize { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..ModelSize::default() })

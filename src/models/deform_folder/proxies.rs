@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::{MIN_SCALE, NetworkMotionModel, heaviest};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, StoredParams, logit, opacity};
 use crate::models::motion_model::MotionModelFrames;
 use crate::passes::gather_all;

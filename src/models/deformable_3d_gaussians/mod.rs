@@ -132,8 +132,9 @@ impl MotionModel for DeformableMotion {
         Ok(())
     }
 
-    /// Returns the derivative of positions only. The covariance depends on scales and rotations too, but its
-    /// decomposition into scales and rotation is not continuous from frame to frame.
+    /// Returns the derivative of the positions with respect to the stored positions; all other attributes get the
+    /// identity. The shape is not differentiated, because its decomposition into scales and rotation is not continuous
+    /// from frame to frame.
     fn jacobian(
         &self,
         time: f64,

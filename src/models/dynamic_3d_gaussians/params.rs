@@ -123,7 +123,7 @@ impl Params {
         &self.npz
     }
 
-    /// Returns how archives of the model are opened.
+    /// Returns the value that opens archives of the model in the way in which the model itself was opened.
     pub(super) fn reopener(&self) -> &Reopener {
         &self.reopener
     }

@@ -7,7 +7,7 @@
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
 use crate::passes::{SourceWithDeltas, gather_all};
@@ -20,7 +20,8 @@ const SAMPLED_FRAMES: usize = 16;
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
 /// Returns the constant scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. The moment
-/// matches at sampled frames are averaged: scales by the geometric mean, opacities by the arithmetic mean.
+/// matches (Gaussians with the mean and covariance of the members) at sampled frames are averaged: scales by the
+/// geometric mean, opacities by the arithmetic mean.
 ///
 /// # Errors
 /// Fails if frames cannot be read.

@@ -57,8 +57,9 @@ impl InputModel for ModelFolder {
         Ok(self.size()?.total())
     }
 
-    /// Returns the size in bytes of the files that a renderer opens, divided into parts. Does not count
-    /// `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has them.
+    /// Returns the size in bytes of the files that a renderer opens: the point cloud file, the deformation field and
+    /// `cfg_args`. Does not count `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no
+    /// output has them.
     fn size(&self) -> Result<ModelSize> {
         let paths = self.paths();
         size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
@@ -160,7 +161,7 @@ impl InputModel for ModelFolder {
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
         let cloud = compressed_raw(self.stored(), reduction).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
-        let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
+        let cfg_args = cfg_args::with_file_names_only(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = ArchiveContent {
             cloud,
             field: tensors.iter().map(role).collect(),
@@ -272,8 +273,8 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
-/// Returns the size in bytes of the three files of a model (point cloud, deformation field and configuration), divided
-/// into parts.
+/// Returns the size in bytes of the three files of a model (point cloud, deformation field and configuration), each as
+/// its own part.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<ModelSize> {
     let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
     Ok(ModelSize { cloud, field, rest, ..ModelSize::default() })

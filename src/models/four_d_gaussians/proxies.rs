@@ -118,8 +118,8 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
     states
 }
 
-/// Replaces each row of `raw` that contains a value that is not finite by the same row of `leaders`. Returns the number
-/// of replaced rows.
+/// Replaces each row of `raw` that contains a value that is not finite by the same row of `leaders`, the stored
+/// parameters of the leaders (the most important members of the clusters). Returns the number of replaced rows.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     let columns: Vec<Attributes> = Attributes::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {

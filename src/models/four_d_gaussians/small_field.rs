@@ -8,7 +8,7 @@ use half::f16;
 use half::slice::HalfFloatSliceExt;
 use half::vec::HalfFloatVecExt;
 
-use crate::deform::{Tensor, Tensors, unread_rows};
+use crate::deform::{Tensor, Tensors, count_unread_time_rows};
 use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
 /// Minimum number of values of a tensor that is stored in half precision. Smaller tensors (biases, the last layers of
@@ -18,7 +18,8 @@ const MIN_HALF_VALUES: usize = 1024;
 /// Rounding of values within range stays below it; values too large or too small for half precision exceed it.
 const MAX_ERROR: f64 = 1.0 / 2048.0;
 
-/// Returns the tensors with the values that are read back after storage in half precision.
+/// Returns `tensors` with the values that are read back after storage in half precision. Tensors that are not stored in
+/// half precision (small ones, and values out of its range) are unchanged.
 pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     for tensor in tensors.values_mut() {
         if let Some(halves) = halves(tensor) {
@@ -55,7 +56,7 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
         return StoredTensor { stride: vec![0; tensor.shape.len()], ..dense };
     }
     let dense = |data| StoredTensor::dense(name.to_owned(), tensor.shape.clone(), values(tensor, data));
-    let unread = if from_zero { unread_rows(name, &tensor.shape) } else { 0 };
+    let unread = if from_zero { count_unread_time_rows(name, &tensor.shape) } else { 0 };
     let &[_, _, rows, columns] = &tensor.shape[..] else { return dense(&tensor.data) };
     if unread == 0 {
         return dense(&tensor.data);
@@ -123,7 +124,7 @@ mod tests {
         for rows in [1, 2, 25, 50] {
             let plane = tensor(&[1, 16, rows, 8], 1.0);
             let tensors = Tensors::from([(TIME.to_owned(), plane.clone())]);
-            let unread = unread_rows(TIME, &plane.shape);
+            let unread = count_unread_time_rows(TIME, &plane.shape);
             assert_eq!(unread, (rows - 1) / 2);
             let [small, whole] = [true, false].map(|from_zero| stored(&tensors, from_zero).remove(0));
             assert_eq!(whole.values.len(), plane.data.len());
@@ -135,8 +136,8 @@ mod tests {
                 assert!(found == expected || k / 8 % rows < unread, "row {} of {rows}", k / 8 % rows);
             }
         }
-        assert_eq!(unread_rows("deformation_net.grid.grids.1.3", &[1, 16, 50, 8]), 0);
-        assert_eq!(unread_rows(TIME, &[16, 50, 8]), 0);
+        assert_eq!(count_unread_time_rows("deformation_net.grid.grids.1.3", &[1, 16, 50, 8]), 0);
+        assert_eq!(count_unread_time_rows(TIME, &[16, 50, 8]), 0);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::files::ftgs::{CENTER, ClipTimes, LOG_DEVIATION, VELOCITY};
+use crate::files::ftgs::{ClipTimes, LOG_TIME_DEVIATION, TIME_CENTER, VELOCITY};
 use crate::files::tsog::{TimedGaussians, Timeline};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
@@ -69,7 +69,7 @@ impl FreeTime {
     /// result must not apply it again.
     pub(in crate::models) fn with_deviations(&self, raw: &StoredParams) -> StoredParams {
         let mut raw = raw.clone();
-        let durations = raw.format_specific.plane_mut(LOG_DEVIATION).iter_mut();
+        let durations = raw.format_specific.plane_mut(LOG_TIME_DEVIATION).iter_mut();
         durations.for_each(|duration| *duration = self.deviation(*duration).ln() as f32);
         raw
     }
@@ -79,7 +79,7 @@ impl MotionModel for FreeTime {
     type Prepared = Windows;
 
     fn prepare(&self, raw: &StoredParams) -> Windows {
-        let rates = raw.format_specific.plane(LOG_DEVIATION).iter().map(|&duration| self.rate(duration)).collect();
+        let rates = raw.format_specific.plane(LOG_TIME_DEVIATION).iter().map(|&duration| self.rate(duration)).collect();
         Windows {
             rates,
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
@@ -104,7 +104,7 @@ impl MotionModel for FreeTime {
         out: &mut Gaussians,
     ) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
-        let (time, centers) = (self.clip.to_unit(time), raw.format_specific.plane(CENTER));
+        let (time, centers) = (self.clip.to_unit(time), raw.format_specific.plane(TIME_CENTER));
         if want.contains(Attributes::POSITION) {
             for c in 0..3 {
                 let (from, velocity) = (raw.gaussians.position.plane(c), raw.format_specific.plane(VELOCITY + c));
@@ -131,7 +131,7 @@ impl MotionModel for FreeTime {
         if want.contains(Attributes::OPACITY) {
             let min_logit = self.min_logit();
             let time = self.clip.to_unit(time);
-            let centers = raw.format_specific.plane(CENTER).iter().zip(&windows.rates).zip(&windows.inverse_odds);
+            let centers = raw.format_specific.plane(TIME_CENTER).iter().zip(&windows.rates).zip(&windows.inverse_odds);
             let slopes = centers.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = -rate * (time - f64::from(center)).powi(2);
                 if exponent < min_logit || faded_logit(inverse_odds, exponent) <= min_logit {
@@ -157,8 +157,8 @@ impl ProxyRule for FreeTime {
             LinearPath {
                 position: raw.gaussians.position.row::<3>(id).map(f64::from),
                 velocity: [0, 1, 2].map(|c| f64::from(raw.format_specific.plane(VELOCITY + c)[id]) / span),
-                center: first + span * f64::from(raw.format_specific.plane(CENTER)[id]),
-                deviation: span * motion.deviation(raw.format_specific.plane(LOG_DEVIATION)[id]),
+                center: first + span * f64::from(raw.format_specific.plane(TIME_CENTER)[id]),
+                deviation: span * motion.deviation(raw.format_specific.plane(LOG_TIME_DEVIATION)[id]),
             }
         };
         let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
@@ -176,8 +176,8 @@ impl ProxyRule for FreeTime {
             let line = matched.line;
             let StoredParams { gaussians, format_specific: own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
-            own.plane_mut(CENTER)[row] = motion.clip.to_unit(line.center) as f32;
-            own.plane_mut(LOG_DEVIATION)[row] = (line.deviation / span - floor[1]).max(floor[0]).ln() as f32;
+            own.plane_mut(TIME_CENTER)[row] = motion.clip.to_unit(line.center) as f32;
+            own.plane_mut(LOG_TIME_DEVIATION)[row] = (line.deviation / span - floor[1]).max(floor[0]).ln() as f32;
             (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = (span * line.velocity[c]) as f32);
             let Some((opacity, covariance)) = matched.shape else { continue };
             let like = gaussians.rotation.row::<4>(row).map(f64::from);

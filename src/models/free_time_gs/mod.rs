@@ -17,7 +17,7 @@ use super::in_checkpoint::{
 };
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
-use crate::files::ftgs::{CENTER, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY};
+use crate::files::ftgs::{LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
@@ -153,8 +153,11 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
         reader.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;
     }
-    let motion_tensors =
-        [("times", &[1][..], CENTER, 1), ("durations", &[1], LOG_DEVIATION, 1), ("velocities", &[3], VELOCITY, 3)];
+    let motion_tensors = [
+        ("times", &[1][..], TIME_CENTER, 1),
+        ("durations", &[1], LOG_TIME_DEVIATION, 1),
+        ("velocities", &[3], VELOCITY, 3),
+    ];
     for (id, (name, row, first, width)) in motion_nodes.into_iter().zip(motion_tensors) {
         reader.read(id, &place(name), row, RowElement::own(first, width))?;
     }

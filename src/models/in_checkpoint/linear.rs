@@ -8,7 +8,7 @@
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, logit, opacity};
 use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::recipe::MergeParams;
@@ -68,7 +68,8 @@ pub(in crate::models) struct Matched {
     pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// State that one proxy should have at one frame: the moment match of its members.
+/// State that one proxy should have at one frame: the moment match of its members, that is, the Gaussian with the mean
+/// and covariance of their mixture.
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
@@ -76,7 +77,7 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
-    /// Weight of the frame: window of the proxy times opacity of the moment match.
+    /// Weight of the frame: window of the proxy times opacity of the moment match (see [`ProxyAtFrame`]).
     pub(in crate::models) weight: f64,
     /// States of a block of proxies at this frame. The state of each proxy is the moment match of its members.
     pub(in crate::models) state: &'a Gaussians,
@@ -85,7 +86,8 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
 }
 
 /// Computes for each of `clusters` the path, temporal window and shape of its proxy from its members (merged
-/// Gaussians).
+/// Gaussians). The moment match of the members at a frame is the Gaussian with the mean and covariance of their
+/// mixture.
 ///
 /// `line_of` returns the path and window of a member by its id; `window` returns the value of a window at a time. Calls
 /// `visit` with the moment match of each proxy at each sampled frame at which the proxy is visible. The moment match
@@ -132,7 +134,8 @@ pub(in crate::models) fn match_proxies(
     Ok(matched)
 }
 
-/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match.
+/// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match (see
+/// [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
     /// Sum over the frames of m·α: window times opacity of the moment match.
@@ -144,8 +147,9 @@ struct FrameSums {
 }
 
 impl FrameSums {
-    /// Adds one frame to the sums. Row `row` of `state` is the moment match at this frame, `m` the window, and `alpha`
-    /// the opacity.
+    /// Adds one frame to the sums. Row `row` of `state` is the moment match of the members at this frame (the Gaussian
+    /// with the mean and covariance of their mixture), `m` is the value of the proxy's temporal window, and `alpha` the
+    /// opacity of the moment match.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -154,7 +158,8 @@ impl FrameSums {
         self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Returns the opacity logit at the center of the window and the mean covariance; `None` if no frame was added.
+    /// Returns two averages over the added frames: the opacity logit of the proxy at the center of its temporal window,
+    /// and the covariance (xx, xy, xz, yy, yz, zz). Returns `None` if no frame was added.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
         let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));

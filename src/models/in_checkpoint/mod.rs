@@ -89,7 +89,8 @@ pub(super) struct ModelDescription {
     pub(super) root: Option<PathBuf>,
     /// Path of the checkpoint file.
     pub(super) file: PathBuf,
-    /// How the model was opened.
+    /// Reopener of the model, which opens archives of the model as the model itself was opened; `None` if there is
+    /// none.
     pub(super) reopener: Option<Reopener>,
     /// Notes for the user.
     pub(super) notes: Vec<String>,
@@ -134,7 +135,8 @@ impl<L: ProxyRule> CheckpointModel<L> {
         found
     }
 
-    /// Returns how the model was opened.
+    /// Returns the value that opens archives of the model in the way in which the model itself was opened. Fails if
+    /// there is none.
     fn reopener(&self) -> Result<&Reopener> {
         self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
     }

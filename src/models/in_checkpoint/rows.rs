@@ -30,8 +30,8 @@ impl RowElement {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Describes `count` consecutive values in a tensor's row that are format-specific parameters: value k is the
-    /// parameter with index `first` + k in [`StoredParams::format_specific`].
+    /// Returns the meaning of `count` consecutive values in a tensor's row that are format-specific parameters: value k
+    /// is the parameter with index `first` + k in [`StoredParams::format_specific`].
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }
@@ -149,8 +149,8 @@ pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &s
 }
 
 impl RowTensors {
-    /// Returns name, node in the checkpoint and meaning of the values of a row, of every tensor that holds parameters of
-    /// Gaussians.
+    /// Returns name, node in the checkpoint and meaning of the values of a row, of every tensor that holds parameters
+    /// of Gaussians.
     pub(in crate::models) fn params(&self) -> impl Iterator<Item = (&str, NodeId, &[RowElement])> {
         self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.planes[..]))
     }

@@ -5,7 +5,7 @@ use xxhash_rust::xxh3::Xxh3;
 use super::ProxyRule;
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::merging::merged::MergedSequence;
+use crate::merging::merged_sequence::MergedSequence;
 use crate::model::{Attributes, Gaussians, StoredParams};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;

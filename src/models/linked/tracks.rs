@@ -196,7 +196,9 @@ impl LinkedTracks {
         (self.joined, self.count) = (None, self.births.len());
     }
 
-    /// Counts the frames in which each track is present.
+    /// Counts the frames in which each track is present, and returns the counts with the frames that have several
+    /// Gaussians of one track.
+    ///
     ///
     /// # Errors
     /// Fails if a read fails.

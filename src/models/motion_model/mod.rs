@@ -75,7 +75,8 @@ pub(super) trait MotionModel: Debug + Send + Sync {
 
 /// Computes colors of pixels from rendered features.
 pub(super) trait Shading: Sync {
-    /// Returns the features of the Gaussians `raw` at `time`, feature by feature.
+    /// Returns the features of the Gaussians `raw` at `time`, from which the color of a pixel is computed after
+    /// blending: one plane per feature, with its value for every Gaussian.
     fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues;
 
     /// Returns the color of a pixel from its blended `features`, seen from the camera center `center` along the unit
@@ -157,8 +158,8 @@ impl<L: MotionModel> MotionModelFrames<L> {
 }
 
 /// Returns the stored parameters of the compressed model `reduction` of `raw`: Gaussians are removed, proxies
-/// (Gaussians that replace merged ones) put in place of their leaders, parameter deltas added, and the SH degree
-/// lowered.
+/// (Gaussians that replace merged ones) put in place of their leaders (the most important members of the clusters),
+/// parameter deltas added, and the SH degree lowered.
 pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) -> StoredParams {
     let mut raw_left = raw.pick(&reduction.kept);
     if let Some(proxies) = &reduction.proxies.raw {

@@ -96,7 +96,9 @@ struct ThreeFunctionFit {
 }
 
 impl ThreeFunctionFit {
-    /// Adds a sample: the three functions `basis` and all values at one time, with a weight.
+    /// Adds one sample of all fitted values to the least-squares sums. `basis` holds the three basis functions
+    /// (constant and two cosine waves) at the time of the sample, `values` the values at this time, `weight` the weight
+    /// of the sample.
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {

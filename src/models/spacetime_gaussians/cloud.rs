@@ -123,8 +123,8 @@ impl PointCloudFile {
     }
 
     /// Writes the compressed model to a PLY file with the same properties. Rows are copied byte for byte, except that
-    /// proxies (Gaussians that replace merged ones) are written in place of their leaders, and parameter deltas are
-    /// added.
+    /// proxies (Gaussians that replace merged ones) are written in place of their leaders (the most important members
+    /// of the clusters), and parameter deltas are added.
     ///
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.
@@ -190,8 +190,8 @@ fn own_property_names(is_full: bool) -> Vec<String> {
 }
 
 /// Replaces the colors in `raw` by SH coefficients of degree 0. With `activation`, a color is `activation` applied to
-/// the first three features. Without it, `raw` holds stored colors in place of SH coefficients, and these are
-/// converted.
+/// the first three features of a Gaussian. Without it, `raw` holds stored colors in place of SH coefficients, and these
+/// are converted.
 fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.format_specific.width() > FEATURES;

@@ -216,9 +216,9 @@ fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     if found.is_finite() { found } else { DQuat::IDENTITY }
 }
 
-/// Returns the logit of the proxy's opacity at the center of its temporal window: the amplitude of the window, fitted by
-/// least squares. The window is fitted to the opacities that the moment match of the members has at `times`. `states`
-/// holds the states of the members at each of `times`.
+/// Returns the logit of the proxy's opacity at the center of its temporal window: the amplitude of the window, fitted
+/// by least squares. The window is fitted to the opacities at `times` of the moment match of the members (the Gaussian
+/// with the mean and covariance of their mixture). `states` holds the states of the members at each of `times`.
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

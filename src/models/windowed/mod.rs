@@ -31,7 +31,7 @@ use crate::source::FrameSource;
 pub(super) use ftgs::FTGS;
 pub(super) use tsog::TSOG;
 
-/// Opened file of a player. The motion model `L` computes the states of its Gaussians.
+/// Opened model file in a format of web players. The motion model `L` computes the states of its Gaussians.
 #[derive(Debug)]
 struct WindowedModel<L: ProxyRule> {
     path: PathBuf,
@@ -44,13 +44,14 @@ struct WindowedModel<L: ProxyRule> {
     /// Repairs and guesses made while opening.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// How the `.ftgs.ply` in an archive of this file is opened. `None` for Gaussians without windows of time, which a
-    /// `.ftgs.ply` cannot hold; their archives hold frames.
+    /// Opens the `.ftgs.ply` in an archive of this file in the way in which the file itself was opened. `None` for
+    /// Gaussians without windows of time, which a `.ftgs.ply` cannot hold; their archives hold frames.
     reopener: Option<Reopener>,
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns how the `.ftgs.ply` in an archive of this file is opened.
+    /// Returns the value that opens the `.ftgs.ply` in an archive of this file in the way in which the file itself was
+    /// opened. Fails if the archives of this file hold frames instead.
     fn reopener(&self) -> Result<&Reopener> {
         self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }

@@ -3,7 +3,7 @@ use std::path::Path;
 
 use super::*;
 use crate::compressed_model::ParamDelta;
-use crate::files::ftgs::{CENTER, ClipTimes, Ftgs, LOG_DEVIATION, PARAMS_PER_GAUSSIAN, VELOCITY, write_ftgs};
+use crate::files::ftgs::{ClipTimes, Ftgs, LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY, write_ftgs};
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::files::tsog::read::read_tsog;
@@ -34,8 +34,8 @@ fn params() -> StoredParams {
         g.log_scale.set_row(i, [0, 1, 2].map(|c| noise(5 + c, i) - 2.0));
         g.opacity_logit.set_row(i, [2.0 * noise(8, i)]);
         (0..12).for_each(|c| g.sh.plane_mut(c)[i] = noise(9 + c, i));
-        made.format_specific.plane_mut(CENTER)[i] = noise(21, i) + 0.5;
-        made.format_specific.plane_mut(LOG_DEVIATION)[i] = if i == 3 { -9.0 } else { noise(22, i) - 1.5 };
+        made.format_specific.plane_mut(TIME_CENTER)[i] = noise(21, i) + 0.5;
+        made.format_specific.plane_mut(LOG_TIME_DEVIATION)[i] = if i == 3 { -9.0 } else { noise(22, i) - 1.5 };
         (0..3).for_each(|c| made.format_specific.plane_mut(VELOCITY + c)[i] = 2.0 * noise(23 + c, i));
     }
     made
@@ -71,12 +71,12 @@ fn ftgs_states_follow_the_formulas_of_the_player() {
         for (state, time) in states(&*model).iter().zip(TIMES) {
             for i in 0..COUNT {
                 let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
-                let dt = time - own(CENTER);
+                let dt = time - own(TIME_CENTER);
                 for c in 0..3 {
                     let expected = f64::from(stored.gaussians.position.plane(c)[i]) + own(VELOCITY + c) * dt;
                     assert!((f64::from(state.position.plane(c)[i]) - expected).abs() < 1e-6);
                 }
-                let deviation = own(LOG_DEVIATION).exp().max(0.02);
+                let deviation = own(LOG_TIME_DEVIATION).exp().max(0.02);
                 let alpha = opacity(stored.gaussians.opacity_logit.plane(0)[i]);
                 let expected = (alpha * (-0.5 * (dt / deviation).powi(2)).exp()).max(1e-4);
                 assert!((opacity(state.opacity_logit.plane(0)[i]) - expected).abs() < 1e-6, "Gaussian {i} at {time}");
@@ -123,7 +123,7 @@ fn proxies_of_copies_move_like_their_members() {
     let mut made = params();
     let copy = made.clone();
     made.set_row(1, &copy, 0);
-    made.format_specific.plane_mut(LOG_DEVIATION).fill(0.0);
+    made.format_specific.plane_mut(LOG_TIME_DEVIATION).fill(0.0);
     made.gaussians.opacity_logit.plane_mut(0).fill(-3.0);
     write_ftgs(&made, &ClipTimes { first: 2.0, last: 6.0, ..ClipTimes::UNIT_INTERVAL }, &path).unwrap();
     let model = open_at(&path, &[2.0, 3.0, 4.0, 6.0]);
@@ -173,10 +173,10 @@ fn tsog_states_follow_the_formulas_of_the_player() {
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for i in 0..COUNT {
             let own = |plane: usize| f64::from(stored.format_specific.plane(plane)[i]);
-            let dt = time - own(CENTER);
+            let dt = time - own(TIME_CENTER);
             let x = f64::from(stored.gaussians.position.plane(0)[i]) + own(VELOCITY) * dt;
             assert!((f64::from(state.position.plane(0)[i]) - x).abs() < 1e-6);
-            let window = (-0.5 * (dt / own(LOG_DEVIATION).exp()).powi(2)).exp();
+            let window = (-0.5 * (dt / own(LOG_TIME_DEVIATION).exp()).powi(2)).exp();
             let expected = opacity(stored.gaussians.opacity_logit.plane(0)[i]) * window;
             assert!((opacity(state.opacity_logit.plane(0)[i]) - expected).abs() < 1e-6, "Gaussian {i} at {time}");
         }

@@ -56,8 +56,8 @@ fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
     is_named || (head.starts_with(b"PK\x03\x04") && is_tsog(path))
 }
 
-/// Returns the opened `.tsog` file at `path`, whose frames `model` computes. `timing` states whether frames can be at
-/// any time, `reopener` how the `.ftgs.ply` in an archive of the file is opened.
+/// Creates the input model of the `.tsog` file at `path`, whose frames `model` computes. `timing` states whether frames
+/// can be at any time; `reopener` opens the `.ftgs.ply` in an archive of the file.
 fn opened<L: ProxyRule + 'static>(
     path: &Path,
     timing: TimeOrigin,

@@ -38,7 +38,7 @@ use crate::source::FrameSource;
 /// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
-/// coarser step would erase the values.
+/// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
 /// Minimum standard deviation of the values of a column from which its quantization step follows, as a fraction of the
 /// largest magnitude of the values.

@@ -113,7 +113,7 @@ impl ShDegreeStage {
                 + work.render_seconds(2.0 * pictures as f64, left * work.gaussian_count(), RENDER_COST),
             reads: 2.0 * work.scattered_full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.filling_blocks(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
+            fixed: vec![work.block_buffer_memory(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
     }
 

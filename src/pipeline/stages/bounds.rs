@@ -15,7 +15,9 @@ use crate::files::atomic::ScratchFolder;
 use crate::memory_plan::{MemoryPart, Workload};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::bounds::ErrorBounds;
-use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
+use crate::outputs::container::{
+    FRAME_BLOCK_WITH_ERROR_BOUNDS, GAUSSIAN_BLOCK, Packing, column_bytes, write_container,
+};
 use crate::pipeline::stages::reference_views::{
     ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, OCTAVE_HALVINGS, OCTAVE_RANGE,
     QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
@@ -29,7 +31,8 @@ const LEVEL: i32 = 15;
 /// Initial error bounds of position, rotation, log scale, opacity and SH: for positions as a fraction of the scene
 /// extent, for the others in the units of the attributes. They are finer than most final bounds.
 const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Maximum ratio of a final error bound to its initial one; with wider bounds no motion and no color would remain.
+/// Maximum ratio of a final error bound to its initial one; with wider bounds, rounding would remove all motion and all
+/// differences of color.
 const MAX_WIDENING: f64 = 64.0;
 /// Maximum number of blocks of Gaussians that are encoded to count the bits of every attribute.
 const COUNTED_BLOCKS: usize = 4;
@@ -48,7 +51,11 @@ pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
     }
-    [work.tile_write_buffers(BOUNDED_FRAME_BLOCK), vec![work.compressor_memory(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
+    [
+        work.tile_write_buffers(FRAME_BLOCK_WITH_ERROR_BOUNDS),
+        vec![work.compressor_memory(LEVEL, FRAME_BLOCK_WITH_ERROR_BOUNDS)],
+    ]
+    .concat()
 }
 
 /// Finds error bounds with which an archive of `source`, a result of `scene`, meets the quality or size `asked`. If

@@ -94,7 +94,7 @@ impl Choose {
             seconds: work.reading_seconds(work.gaussian_count(), frames as f64) + made,
             reads: work.full_reads(frames, limits) + work.scattered_full_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.filling_blocks(), ("views", pictures)],
+            fixed: vec![work.block_buffer_memory(), ("views", pictures)],
         }
     }
 

@@ -36,8 +36,8 @@ pub(crate) struct Degree {
 /// Adds the stage that chooses the SH degree to `stages` if a size on disk is requested and the run refines and may
 /// lower the SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
-        stages.set_open_ended();
+    if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_sh_degree()) {
+        stages.set_uncertain_duration();
         stages.add(Phase::Rank, Degree { refine: refine.with_step_fraction(TRIAL_STEPS) });
     }
 }

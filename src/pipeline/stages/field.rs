@@ -90,7 +90,7 @@ impl FieldPrecisionStage {
             reads: work.full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
-                work.filling_blocks(),
+                work.block_buffer_memory(),
                 ("field", work.input.fixed),
                 ("views", render::STRIP_BYTES as u64 + 24 * work.pixels),
             ],

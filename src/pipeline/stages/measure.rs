@@ -15,7 +15,7 @@ use crate::pipeline::stage::{
 };
 use crate::pruning::score;
 use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
-use crate::pruning::visible::{self, VisibilityStage};
+use crate::pruning::visibility::{self, VisibilityStage};
 use crate::recipe::{Coverage, Recipe, ScanFrames};
 use crate::scene::Scene;
 use crate::statistics::pass::{ScanResult, scan_units};
@@ -101,7 +101,7 @@ impl MeasureStages {
     /// # Errors
     /// Fails if a stage fails.
     pub fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
-        scene.set_absent(&[]);
+        scene.set_excluded_ids(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
         let key = scene.work.key(&(
             (&self.scan.recipe, self.scan.can_be_partial, self.visible.is_some(), snap_noise, non_finite, score, user),
@@ -109,7 +109,7 @@ impl MeasureStages {
         ));
         let scored =
             journal.cached(&scene.work, score::NAME, key, |journal| self.measure_anew(scene, arrived, journal))?;
-        scene.set_absent(&scored.absent);
+        scene.set_excluded_ids(&scored.absent);
         scored.within(&scene.limits, &scene.scratch)
     }
 
@@ -119,13 +119,13 @@ impl MeasureStages {
     /// # Errors
     /// Fails if frames cannot be read, or if their times do not allow statistics of motion.
     pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
-        scene.set_absent(&[]);
+        scene.set_excluded_ids(&[]);
         let scanned = self.scan.run(scene, journal)?;
-        let absent = self.score.absent_ids(&scanned.rows);
+        let absent = self.score.non_finite_ids_to_drop(&scanned.rows);
         if absent.is_empty() {
             return Ok(scanned);
         }
-        scene.set_absent(&absent);
+        scene.set_excluded_ids(&absent);
         self.scan.run(scene, journal)
     }
 
@@ -164,7 +164,7 @@ impl Stage for MeasureStages {
                 0 => scene.schedule.pair_count(),
                 most => most.min(scene.schedule.pair_count()),
             };
-            units.push(format!("{}: {most} views", visible::NAME));
+            units.push(format!("{}: {most} views", visibility::NAME));
         }
         units
     }

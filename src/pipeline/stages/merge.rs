@@ -20,11 +20,11 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging;
-use crate::merging::known::{PairSimilarity, SimilarityCache};
 use crate::merging::motion::MotionThresholds;
 use crate::merging::motion_pass;
 use crate::merging::motion_pass::PairMeter;
 use crate::merging::proxy::{Importance, weights};
+use crate::merging::similarity_cache::{PairSimilarity, SimilarityCache};
 use crate::merging::voxels::voxel_order;
 use crate::merging::{MergeResult, RequestedPairs, Survivors};
 use crate::model::{AttributeValues, Attributes, Gaussians};
@@ -45,17 +45,18 @@ use crate::source::FrameSource;
 const NAME: &str = "merge";
 
 /// Name under which the measured motion similarities of pairs of Gaussians are cached. The measurement can be divided
-/// into shards.
+/// into shards (parts of a divided stage).
 pub(crate) const PAIRS: &str = "pairs";
-/// Minimum number of pairs of Gaussians for which the measurement of their motion is divided into shards.
+/// Minimum number of pairs of Gaussians for which the measurement of their motion is divided into shards (parts of a
+/// divided stage).
 const MIN_DIVIDED_PAIRS: usize = 20_000;
 
 /// Bytes of memory per Gaussian that may survive. They hold its id in the list of all such Gaussians and in the subset
 /// on which merging is tried, its state with base colors only, a flag whether the state is finite, and its merge class.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Assumed number of sets of survivors on which merging is tried until it leaves the requested number of Gaussians;
-/// used to estimate reads. The secant search ([`bracket`]) usually needs fewer.
+/// Assumed number of sets of survivors (Gaussians left by pruning) on which merging is tried until it leaves the
+/// requested number of Gaussians; used to estimate reads. The secant search ([`bracket`]) usually needs fewer.
 const USUAL_TRIALS: f64 = 16.0;
 
 /// Number of Gaussians whose full states are read at a time at the reference frame. Merging then keeps only the
@@ -72,10 +73,11 @@ const FOLLOWED_FRACTION: f64 = 0.3;
 pub(crate) struct MergeStage {
     /// Parameters of the tests for similarity, of the merge passes and of the proxies.
     pub recipe: recipe::MergeParams,
-    /// Parameters of the scan, which define in which frames a Gaussian is alive (its life span) and how motion between
-    /// frames is measured.
+    /// Parameters of the scan, which define in which frames a Gaussian is alive (its life span: opacity ≥ alpha_min)
+    /// and how motion between frames is measured.
     pub scan: recipe::ScanParams,
-    /// Whether survivors may be pruned in addition to merging, to reach the requested number of Gaussians.
+    /// Whether survivors (Gaussians left by pruning) may be pruned in addition to merging, to reach the requested
+    /// number of Gaussians.
     pub prunes: bool,
     /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
@@ -90,7 +92,8 @@ pub(crate) struct MergeOutcome {
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage that merges survivors to `stages` if the run merges; otherwise records the reason why it does not.
+/// Adds the stage that merges survivors (Gaussians left by pruning) to `stages` if the run merges; otherwise records
+/// the reason why it does not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -154,7 +157,7 @@ impl MergeStage {
             ("pool", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
             ("survivors", merging::BYTES_PER_SURVIVOR as u64),
-            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSING) as u64),
+            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSED_PAIR) as u64),
             ("readers", work.input.reader),
             ("followed", motion_pass::bytes_per_gaussian(limits.max_kept_frames) as u64),
         ];
@@ -168,7 +171,7 @@ impl MergeStage {
             seconds: SECONDS_TO_MERGE * work.gaussian_count()
                 + FOLLOWED_FRACTION * work.reading_seconds(work.gaussian_count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.filling_blocks()],
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.block_buffer_memory()],
         }
     }
 
@@ -207,7 +210,7 @@ impl MergeStage {
                     }
                 };
                 drop(trial);
-                scene.work.end_shard_before(NAME)?;
+                scene.work.end_shard_run_before(NAME)?;
                 let MergeOutcome { compressed, summary } = &mut merged;
                 let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
                 compressed.set_proxies(proxies);
@@ -252,7 +255,7 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
     Ok(low)
 }
 
-/// Input of merging, kept in memory so that merging can be tried on many sets of survivors.
+/// Input of merging, kept in memory so that merging can be tried on many sets of survivors (Gaussians left by pruning).
 struct Trial<'a> {
     scored: &'a Scored,
     /// Merge parameters of the recipe, with the motion noise raised to at least twice the distance between neighboring
@@ -271,10 +274,11 @@ struct Trial<'a> {
     work: &'a Cache,
     /// Maximum number of pairs whose motion is measured at the same time.
     pairs_together: usize,
-    /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors that is
-    /// tried.
+    /// Similarities of motion measured so far, by pair of Gaussians. They stay valid for every set of survivors
+    /// (Gaussians left by pruning) that is tried.
     known: SimilarityCache,
-    /// Progress display of the stage: one unit per set of survivors on which merging was tried.
+    /// Progress display of the stage: one unit per set of survivors (Gaussians left by pruning) on which merging was
+    /// tried.
     progress: &'a Progress,
 }
 
@@ -313,8 +317,8 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` (increasing ids) so that exactly `target` Gaussians are left, and returns the result. Fails
-    /// if merging cannot reduce them to so few.
+    /// Merges `survivors` (Gaussians left by pruning) (increasing ids) so that exactly `target` Gaussians are left, and
+    /// returns the result. Fails if merging cannot reduce them to so few.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
         let left = merged.compressed.len();
@@ -395,8 +399,8 @@ fn measure(
     })
 }
 
-/// Returns the compressed model of the survivors, in which proxies replace the groups in `merged`, with a summary of
-/// how many Gaussians each merge pass joined.
+/// Returns the compressed model of the survivors (Gaussians left by pruning), in which proxies replace the groups in
+/// `merged`, with a summary of how many Gaussians each merge pass joined.
 fn outcome(
     survivors: &Survivors<'_>,
     merged: &MergeResult,

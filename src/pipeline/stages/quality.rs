@@ -25,7 +25,7 @@ use crate::passes::{BatchLimits, RenderedSource, ViewStates, for_each_view_batch
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, MeasuredOnArrival, Phase, PreparedArchive, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
-use crate::scene::pictures::{self, ViewSet, spread_views};
+use crate::scene::view_selection::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
@@ -85,7 +85,7 @@ impl Stage for QualityStage {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        run.scene.work.end_shard_before("measuring quality")?;
+        run.scene.work.end_shard_run_before("measuring quality")?;
         if run.result.is_empty() {
             return Ok(());
         }
@@ -104,7 +104,7 @@ impl QualityStage {
     /// number of Gaussians in the result divided by that in the input.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
-        let of_views = pictures::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
+        let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
         let result =
             vec![("kept", bytes_of_survivors(left, 24)), ("result", bytes_of_survivors(left, 2 * work.input.reduced))];
         ResourceEstimate {
@@ -123,13 +123,13 @@ impl QualityStage {
     fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
         let scene = run.scene;
         let times = &scene.source().info().times;
-        let kind = match scene.rig.held_out() {
+        let kind = match scene.rig.held_out_split() {
             Some(_) => ViewKind::Test,
             None if journal.refined.is_some() => ViewKind::Validation,
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };
-        let all = pictures::select_views(&scene.rig, times, ViewSet::HeldOut)?;
+        let all = view_selection::select_views(&scene.rig, times, ViewSet::HeldOut)?;
         let views = spread_views(all, self.view_count(run));
         let folder;
         let (opened, reduced);

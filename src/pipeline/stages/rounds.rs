@@ -47,8 +47,8 @@ pub(crate) struct Rounds {
     /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
     /// color of its background.
     pub contrast_floor: f64,
-    /// Smallest fraction of the Gaussians of the input that the last round is assumed to leave; bounds the number of
-    /// rounds in estimates.
+    /// Smallest fraction of the Gaussians of the input that the last round may leave, as assumed in estimates; it
+    /// bounds the number of rounds.
     pub fewest: f64,
     /// Fraction of the Gaussians of the input that the last round usually leaves; used for estimates of time.
     pub usual: f64,
@@ -113,7 +113,7 @@ impl Rounds {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
-    /// buffers for rendering all survivors.
+    /// buffers for rendering all survivors (Gaussians left by pruning).
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
@@ -298,7 +298,7 @@ impl Rounds {
 /// State of the ranking between two pruning rounds.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Ids of the survivors that later rounds may remove, best first.
+    /// Ids of the survivors (Gaussians not removed so far) that later rounds may remove, most important first.
     free: Vec<u32>,
     /// Ids of the Gaussians removed so far, worst last.
     removed: Vec<u32>,

@@ -5,7 +5,7 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::model::{Attributes, Rows, ViewSchedule};
+use crate::model::{Attributes, StatisticRows, ViewSchedule};
 use crate::passes::{GAUSSIANS_PER_BLOCK, SomeFrames};
 use crate::recipe;
 use crate::scene::Scene;
@@ -61,10 +61,10 @@ impl ScanStage {
                 * frames_read
                 * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
                 + work.reading_seconds(work.gaussian_count(), frames_read),
-            per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
+            per_gaussian: vec![("rows", 2 * StatisticRows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
                 ("blocks", work.threads * work.largest_block(GAUSSIANS_PER_BLOCK as u64) * block),
-                work.filling_blocks(),
+                work.block_buffer_memory(),
                 ("frames", frames),
             ],
         }
@@ -96,7 +96,7 @@ impl ScanStage {
             info.times.len()
         );
         journal.leave_out("statistics of motion and opacity (D, kappa, V)", why);
-        Ok(found.for_all_frames(&frames, info.times.len()))
+        Ok(found.extrapolate_to_all_frames(&frames, info.times.len()))
     }
 
     /// Reads all frames of `source` (all or some frames of `scene`), and returns the statistics of every Gaussian as
@@ -177,10 +177,15 @@ mod tests {
 
     #[test]
     fn partial_scan_stands_for_all_frames() {
-        let rows =
-            Rows { life: vec![3, 1, 0], d: vec![2.0; 3], kappa: vec![1.0; 3], v: vec![0.1; 3], ..Rows::default() };
+        let rows = StatisticRows {
+            life: vec![3, 1, 0],
+            d: vec![2.0; 3],
+            kappa: vec![1.0; 3],
+            v: vec![0.1; 3],
+            ..StatisticRows::default()
+        };
         let found = ScanResult { rows, alive_per_frame: vec![1, 2, 1], ..ScanResult::default() };
-        let all = found.for_all_frames(&[0, 5, 9], 10);
+        let all = found.extrapolate_to_all_frames(&[0, 5, 9], 10);
         assert_eq!(all.alive_per_frame, [1, 0, 0, 0, 0, 2, 0, 0, 0, 1]);
         assert_eq!((all.rows.life, all.rows.d, all.rows.v), (vec![10, 4, 0], vec![0.0; 3], vec![0.0; 3]));
         assert!(all.is_partial);

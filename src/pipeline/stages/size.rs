@@ -36,7 +36,7 @@ const RANKING_VIEWS: usize = 48;
 /// Adds to `stages` the stage that finds how many Gaussians fit the requested size on disk, if a size is requested.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning) {
-        stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_degree(), limit });
+        stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_sh_degree(), limit });
     }
 }
 

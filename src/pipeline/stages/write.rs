@@ -39,7 +39,7 @@ const NAME: &str = "emit";
 /// Assumed fraction of the input's Gaussians that a run writes; used for estimates of time.
 const USUAL_LEFT: f64 = 0.5;
 /// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
-pub const SECONDS_TO_ENCODE: f64 = 3.5e-7;
+pub const ENCODE_SECONDS_PER_STATE: f64 = 3.5e-7;
 
 /// Assumed maximum number of bytes of two parts of the files beside a result: the summary, and the header of the index
 /// map. Long lists of files or notes may exceed it.
@@ -97,7 +97,7 @@ impl Stage for WriteStage {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        run.scene.work.end_shard_before("writing")?;
+        run.scene.work.end_shard_run_before("writing")?;
         let scored = run.scored()?;
         let mut map = run.result.index_map(run.scene.source().info().count);
         if let Some(PreparedArchive::Content(encoded)) = &run.archived {
@@ -237,7 +237,7 @@ impl WriteStage {
         };
         let frames = if is_solved && !self.kind.stores_frames() { 0.0 } else { work.frames as f64 };
         let left = USUAL_LEFT * work.gaussian_count();
-        let seconds = work.reading_seconds(left, frames) + left * frames * SECONDS_TO_ENCODE;
+        let seconds = work.reading_seconds(left, frames) + left * frames * ENCODE_SECONDS_PER_STATE;
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 

@@ -12,7 +12,7 @@ use crate::passes::gather;
 use crate::pipeline::score_scene;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::Recipe;
-use crate::report::traits::{contribution_shares, kind_flags};
+use crate::report::gaussian_kinds::{contribution_shares, kind_flags};
 use crate::source::FrameSource;
 
 /// Test scene with its scores and the kinds of its Gaussians.
@@ -70,8 +70,8 @@ impl Looked {
             let of = |wanted: bool| {
                 (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
             };
-            let members = KindMembers { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
-            judge(kind, members, &seen, &names)
+            let members = KindTotals { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
+            assess_failure_mode(kind, members, &seen, &names)
         })
     }
 }
@@ -134,23 +134,23 @@ fn sums(weight: f64, error: f64) -> ViewErrorSums {
 
 #[test]
 fn verdicts_follow_the_stated_thresholds() {
-    let verdict = |members: KindMembers, observed: ViewErrorSums| {
-        judge(GaussianKind::Motion, members, &[observed], &[(3, 7)]).verdict
+    let verdict = |members: KindTotals, observed: ViewErrorSums| {
+        assess_failure_mode(GaussianKind::Motion, members, &[observed], &[(3, 7)]).verdict
     };
-    let lost = KindMembers { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
+    let lost = KindTotals { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
     // 100 pixels of 10,000 with a squared error of 0.01 each: 20 dB; elsewhere 40 dB.
     assert_eq!(verdict(lost, sums(100.0, 1.0)), Verdict::Flagged);
-    assert_eq!(verdict(KindMembers { count: 0, ..lost }, sums(0.0, 0.0)), Verdict::Absent);
+    assert_eq!(verdict(KindTotals { count: 0, ..lost }, sums(0.0, 0.0)), Verdict::Absent);
     assert_eq!(verdict(lost, sums(9.9, 0.1)), Verdict::Unseen, "under a thousandth of the pixels");
-    assert_eq!(verdict(KindMembers { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
+    assert_eq!(verdict(KindTotals { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
     assert_eq!(verdict(lost, sums(100.0, 0.009)), Verdict::Passed, "40.5 dB cannot be seen");
     assert_eq!(verdict(lost, sums(4000.0, 40.0)), Verdict::Passed, "20 dB against 21.8 is not apart");
     // Without an index map the pictures alone decide.
-    assert_eq!(verdict(KindMembers { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
-    let found = judge(GaussianKind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
+    assert_eq!(verdict(KindTotals { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
+    let found = assess_failure_mode(GaussianKind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
     assert_eq!(found.psnr_on_kind, Some(20.0));
     assert_eq!(found.worst.map(|worst| (worst.frame, worst.view)), Some((3, 7)));
-    assert_eq!(judge(GaussianKind::Thin, KindMembers::default(), &[], &[]).verdict, Verdict::Absent);
+    assert_eq!(assess_failure_mode(GaussianKind::Thin, KindTotals::default(), &[], &[]).verdict, Verdict::Absent);
 }
 
 #[test]
@@ -164,7 +164,7 @@ fn shares_of_pixels_are_those_of_the_gaussians_seen_there() {
     // The nearer one lets half through.
     state.opacity_logit.set_row(1, [12.0]);
     let camera = Camera::look_at(DVec3::new(0.0, -6.0, 0.0), DVec3::ZERO, 0.6, (33, 33));
-    let shares = shares_of_pixels(&state, &[[true, false, false], [false, true, false]], &camera);
+    let shares = render_kind_shares(&state, &[[true, false, false], [false, true, false]], &camera);
     let middle = &shares.data[3 * (16 * 33 + 16)..][..3];
     for (got, expected) in middle.iter().zip([0.5, 0.5 * 0.99, 0.0]) {
         assert!((got - expected).abs() < 0.02, "got {middle:?}");

@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use crate::error::Result;
-use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
+use crate::model::{Attributes, Camera, Gaussians, StatisticRows, ViewSchedule};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
@@ -19,8 +19,8 @@ pub(crate) struct BlockScans<'a> {
     /// Numbers of the blocks of Gaussians to scan.
     pub(crate) blocks: Range<usize>,
     pub(crate) progress: Progress,
-    /// Number of Gaussians alive in each frame, summed over finished blocks. The sums are integers, so the order in
-    /// which blocks finish does not matter.
+    /// Number of Gaussians alive (opacity ≥ alpha_min) in each frame, summed over finished blocks. The sums are
+    /// integers, so the order in which blocks finish does not matter.
     pub(crate) alive: Mutex<Vec<u32>>,
 }
 
@@ -44,7 +44,8 @@ impl<'a> BlockScans<'a> {
         wanted(frame, self.source.info().varying)
     }
 
-    /// Returns a scan of block `block` without frames, and a buffer for the block's attributes at one frame.
+    /// Returns a scan of block `block` that has not read any frame yet, and a buffer for the attributes of the block at
+    /// one frame.
     pub(crate) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
         let range = self.range(block);
         let state = Gaussians::zeros(range.len(), self.source.info().sh_degree);
@@ -75,7 +76,7 @@ impl<'a> BlockScans<'a> {
     }
 
     /// Returns the rows of a block whose frames have all been added, and the largest |coordinate| of its positions.
-    pub(crate) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (Rows, f32) {
+    pub(crate) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (StatisticRows, f32) {
         let found = scan.finish();
         let mut alive = self.alive.lock().unwrap_or_else(PoisonError::into_inner);
         for (sum, count) in alive.iter_mut().zip(found.alive_per_frame) {
@@ -88,7 +89,7 @@ impl<'a> BlockScans<'a> {
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
-    pub(crate) fn block(&self, block: usize) -> Result<(Rows, f32)> {
+    pub(crate) fn block(&self, block: usize) -> Result<(StatisticRows, f32)> {
         let mut scan = self.begin(block);
         let mut reader = self.source.open(Ids::Range(self.range(block)))?;
         self.add(&mut scan, 0..self.frames(), &mut *reader)?;

@@ -19,7 +19,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 
 use super::blocks::BlockScans;
 use crate::error::{Error, Result};
-use crate::model::Rows;
+use crate::model::StatisticRows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
 /// Maximum number of units of work per lane (a decoding thread and an accumulating thread) whose bytes have been
@@ -37,7 +37,7 @@ type BlockReaderOf<'a> = (usize, Box<dyn BlockReader + 'a>);
 
 /// Results of the blocks of Gaussians that have been scanned, or an error.
 struct StagedResult {
-    blocks: Vec<Option<(Rows, f32)>>,
+    blocks: Vec<Option<(StatisticRows, f32)>>,
     /// Number and error of the lowest-numbered block whose scan failed.
     error: Option<(usize, Error)>,
 }
@@ -46,7 +46,7 @@ struct StagedResult {
 ///
 /// # Errors
 /// Fails if a frame cannot be read, with the error of the lowest-numbered block that failed.
-pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(Rows, f32)>> {
+pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(StatisticRows, f32)>> {
     let blocks = scan.blocks();
     let lanes = rayon::current_num_threads().min(blocks);
     let found = Mutex::new(StagedResult { blocks: (0..blocks).map(|_| None).collect(), error: None });

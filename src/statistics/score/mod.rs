@@ -5,14 +5,14 @@
 //! Compact 4D Gaussian Splatting Models", section 3.2.
 
 mod norm;
-pub mod sketch;
+pub mod percentile_sketch;
 
 pub use norm::{Norm, PercentilePasses};
-pub use sketch::FloatSketch;
+pub use percentile_sketch::FloatSketch;
 
 use serde::{Deserialize, Serialize};
 
-use crate::model::{Flags, Rows, Statistic};
+use crate::model::{AnomalyFlags, Statistic, StatisticRows};
 use crate::recipe::{self, StaticScoreTerm};
 
 /// Scores of N Gaussians; every array has N entries, all finite.
@@ -102,17 +102,22 @@ impl ScoredQuantity {
 
 /// Computes the scores of `rows`, which come from a sequence of `frames` frames.
 ///
-/// Rows with [`Flags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy `rows.e`
-/// is used only if its weight λ is above 0. An empty list of rows gives empty scores.
-pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
+/// Rows with [`AnomalyFlags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy
+/// `rows.e` is used only if its weight λ is above 0. An empty list of rows gives empty scores.
+pub fn score(rows: &StatisticRows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
 
 /// Computes the scores as [`score`] does, with percentiles that are found in one pass or two as `passes` states.
-pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
+pub fn score_with_passes(
+    passes: PercentilePasses,
+    rows: &StatisticRows,
+    frames: usize,
+    recipe: &recipe::ScoreParams,
+) -> Scores {
     use ScoredQuantity::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
-    let is_finite: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
+    let is_finite: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(AnomalyFlags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
     let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
 
@@ -173,9 +178,9 @@ mod tests {
     use super::*;
     use crate::recipe::Recipe;
 
-    fn rows(n: usize) -> Rows {
+    fn rows(n: usize) -> StatisticRows {
         let ramp = |scale: f64| (0..n).map(|i| scale * i as f64).collect::<Vec<f64>>();
-        Rows {
+        StatisticRows {
             d: ramp(0.1),
             kappa: ramp(0.01),
             v: ramp(1e-3),
@@ -184,7 +189,7 @@ mod tests {
             w: Vec::new(),
             e: ramp(2.0),
             vis: ramp(0.0),
-            flags: vec![Flags::empty(); n],
+            flags: vec![AnomalyFlags::empty(); n],
         }
     }
 
@@ -233,7 +238,7 @@ mod tests {
     fn flagged_rows_do_not_change_percentiles() {
         let clean = rows(500);
         let mut odd = rows(500);
-        let zeros = Rows {
+        let zeros = StatisticRows {
             d: vec![0.0; 200],
             kappa: vec![0.0; 200],
             v: vec![0.0; 200],
@@ -242,7 +247,7 @@ mod tests {
             w: Vec::new(),
             e: vec![0.0; 200],
             vis: vec![0.0; 200],
-            flags: vec![Flags::NON_FINITE; 200],
+            flags: vec![AnomalyFlags::NON_FINITE; 200],
         };
         odd.append(&mut zeros.clone());
         for name in ["paper", "default"] {
@@ -282,7 +287,7 @@ mod tests {
 
     #[test]
     fn zero_rows_and_one_row_are_scored() {
-        let none = score(&Rows::default(), 0, &preset("default"));
+        let none = score(&StatisticRows::default(), 0, &preset("default"));
         assert!(none.score.is_empty());
         let one = score(&rows(1), 1, &preset("paper"));
         assert_eq!(one.score, [0.0]);

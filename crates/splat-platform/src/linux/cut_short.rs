@@ -16,7 +16,7 @@ static MESSAGE: OnceLock<TruncatedMapMessage> = OnceLock::new();
 /// Installs a handler for the case that this process accesses a mapped file that another program has truncated. The
 /// handler writes `message` with the path of the file to standard error and ends the process with code 1. If this
 /// function is called again, the first message stays.
-pub fn report_cut_short_maps(message: TruncatedMapMessage) {
+pub fn report_truncated_maps(message: TruncatedMapMessage) {
     MESSAGE.get_or_init(|| message);
     let mut action: libc::sigaction = unsafe {
         // SAFETY: all fields of `sigaction` are integers or pointers that may be null, so zero bytes are a valid value.

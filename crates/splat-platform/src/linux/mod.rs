@@ -8,7 +8,7 @@ use std::io::IoSliceMut;
 
 use rustix::io::{Errno, ReadWriteFlags, preadv2};
 
-pub use cut_short::report_cut_short_maps;
+pub use cut_short::report_truncated_maps;
 pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory, return_freed_memory};
 
 /// Returns whether the byte at `offset` of `file` is in memory (the page cache), so that reading it needs no disk

@@ -61,7 +61,7 @@ impl FolderHandle {
     }
 
     /// Returns whether the entry `name` of this folder is the file that is open as `file`.
-    pub fn names_file(&self, name: &str, file: &File) -> bool {
+    pub fn entry_is_file(&self, name: &str, file: &File) -> bool {
         // The file is not opened again: on network file systems that could release a lock on it.
         let named = rustix::fs::statat(&self.0, name, AtFlags::SYMLINK_NOFOLLOW);
         let open = rustix::fs::fstat(file);

@@ -147,7 +147,7 @@ pub fn sync_folder(path: &Path) -> io::Result<()> {
 
 /// Tells the system that the bytes `range` of the memory map `map` will be read soon. Has no effect if the system
 /// refuses.
-pub fn expect_pages(map: &Mmap, range: Range<usize>) {
+pub fn prefetch_pages(map: &Mmap, range: Range<usize>) {
     _ = map.advise_range(Advice::WillNeed, range.start, range.len());
 }
 

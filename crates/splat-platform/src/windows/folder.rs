@@ -68,7 +68,7 @@ impl FolderHandle {
     }
 
     /// Returns whether the entry `name` of this folder is the file that is open as `file`.
-    pub fn names_file(&self, name: &str, file: &File) -> bool {
+    pub fn entry_is_file(&self, name: &str, file: &File) -> bool {
         let named = self.open_file(name, false).and_then(|named| FileStatus::from_file(&named));
         let open = FileStatus::from_file(file);
         named.is_ok_and(|named| open.is_ok_and(|open| named.identity == open.identity))

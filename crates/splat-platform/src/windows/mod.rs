@@ -133,7 +133,7 @@ pub fn sync_folder(_path: &Path) -> io::Result<()> {
 }
 
 /// Does nothing: Windows decides by itself which pages to read ahead.
-pub fn expect_pages(_map: &Mmap, _range: Range<usize>) {}
+pub fn prefetch_pages(_map: &Mmap, _range: Range<usize>) {}
 
 /// Does nothing: Windows takes pages back when it needs them.
 ///
@@ -147,7 +147,7 @@ pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
 }
 
 /// Does nothing: on Windows a mapped file cannot be truncated.
-pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
+pub fn report_truncated_maps(_message: TruncatedMapMessage) {}
 
 /// Function that cleans up and ends the process because of a signal, whose number is its argument.
 type End = Box<dyn FnOnce(u8) + Send>;

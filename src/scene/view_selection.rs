@@ -157,9 +157,9 @@ pub fn render_estimate(
             ("views", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![
-            work.filling_blocks(),
+            work.block_buffer_memory(),
             ("views", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
-            Workload::view_list(work.pictures as f64),
+            Workload::view_list_memory(work.pictures as f64),
         ],
     }
 }
@@ -168,7 +168,7 @@ impl ViewSet {
     /// Returns the split of `rig` whose views this selection uses; `None`: the views of all splits.
     pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
-            ViewSet::HeldOut => rig.held_out(),
+            ViewSet::HeldOut => rig.held_out_split(),
             ViewSet::Split(split) => Some(split),
             ViewSet::All => None,
         }

@@ -110,7 +110,8 @@ impl FrameSource for MergedSequence<'_> {
 struct MergedMembers {
     /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
-    /// For every selected Gaussian, the index of its id in `ids`. A proxy has the id of its leader.
+    /// For every selected Gaussian, the index of its id in `ids`. A proxy has the id of its leader (most important
+    /// member).
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
     /// For every member of every proxy, the index of its id in `ids`, and its weight. The members of one proxy follow

@@ -1,8 +1,8 @@
 //! Choice of the renders that the page shows, and their images.
 //!
 //! Input: first the scores of all renders, from which some renders are chosen; then the chosen renders, which the
-//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_SHOWN`] renders of at most
-//! [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
+//! caller renders a second time. Output: PNG files as data URIs. A page has at most [`MAX_RENDERS_PER_PAGE`] renders of
+//! at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 
@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::evaluation::RenderedViews;
-use crate::evaluation::found::{Evaluation, ImageScore};
+use crate::evaluation::results::{Evaluation, ImageScore};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
@@ -23,7 +23,7 @@ pub(super) const MEDIAN: &str = "median render";
 
 /// Maximum number of renders that the page shows: the worst one, the worst one of the worst view, the worst one of the
 /// worst frame, and the median one.
-pub const MAX_SHOWN: usize = 4;
+pub const MAX_RENDERS_PER_PAGE: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
@@ -97,7 +97,7 @@ pub fn choose_renders(found: &Evaluation) -> Vec<ChosenRender> {
 
 /// Returns the chosen renders `choices` with the scores of another compressed model of the same original. `found` is
 /// the evaluation of this other model; the scores in `choices` are those of the first compressed model.
-pub fn with_scores_of(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
+pub fn with_scores_from(found: &Evaluation, choices: &[ChosenRender]) -> Vec<ChosenRender> {
     let scored = |choice: &ChosenRender| {
         let ImageScore { psnr, ssim, flip, .. } = found.views[choice.place].loss;
         ChosenRender { psnr, ssim, flip, ..choice.clone() }

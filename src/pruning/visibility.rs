@@ -8,7 +8,7 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{CONTRIBUTION_COST, ResourceEstimate, Workload};
-use crate::model::{Attributes, Rows, Statistic};
+use crate::model::{Attributes, Statistic, StatisticRows};
 use crate::passes::{frames_to_cover, scoring_views};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::pruning::removal::ranking_stride;
@@ -57,9 +57,9 @@ impl VisibilityStage {
         };
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
         let frames = if strided > max_views { frames.min(max_views as u64) } else { frames };
-        let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
+        let rows = StatisticRows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
         per_gaussian.insert(0, ("rows", rows as u64));
-        fixed.push(Workload::view_list(strided.min(max_views)));
+        fixed.push(Workload::view_list_memory(strided.min(max_views)));
         if every > 1.0 {
             // Strides turn a schedule (list of views per frame) into a second one, with an entry for each frame.
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
@@ -84,7 +84,8 @@ impl VisibilityStage {
     }
 
     /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of
-    /// frames in which each Gaussian is alive. Writes a warning to `journal` if the cameras see very few Gaussians.
+    /// frames in which each Gaussian is alive (opacity ≥ alpha_min). Writes a warning to `journal` if the cameras see
+    /// very few Gaussians.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.
@@ -117,14 +118,15 @@ impl VisibilityStage {
     }
 }
 
-/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive in some frame.
-/// Cameras that see fewer probably belong to another scene. Cameras of trained models see two thirds; those inside a
-/// scene that fills a room see a third.
+/// Minimum fraction of the Gaussians that the cameras must see, counting only Gaussians that are alive (opacity ≥
+/// alpha_min) in some frame. Cameras that see fewer probably belong to another scene. Cameras of trained models see two
+/// thirds; those inside a scene that fills a room see a third.
 const MIN_SEEN_FRACTION: f64 = 0.1;
 
-/// Returns a warning for the user if very few of the Gaussians that are ever alive contribute to any view, so that the
-/// cameras may belong to another scene. `peak`: largest contribution W of each Gaussian to a pixel. `life`: number of
-/// frames in which each Gaussian is alive. `origin`: where the cameras came from, for the message.
+/// Returns a warning for the user if very few of the Gaussians that are ever alive (opacity ≥ alpha_min) contribute to
+/// any view, so that the cameras may belong to another scene. `peak`: largest contribution W of each Gaussian to a
+/// pixel. `life`: number of frames in which each Gaussian is alive. `origin`: where the cameras came from, for the
+/// message.
 fn wrong_scene_warning(peak: &[f64], life: &[u32], origin: &str) -> Option<String> {
     let alive = life.iter().filter(|&&frames| frames > 0).count();
     let seen = peak.iter().zip(life).filter(|&(&peak, &frames)| frames > 0 && peak > 0.0).count();

@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::Scene;
-use super::between::{SplitMix64, cameras_between, meeting_point};
+use super::views_between::{SplitMix64, cameras_between, meeting_point};
 use crate::model::{Camera, Rig, Split, ViewSchedule};
 
 /// View number of all views from cameras outside the rig. No data set uses this number.
@@ -68,7 +68,7 @@ impl RigCone {
 
     /// Returns the inward unit normals of the flat faces of the cone. A direction is inside the cone if its dot
     /// products with all of them are at least 0. Takes time in proportion to the cube of the number of cameras.
-    pub fn faces(&self) -> Vec<DVec3> {
+    pub fn inward_face_normals(&self) -> Vec<DVec3> {
         let all = &self.directions;
         let pairs = (0..all.len()).flat_map(|i| (0..all.len()).filter(move |&j| j != i).map(move |j| (i, j)));
         let normals = pairs.filter_map(|(i, j)| all[i].cross(all[j]).try_normalize());
@@ -261,7 +261,7 @@ mod tests {
         let lower = arc(5, 60.0);
         let raised = |camera: &Camera| Camera::look_at(camera.center() + DVec3::Z, DVec3::ZERO, 0.8, (64, 48));
         let cameras = [lower.clone(), lower.iter().map(raised).collect()].concat();
-        let (cone, faces) = (RigCone::new(&cameras), RigCone::new(&cameras).faces());
+        let (cone, faces) = (RigCone::new(&cameras), RigCone::new(&cameras).inward_face_normals());
         assert!((4..=10).contains(&faces.len()), "{}", faces.len());
         let is_inside = |camera: &Camera| faces.iter().all(|face| face.dot(camera.center().normalize()) > -1e-4);
         assert!(cameras_between(&cameras, 30).iter().all(is_inside));

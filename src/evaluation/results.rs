@@ -20,7 +20,7 @@ use crate::pipeline::summary::CameraSummary;
 
 /// Pair of values: one for the original model and one for the compressed model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ByModel<T> {
+pub struct OriginalAndCompressed<T> {
     /// Value of the original model.
     pub original: T,
     /// Value of the compressed model.
@@ -54,7 +54,7 @@ pub struct ViewScores {
     pub loss: ImageScore,
     /// Scores of both models against the photograph; `None` without a photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub truth: Option<ByModel<ImageScore>>,
+    pub truth: Option<OriginalAndCompressed<ImageScore>>,
 }
 
 /// Mean scores over a set of views.
@@ -90,7 +90,8 @@ pub struct FrameMeans {
     pub frame: usize,
     /// Time stamp of the frame.
     pub time: f64,
-    /// Means of the scores over the views of this frame. Temporal errors are those since the previous evaluated frame.
+    /// Means of the scores over the views of this frame. The temporal error (flicker) of a view compares it with the
+    /// previous evaluated frame.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
@@ -122,9 +123,9 @@ pub struct TruthComparison {
 }
 
 /// Mean scores of the compressed model against the original, separately for views whose cameras are inside and outside
-/// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::outside::RigCone)).
+/// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::views_outside::RigCone)).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct RigSides {
+pub struct InsideOutsideMeans {
     /// Means over the views inside the rig: in the directions of the training cameras and between them. `None` if there
     /// are no such views.
     pub inside: Option<QualityMeans>,
@@ -138,13 +139,13 @@ pub struct Evaluation {
     /// Name and version of the program.
     pub tool: String,
     /// Paths of both models, as given.
-    pub path: ByModel<String>,
+    pub path: OriginalAndCompressed<String>,
     /// Numbers of Gaussians of both models.
-    pub count: ByModel<usize>,
+    pub count: OriginalAndCompressed<usize>,
     /// Total size of each model in bytes.
-    pub bytes: ByModel<u64>,
+    pub bytes: OriginalAndCompressed<u64>,
     /// Size of each model in bytes, divided into parts, such as canonical Gaussians and deformation field.
-    pub size: ByModel<ModelSize>,
+    pub size: OriginalAndCompressed<ModelSize>,
     /// Origin and number of the cameras, and number of the views on which the models are compared.
     pub cameras: CameraSummary,
     /// Background color: red, green, blue in [0, 1].
@@ -155,7 +156,7 @@ pub struct Evaluation {
     /// Mean scores of the views inside the rig of the training cameras (in their directions and between them), and of
     /// the views outside it; `None` if no view is outside, or if the cameras have no training views.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub rig_sides: Option<RigSides>,
+    pub rig_sides: Option<InsideOutsideMeans>,
     /// Mean scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
@@ -231,22 +232,22 @@ impl Comparison {
     }
 }
 
-impl RigSides {
+impl InsideOutsideMeans {
     /// Averages the scores of the compressed model against the original, separately for views inside and outside the
     /// rig. `is_outside` states for each of `views` whether it is outside. Returns `None` if no view is outside.
-    pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<RigSides> {
+    pub fn from_views(views: &[ViewScores], is_outside: &[bool]) -> Option<InsideOutsideMeans> {
         let side = |outside: bool| -> Option<QualityMeans> {
             let chosen = views.iter().zip(is_outside).filter(|&(_, &is)| is == outside);
             let scores: Vec<ImageScore> = chosen.map(|(view, _)| view.loss).collect();
             (!scores.is_empty()).then(|| QualityMeans::from_scores(&scores))
         };
-        Some(RigSides { inside: side(false), outside: side(true)? })
+        Some(InsideOutsideMeans { inside: side(false), outside: side(true)? })
     }
 }
 
 impl Evaluation {
     /// Returns the evaluation with every path reduced to its last component, for writing to a file.
-    pub fn without_folders(mut self) -> Evaluation {
+    pub fn with_file_names_only(mut self) -> Evaluation {
         let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
         for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
             *path = name_of(Path::new(path));
@@ -258,7 +259,7 @@ impl Evaluation {
     /// worst frame, and the notes.
     pub fn text(&self) -> String {
         let mut out = String::new();
-        let ByModel { original, compressed } = self.count;
+        let OriginalAndCompressed { original, compressed } = self.count;
         let percent = 100.0 * compressed as f64 / original.max(1) as f64;
         // Writing to a String cannot fail.
         let (before, after) = (self.size.original, self.size.compressed);
@@ -287,7 +288,7 @@ impl Evaluation {
             let _ = writeln!(out, "  {label:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
         };
         line("compressed against original", &self.loss.overall);
-        if let Some(RigSides { inside, outside }) = self.rig_sides {
+        if let Some(InsideOutsideMeans { inside, outside }) = self.rig_sides {
             if let Some(inside) = inside {
                 line(&format!("{} views inside the training rig", inside.pairs), &inside);
             }
@@ -377,10 +378,10 @@ mod tests {
         let truth = Comparison::from_views(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
         Evaluation {
             tool: String::new(),
-            path: ByModel { original: String::new(), compressed: String::new() },
-            count: ByModel { original: 0, compressed: 0 },
-            bytes: ByModel { original: 0, compressed: 0 },
-            size: ByModel { original: ModelSize::default(), compressed: ModelSize::default() },
+            path: OriginalAndCompressed { original: String::new(), compressed: String::new() },
+            count: OriginalAndCompressed { original: 0, compressed: 0 },
+            bytes: OriginalAndCompressed { original: 0, compressed: 0 },
+            size: OriginalAndCompressed { original: ModelSize::default(), compressed: ModelSize::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
             loss: Comparison::from_views(&pictures, |picture| Some(picture.loss)).unwrap(),
@@ -401,10 +402,10 @@ mod tests {
     #[test]
     fn sides_of_the_rig_are_averaged_apart() {
         let views = [picture(0, 1, 30.0, None), picture(0, 2, 20.0, None), picture(1, 1, 40.0, None)];
-        let sides = RigSides::from_views(&views, &[false, true, false]).unwrap();
+        let sides = InsideOutsideMeans::from_views(&views, &[false, true, false]).unwrap();
         assert_eq!((sides.inside.unwrap().psnr, sides.outside.psnr, sides.outside.pairs), (35.0, 20.0, 1));
-        assert!(RigSides::from_views(&views, &[true; 3]).unwrap().inside.is_none());
-        assert!(RigSides::from_views(&views, &[false; 3]).is_none());
+        assert!(InsideOutsideMeans::from_views(&views, &[true; 3]).unwrap().inside.is_none());
+        assert!(InsideOutsideMeans::from_views(&views, &[false; 3]).is_none());
         let mut found = evaluation(views.to_vec());
         found.rig_sides = Some(sides);
         let text = found.text();
@@ -421,8 +422,10 @@ mod tests {
         );
         for picture in &mut pictures {
             picture.loss.flip = Some(0.5);
-            picture.truth =
-                Some(ByModel { original: ImageScore { flip: None, ..picture.loss }, compressed: picture.loss });
+            picture.truth = Some(OriginalAndCompressed {
+                original: ImageScore { flip: None, ..picture.loss },
+                compressed: picture.loss,
+            });
         }
         assert_eq!(
             evaluation(pictures).csv(),

@@ -12,7 +12,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging::neighbors::PointIndex;
 use crate::merging::tree::TreePoint;
-use crate::model::{Attributes, Gaussians, Rows, SH_C0, opacity};
+use crate::model::{Attributes, Gaussians, SH_C0, StatisticRows, opacity};
 use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORING_BYTES_PER_GAUSSIAN, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
@@ -34,10 +34,11 @@ pub const MIN_THIN_RATIO: f64 = 5.0;
 pub const MAX_STILL_MOTION: f64 = 5e-4;
 /// Minimum change of opacity that counts as a change of appearance: standard deviation over the frames in which the
 /// Gaussian is alive.
-pub const OPACITY_CHANGE: f64 = 0.05;
+pub const MIN_OPACITY_CHANGE: f64 = 0.05;
 /// Minimum change of the base color that counts as a change of appearance: standard deviation over the frames in which
-/// the Gaussian is alive, root mean square over the channels, colors in [0, 1]. It is five steps of 1/255.
-pub const COLOR_CHANGE: f64 = 0.02;
+/// the Gaussian is alive (opacity ≥ alpha_min), root mean square over the channels, colors in [0, 1]. It is five steps
+/// of 1/255.
+pub const MIN_COLOR_CHANGE: f64 = 0.02;
 /// Maximum number of frames at which distances and colors are measured. They are evenly spaced.
 pub const MAX_SAMPLED_FRAMES: usize = 24;
 
@@ -70,7 +71,7 @@ pub fn resource_estimate(work: &Workload) -> ResourceEstimate {
     let frames = MAX_SAMPLED_FRAMES.min(work.frames as usize) as u64;
     let reads = work.scattered_full_reads(1, &Limits::NONE) + 2.0 * work.scattered_full_reads(frames, &Limits::NONE);
     let seconds = 2e-5 * work.gaussian_count() + work.reading_seconds(work.gaussian_count(), 2.0 * frames as f64);
-    ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.filling_blocks()] }
+    ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.block_buffer_memory()] }
 }
 
 /// Kinds to which one Gaussian belongs: one flag per kind, in the order of [`GaussianKind::ALL`].
@@ -103,7 +104,7 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
     for i in (0..rows.len()).filter(|&i| visible(i)) {
         found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
         found[i][GaussianKind::Appearance as usize] = rows.d[i] <= MAX_STILL_MOTION * extent
-            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= COLOR_CHANGE));
+            && (rows.v[i].sqrt() >= MIN_OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= MIN_COLOR_CHANGE));
     }
     Ok(found)
 }
@@ -111,7 +112,11 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
 /// Returns two fractions for each kind of Gaussian. First: the contribution of the kind to renders, divided by the
 /// contribution of all Gaussians. Second: the contribution of the Gaussians of this kind for which `is_lost` is true,
 /// divided by the contribution of the kind. `traits` has the kinds of every Gaussian.
-pub fn contribution_shares(rows: &Rows, traits: &[KindFlags], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
+pub fn contribution_shares(
+    rows: &StatisticRows,
+    traits: &[KindFlags],
+    is_lost: impl Fn(usize) -> bool,
+) -> [(f64, f64); 3] {
     // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
     std::array::from_fn(|kind| {

@@ -118,7 +118,7 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
 }
 
 /// Renders a view of `gaussians`. Only the pixels of every `stride`-th column and row count as sampled for
-/// [`OracleRender::sum`] and [`OracleRender::max`].
+/// [`OracleRender::sum`] and [`OracleRender::max`]. Returns the image, and the contribution of every Gaussian to it.
 pub fn render_view(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
     render_with(gaussians, camera, background, stride, |_, _| ())
 }
