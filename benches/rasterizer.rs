@@ -14,7 +14,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use glam::{DMat3, DVec3};
-use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
+use splatsieve::diagnostics::selfcheck::oracle::render as oracle;
 use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Image, Renderer};
 
