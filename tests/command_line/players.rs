@@ -1,7 +1,8 @@
-//! Tests with readers and writers of other programs: splat-transform of PlayCanvas and the loaders of three.js. They
-//! open files of this program, and this program opens theirs. `SPLATSIEVE_NODE_MODULES` names the folder `node_modules`
-//! with both.
+//! Tests with readers and writers of other programs: splat-transform of PlayCanvas, the loaders of three.js, the spz
+//! library and fourdgs. They open files of this program, and this program opens theirs. `SPLATSIEVE_NODE_MODULES` names
+//! the folder `node_modules` with the first three, `SPLATSIEVE_FOURDGS` a Python with the last.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -169,6 +170,67 @@ fn files_of_splat_transform_are_read() {
     splat_transform(&workplace, "in.ply", "a.sog", &["-g", "cpu"]);
     let steps = Steps { position: 8e-4, log_scale: 0.03, sh: 0.02 };
     assert_near(&read(&workplace.path("a.sog")), &asymmetrical(0), &steps, "a.sog");
+}
+
+#[test]
+#[ignore = "needs the spz library"]
+fn spz_library_reads_our_files_and_we_read_its_files() {
+    let workplace = Workplace::new();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/read_with_spz.mjs");
+    for degree in [0, 1, 3] {
+        let original = asymmetrical(degree);
+        workplace.ply("in.ply", &original);
+        for version in [3, 4] {
+            workplace.done(&format!("convert in.ply a.spz --spz-version {version} --overwrite"));
+            let files = ["a.spz", "out.ply", "b.spz"].map(|name| workplace.path(name));
+            let output = Command::new("node").arg(&script).arg(modules()).args(files).output().expect("node");
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            // Half a quantization step of positions is 2^-13; scales have steps of 1/16.
+            let steps = Steps { position: 1.3e-4, log_scale: 0.51 / 16.0, sh: 8.6 / 128.0 };
+            let what = format!("version {version}, degree {degree}");
+            assert_near(&read(&workplace.path("out.ply")), &original, &steps, &format!("{what}, read by the library"));
+            let twice = Steps { position: 2.6e-4, log_scale: 0.51 / 16.0, sh: 2.0 * 8.6 / 128.0 };
+            assert_near(&read(&workplace.path("b.spz")), &original, &twice, &format!("{what}, written by it"));
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs fourdgs"]
+fn fourdgs_reads_our_4dgs_files() {
+    const FRAMES: usize = 10;
+    let workplace = Workplace::new();
+    fs::create_dir(workplace.path("frames")).unwrap();
+    let frames: Vec<Gaussians> = (0..FRAMES).map(|frame| moved(&asymmetrical(0), frame)).collect();
+    for (number, frame) in frames.iter().enumerate() {
+        workplace.ply(&format!("frames/frame_{number:04}.ply"), frame);
+    }
+    workplace.done("convert frames a.4dgs");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/benchmark/fourdgs_frames.py");
+    let python = std::env::var_os("SPLATSIEVE_FOURDGS").expect("SPLATSIEVE_FOURDGS names a Python with fourdgs");
+    let mut command = Command::new(python);
+    command
+        .arg(script)
+        .args([workplace.path("a.4dgs"), workplace.path("read")])
+        .args(["--frames", &FRAMES.to_string()]);
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // Pieces of motion may be off by a tenth of the middle scale, which is 0.08 or less.
+    let steps = Steps { position: 0.01, log_scale: 0.02, sh: 1.01 / 255.0 / 0.282 };
+    for (number, frame) in frames.iter().enumerate() {
+        let found = read(&workplace.path(&format!("read/frame_{number:04}.ply")));
+        assert_near(&found, frame, &steps, &format!("frame {number}"));
+    }
+}
+
+/// Returns the Gaussians of a frame: every Gaussian moves at its own speed, and none passes another in x.
+fn moved(gaussians: &Gaussians, frame: usize) -> Gaussians {
+    let mut moved = gaussians.clone();
+    for axis in [1, 2] {
+        let plane = moved.position.plane_mut(axis);
+        plane.iter_mut().enumerate().for_each(|(i, x)| *x += 0.01 * frame as f32 * ((i + axis) % 7) as f32);
+    }
+    moved
 }
 
 #[test]
