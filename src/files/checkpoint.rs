@@ -206,10 +206,14 @@ impl Checkpoint {
     pub(crate) fn open(path: &Path, memory: ReadLimit) -> Result<Checkpoint> {
         let file = SharedFile::open(path)?;
         let wrong = |place: &str, found: String| {
-            Error::input(path, place, "a checkpoint as torch.save writes it", found).hint(
-                "if the file was copied, copy it again; if PyTorch before 1.6 saved it, load it and save it again",
-            )
+            Error::input(path, place, "a checkpoint as torch.save writes it", found)
+                .hint("if the file was copied, copy it again; otherwise load it and save it again with torch.save")
         };
+        let mut head = Vec::new();
+        file.clone().take(64).read_to_end(&mut head).map_err(Error::io("read", path))?;
+        if has_legacy_magic(&head) {
+            return Err(legacy_format(path));
+        }
         let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
         let directory = declared_directory(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
         if directory.entries > MAX_ENTRIES {
@@ -421,23 +425,8 @@ impl Checkpoint {
         read_entry(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
     }
 
-    /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages.
-    ///
-    /// # Errors
-    /// Fails if values are damaged or not finite, or need more memory than allowed.
-    pub(crate) fn floats(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
-        let values = self.values(tensor, place)?;
-        match values.iter().position(|value| !value.is_finite()) {
-            Some(at) => {
-                let row = at / tensor.shape.iter().skip(1).product::<usize>().max(1);
-                Err(self.wrong(place, "finite numbers", format!("{} in row {row}", values[at])))
-            }
-            None => Ok(values),
-        }
-    }
-
-    /// Reads the elements of a floating-point tensor as f32, the last axis fastest, without checking that they are
-    /// finite; `place` names it in messages.
+    /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages. They
+    /// may be NaN or infinite.
     ///
     /// # Errors
     /// Fails if values are damaged or need more memory than allowed.
@@ -492,6 +481,25 @@ const PICKLE: &str = "data.pkl";
 /// names it after the checkpoint file.
 fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
+}
+
+/// Start of a file of the format that PyTorch before 1.6 saves: a pickle of PyTorch's magic number.
+const LEGACY_MAGIC: &[u8] = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19";
+
+/// Returns whether `head`, the first bytes of a file, belong to the format that PyTorch before 1.6 saves.
+pub(crate) fn has_legacy_magic(head: &[u8]) -> bool {
+    head.first() == Some(&0x80) && head.get(2..).is_some_and(|rest| rest.starts_with(LEGACY_MAGIC))
+}
+
+/// Returns the error for the file `path`, which has the format that PyTorch before 1.6 saves.
+pub(crate) fn legacy_format(path: &Path) -> Error {
+    Error::input(
+        path,
+        "first bytes",
+        "a zip archive, as torch.save of PyTorch 1.6 or newer writes it",
+        "the older format",
+    )
+    .hint("convert it: python3 -c \"import torch; torch.save(torch.load('OLD', map_location='cpu'), 'NEW')\"")
 }
 
 /// Name that error messages use for the list of files in the archive.

@@ -220,7 +220,8 @@ impl Npz {
         };
         let Some(float) = entry.float else {
             let found = format!("{}, another type or Fortran order", entry.descr);
-            return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
+            return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found)
+                .hint("save the array again as numpy.ascontiguousarray(array, dtype='float32')"));
         };
         Ok((entry, float))
     }

@@ -17,7 +17,8 @@ use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
 pub struct PlySequence {
     frames: PlyFrames,
     info: SequenceInfo,
-    note: Option<String>,
+    /// Notes for the user about the files.
+    notes: Vec<String>,
     bytes: SharedCounter,
     states: SharedCounter,
 }
@@ -60,17 +61,21 @@ impl PlySequence {
             varying: if frames.paths().len() == 1 { Attributes::empty() } else { Attributes::all() },
         };
         let (bytes, states) = (SharedCounter::default(), SharedCounter::default());
-        Ok(PlySequence { frames, info, note: None, bytes, states })
+        let first = frames.frame(0)?;
+        let notes = if frames.paths().len() == 1 { first.notes()? } else { first.header_notes() };
+        Ok(PlySequence { frames, info, notes, bytes, states })
     }
 
-    /// Returns this sequence with `note`, a note for the user about its files.
-    pub fn with_note(self, note: String) -> PlySequence {
-        PlySequence { note: Some(note), ..self }
+    /// Returns this sequence with `note`, an additional note for the user about its files.
+    pub fn with_note(mut self, note: String) -> PlySequence {
+        self.notes.push(note);
+        self
     }
 
-    /// Returns the note for the user, if there is one.
-    pub fn note(&self) -> Option<&str> {
-        self.note.as_deref()
+    /// Returns the notes for the user about the files: for a single file, on every row with a defect; for several
+    /// files, only on parts that are not read.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Replaces the time stamps of the T frames by `times`, one per frame.

@@ -24,8 +24,8 @@ const MIN_SCALE: f32 = 1e-7;
 /// Reads the Gaussians of the `.splat` file at `path`, with SH degree 0.
 ///
 /// # Errors
-/// Fails if the file is not a whole number of rows, if a position or a standard deviation is not finite, or if the
-/// Gaussians need more memory than `memory`.
+/// Fails if the file is not a whole number of rows, or if the Gaussians need more memory than `memory`. Positions and
+/// scales may be NaN or infinite, and quaternions zero.
 pub fn read_splat(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     let map = FileMap::open(path)?;
     let count = map.len() / ROW_BYTES;
@@ -42,13 +42,8 @@ pub fn read_splat(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
         map.touched(i * ROW_BYTES..(i + 1) * ROW_BYTES);
         let number = |at: usize| f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]]);
         let [position, scale] = [0, 12].map(|first| [0, 1, 2].map(|c| number(first + 4 * c)));
-        if let Some(value) = position.iter().chain(&scale).find(|value| !value.is_finite()) {
-            let place = format!("byte {}, Gaussian {i}", i * ROW_BYTES);
-            return Err(Error::input(path, place, "finite positions and standard deviations", value.to_string())
-                .hint("export the file again without this Gaussian"));
-        }
         gaussians.position.set_row(i, position);
-        gaussians.log_scale.set_row(i, scale.map(|s| f64::from(s.abs().max(MIN_SCALE)).ln() as f32));
+        gaussians.log_scale.set_row(i, scale.map(log_scale));
         gaussians.sh.set_row(i, [24, 25, 26].map(|at| sh_from_color(f64::from(row[at]) / 255.0)));
         gaussians.opacity_logit.set_row(i, [decode_opacity(row[27])]);
         gaussians.rotation.set_row(i, unit([28, 29, 30, 31].map(|at| (f32::from(row[at]) - 128.0) / 128.0)));
@@ -56,10 +51,15 @@ pub fn read_splat(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// Returns the quaternion `q` scaled to length 1; the identity if its length is 0.
+/// Returns the natural logarithm of the standard deviation `scale`, at least that of [`MIN_SCALE`]; NaN for NaN.
+fn log_scale(scale: f32) -> f32 {
+    if scale.is_nan() { scale } else { f64::from(scale.abs().max(MIN_SCALE)).ln() as f32 }
+}
+
+/// Returns the quaternion `q` scaled to length 1; a quaternion of length 0 is unchanged.
 fn unit(q: [f32; 4]) -> [f32; 4] {
     let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
-    if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
+    if length > 0.0 { q.map(|x| x / length) } else { q }
 }
 
 #[cfg(test)]
@@ -94,12 +94,17 @@ mod tests {
 
     #[test]
     fn damaged_files_are_refused() {
-        let whole = row();
-        assert!(read(&whole[..31]).unwrap_err().to_string().contains("31 bytes"));
-        for at in [0, 12] {
-            let mut wrong = row();
-            wrong[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-            assert!(read(&wrong).unwrap_err().to_string().contains("Gaussian 0"));
-        }
+        assert!(read(&row()[..31]).unwrap_err().to_string().contains("31 bytes"));
+    }
+
+    #[test]
+    fn unusual_values_are_read_as_they_are() {
+        let mut odd = row();
+        odd[0..4].copy_from_slice(&f32::NAN.to_le_bytes());
+        odd[12..16].copy_from_slice(&f32::NAN.to_le_bytes());
+        odd[28..].copy_from_slice(&[128; 4]);
+        let found = read(&odd).unwrap();
+        assert!(found.position.plane(0)[0].is_nan() && found.log_scale.plane(0)[0].is_nan());
+        assert_eq!(found.rotation.row::<4>(0), [0.0; 4]);
     }
 }

@@ -283,6 +283,8 @@ pub struct FlagSummary {
     pub non_finite: usize,
     /// Number of Gaussians with a zero quaternion as rotation in some frame.
     pub zero_rotation: usize,
+    /// Number of Gaussians whose opacity logit is ±100 or beyond in some frame; infinite logits are read as ±100.
+    pub infinite_logit: usize,
     /// Number of Gaussians whose motion D (root mean square step) was set to 0, because it was within rounding noise of
     /// the positions.
     pub snapped_d: usize,

@@ -42,6 +42,7 @@ pub use linked::LinkedFrames;
 pub use size::ModelSize;
 
 use crate::error::{Error, Result, ShowPath};
+use crate::files::checkpoint::{has_legacy_magic, legacy_format};
 use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Model formats that are read from files. The first entry that recognizes a path opens it.
@@ -89,6 +90,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     match MODEL_FORMATS.iter().find(|entry| (entry.recognizes)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None if is_folder => Err(unrecognized::unrecognized_folder(path)),
+        None if has_legacy_magic(&found.head) => Err(legacy_format(path)),
         None => Err(unrecognized::unrecognized_file(path)),
     }
 }

@@ -147,7 +147,7 @@ impl InputModel for PlySequence {
     }
 
     fn notes(&self) -> Vec<String> {
-        self.note().map(str::to_owned).into_iter().collect()
+        PlySequence::notes(self).to_vec()
     }
 
     fn bytes(&self) -> Result<u64> {

@@ -115,6 +115,10 @@ impl InputModel for StaticModel {
         self.cloud.memory_profile()
     }
 
+    fn notes(&self) -> Vec<String> {
+        self.cloud.notes().to_vec()
+    }
+
     fn timing(&self) -> TimeOrigin {
         TimeOrigin::Numbered
     }

@@ -2,10 +2,13 @@
 //! all layouts.
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
 
 use crate::error::{Error, ShowPath};
+use crate::files::checkpoint::{has_legacy_magic, legacy_format};
 use crate::files::names::shown_name;
+use crate::files::open::open_file;
 
 /// Layout of a kind of model folder: paths, relative to the folder, of the files by which it is recognized.
 /// `iteration_N` stands for a folder with any number.
@@ -48,6 +51,15 @@ pub(super) fn unrecognized_folder(path: &Path) -> Error {
     };
     let expected = "a trained model or frames of one";
     let error = |found: String| Error::input(path, "", expected, found);
+    let is_checkpoint = |name: &&String| [".pth", ".pt"].iter().any(|ending| name.ends_with(ending));
+    for file in entries.iter().filter(is_checkpoint).map(|name| path.join(name)) {
+        let mut head = Vec::new();
+        let read =
+            open_file(&file).and_then(|open| open.take(64).read_to_end(&mut head).map_err(Error::io("read", &file)));
+        if read.is_ok() && has_legacy_magic(&head) {
+            return legacy_format(&file);
+        }
+    }
     let mut closest: Option<(&FolderLayout, Vec<&str>)> = None;
     for layout in &LAYOUTS {
         let missing: Vec<&str> = layout.files.iter().copied().filter(|file| !has(path, file)).collect();

@@ -61,6 +61,9 @@ pub struct ScoreStage {
 /// continue one another in later frames.
 const SHORT_LIFE: usize = 4;
 
+/// Maximum fraction of Gaussians with NaN or infinity that [`NonFinite::Few`] removes.
+const FEW_FRACTION: f64 = 0.01;
+
 /// Result of stage `score`: statistics of every Gaussian of a scene, and a selection of those to keep.
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
@@ -123,7 +126,13 @@ impl ScoreStage {
     /// Returns the ids, in increasing order, of the Gaussians that are dropped because one of their values is not
     /// finite. There are none if the recipe does not drop such Gaussians.
     pub fn non_finite_ids_to_drop(&self, rows: &StatisticRows) -> Vec<u32> {
-        if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
+        let ids: Vec<u32> = non_finite(rows).collect();
+        let are_dropped = match self.non_finite {
+            NonFinite::Drop => true,
+            NonFinite::Few => ids.len() as f64 <= FEW_FRACTION * rows.len() as f64,
+            NonFinite::Error | NonFinite::Keep => false,
+        };
+        if are_dropped { ids } else { Vec::new() }
     }
 
     /// Computes scores and a selection of the Gaussians to keep, from the statistics `scanned` and, if measured, the
@@ -172,8 +181,8 @@ impl ScoreStage {
             let mut drop = self.user.drop.clone();
             let absent = self.non_finite_ids_to_drop(&rows);
             match self.non_finite {
-                NonFinite::Error => refuse_non_finite(scene, &rows)?,
-                NonFinite::Drop => drop.extend(&absent),
+                NonFinite::Error | NonFinite::Few if absent.is_empty() => refuse_non_finite(scene, &rows)?,
+                NonFinite::Error | NonFinite::Few | NonFinite::Drop => drop.extend(&absent),
                 NonFinite::Keep => protected.extend(non_finite(&rows)),
             }
             for ids in [&mut protected, &mut drop] {
@@ -226,12 +235,18 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     if ids.is_empty() {
         return Ok(());
     }
-    let some: Vec<String> = ids.iter().take(5).map(u32::to_string).collect();
-    let more = if ids.len() > some.len() { ", ..." } else { "" };
-    let place = format!("Gaussian {}{more}", some.join(", "));
+    let place = format!("Gaussian {}", some_ids(&ids));
     let found = format!("NaN or infinity in {} of {} Gaussians", ids.len(), rows.len());
-    Err(Error::input(&scene.path, place, "finite values in every frame", found)
-        .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
+    Err(Error::input(&scene.path, place, "finite values in every frame", found).hint(
+        "at most 1% of such Gaussians are left out without asking; --set non_finite=drop removes any number of \
+             them, --set non_finite=keep leaves them as they are",
+    ))
+}
+
+/// Returns the first five of `ids` as a list for messages.
+fn some_ids(ids: &[u32]) -> String {
+    let some: Vec<String> = ids.iter().take(5).map(u32::to_string).collect();
+    some.join(", ") + if ids.len() > some.len() { ", ..." } else { "" }
 }
 
 /// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
@@ -240,6 +255,7 @@ fn flags(rows: &StatisticRows) -> FlagSummary {
     FlagSummary {
         non_finite: count(AnomalyFlags::NON_FINITE),
         zero_rotation: count(AnomalyFlags::ZERO_ROTATION),
+        infinite_logit: count(AnomalyFlags::INFINITE_LOGIT),
         snapped_d: count(AnomalyFlags::SNAPPED_D),
         snapped_kappa: count(AnomalyFlags::SNAPPED_KAPPA),
         never_alive: rows.life.iter().filter(|&&life| life == 0).count(),
@@ -371,9 +387,19 @@ impl Scored {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
             journal.leave_out(format!("grading by {}", term.of.measured_property()), why);
         }
+        let absent = self.absent.len();
+        if absent > 0 {
+            let (all, percent) = (info.count, 100.0 * absent as f64 / info.count as f64);
+            let ids = some_ids(&self.absent);
+            journal.notes.push(format!(
+                "{absent} of {all} Gaussians ({percent:.2}%) left out: NaN or infinity in some frame, which no renderer \
+                 draws (Gaussian {ids})"
+            ));
+        }
         for (count, what) in [
-            (self.flags.non_finite, "with NaN or infinity"),
+            (self.flags.non_finite - absent, "with NaN or infinity"),
             (self.flags.zero_rotation, "with a zero quaternion (taken as the identity)"),
+            (self.flags.infinite_logit, "with an opacity logit of ±100 or beyond (infinite ones are read as ±100)"),
             (self.flags.snapped_d, "whose motion D is rounding noise (set to 0)"),
             (self.flags.snapped_kappa, "whose curvature kappa is rounding noise (set to 0)"),
             (self.flags.never_alive, "never alive"),

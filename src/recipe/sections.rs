@@ -70,6 +70,8 @@ pub enum Coverage {
 pub enum NonFinite {
     /// Stop the run with an error that names the Gaussians.
     Error,
+    /// Remove the Gaussian if at most 1% of all Gaussians are such; else stop the run like [`NonFinite::Error`].
+    Few,
     /// Remove the Gaussian.
     Drop,
     /// Keep the Gaussian in the output as it is.

@@ -4,7 +4,7 @@
 use std::mem::size_of;
 use std::ops::Range;
 
-use crate::model::{self, AnomalyFlags, AttributeValues, Attributes, Gaussians};
+use crate::model::{self, AnomalyFlags, AttributeValues, Attributes, Gaussians, INFINITE_LOGIT};
 
 /// Largest ln(scale); larger values are clamped to it. A scale of e¹⁰⁰ scene units causes no overflow later, and such a
 /// Gaussian already covers every view entirely.
@@ -52,6 +52,12 @@ impl BlockState {
             let largest = largest_magnitude(values.planes());
             if !largest.is_finite() {
                 self.flag_non_finite(values);
+            }
+            if column == Attributes::OPACITY && (largest.is_nan() || largest >= INFINITE_LOGIT) {
+                for (flags, logit) in self.flags.iter_mut().zip(values.plane(0)) {
+                    let is_replaced = logit.is_finite() && logit.abs() >= INFINITE_LOGIT;
+                    *flags |= if is_replaced { AnomalyFlags::INFINITE_LOGIT } else { AnomalyFlags::empty() };
+                }
             }
             if column == Attributes::POSITION {
                 let finite = if largest.is_finite() { largest } else { largest_finite(values.planes()) };

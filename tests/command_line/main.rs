@@ -2,6 +2,7 @@
 
 mod beside_others;
 mod cli;
+mod defects;
 mod docs;
 mod durable;
 mod inputs;

@@ -201,7 +201,7 @@ fn nonfinite_gaussians_are_refused_dropped_or_kept() {
         let odd = workplace.ply("odd.ply", &odd_cloud);
         workplace.refused(
             1,
-            "compress odd.ply -o out.ply",
+            "compress odd.ply -o out.ply --set non_finite=error",
             &["odd.ply", "Gaussian 7", "NaN or infinity", "--set non_finite=drop"],
         );
 

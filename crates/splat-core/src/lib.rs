@@ -57,6 +57,14 @@ pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
+/// Magnitude of the logit that stands for an infinite one: the opacity 1 / (1 + e^∓100) is 1, or at most 4e-44.
+pub const INFINITE_LOGIT: f32 = 100.0;
+
+/// Returns `logit` with an infinite value replaced by ±[`INFINITE_LOGIT`]; NaN and finite values are unchanged.
+pub fn finite_logit(logit: f32) -> f32 {
+    if logit.is_infinite() { INFINITE_LOGIT.copysign(logit) } else { logit }
+}
+
 /// Returns the value of one color channel from its SH coefficient of degree 0. This part of the color is the same from
 /// all directions.
 pub fn color_from_sh(harmonic: f32) -> f64 {

@@ -18,6 +18,9 @@ bitflags! {
         const SNAPPED_D = 4;
         /// The curvature κ of the trajectory was below the rounding noise of f32 positions and was set to 0.
         const SNAPPED_KAPPA = 8;
+        /// The opacity logit reached ±[`INFINITE_LOGIT`](crate::INFINITE_LOGIT) in some frame; readers replace infinite
+        /// logits by this value.
+        const INFINITE_LOGIT = 16;
     }
 }
 

@@ -67,7 +67,7 @@ fn find(checkpoint: &Checkpoint, part: usize, name: &str) -> TensorView {
 }
 
 fn values(checkpoint: &Checkpoint, part: usize, name: &str) -> Vec<f32> {
-    checkpoint.floats(&find(checkpoint, part, name), name).unwrap()
+    checkpoint.values(&find(checkpoint, part, name), name).unwrap()
 }
 
 #[test]
@@ -101,12 +101,18 @@ fn every_float_type_is_converted_to_f32() {
     ] {
         let checkpoint = temp.open(&checkpoint_of_type(class, width, bytes)).unwrap();
         let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
-        assert_eq!(checkpoint.floats(&tensor, "t").unwrap(), expected, "{class}");
+        assert_eq!(checkpoint.values(&tensor, "t").unwrap(), expected, "{class}");
     }
-    let checkpoint = temp.open(&checkpoint_of_type("FloatStorage", 4, f32::NAN.to_le_bytes().repeat(3))).unwrap();
-    let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
-    let error = checkpoint.floats(&tensor, "t").unwrap_err().to_string();
-    assert!(error.contains("NaN in row 0"), "{error}");
+}
+
+/// The bytes are the start of a file that `torch.save(…, _use_new_zipfile_serialization=False)` writes.
+#[test]
+fn files_of_old_pytorch_are_refused_with_the_way_out() {
+    let start = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.";
+    let error = TempCheckpoint::new().open(start).unwrap_err().to_string();
+    for part in ["a.pt", "PyTorch 1.6", "the older format", "torch.load('OLD'"] {
+        assert!(error.contains(part), "{part}: {error}");
+    }
 }
 
 #[test]
@@ -280,7 +286,7 @@ fn truncated_and_damaged_files_never_give_wrong_values() {
         let Ok(checkpoint) = temp.open(&bytes) else { continue };
         let Some(tensor) = root(&checkpoint) else { continue };
         if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "means")
-            && let Ok(found) = checkpoint.floats(&tensor, "means")
+            && let Ok(found) = checkpoint.values(&tensor, "means")
         {
             assert_eq!(found, expected, "byte {at}");
         }
@@ -295,7 +301,7 @@ proptest! {
             let Ok(checkpoint) = temp.open(bytes) else { return };
             for tensor in checkpoint.tensors() {
                 if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "t") {
-                    _ = checkpoint.floats(&tensor, "t");
+                    _ = checkpoint.values(&tensor, "t");
                 }
                 if !tensor.shape.is_empty() {
                     let rows = [GaussianRows { tensor, changed: Vec::new(), values: Vec::new() }];

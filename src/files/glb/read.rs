@@ -113,11 +113,12 @@ pub fn read_glb(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         if !place.iter().chain(&scales).chain(&[alpha, length]).all(|x| x.is_finite() && x.abs() <= f64::from(f32::MAX))
         {
-            return Err(Error::input(path, format!("Gaussian {row}"), "finite attributes", "NaN or infinity"));
+            return Err(Error::input(path, format!("Gaussian {row}"), "finite attributes", "NaN or infinity")
+                .hint("export the file again without this Gaussian"));
         }
         let [x, y, z] = place;
         gaussians.position.set_row(row, [axes * x, axes * y, z].map(|x| x as f32));
-        let [x, y, z, w] = if length > 0.0 { q.map(|x| x / length) } else { [0.0, 0.0, 0.0, 1.0] };
+        let [x, y, z, w] = if length > 0.0 { q.map(|x| x / length) } else { q };
         gaussians.rotation.set_row(row, [w, axes * x, axes * y, z].map(|x| x as f32));
         gaussians.log_scale.set_row(row, scales.map(|s| s.abs().max(MIN_SCALE).ln() as f32));
         gaussians.opacity_logit.set_row(row, [logit(alpha.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)) as f32]);
@@ -133,7 +134,8 @@ pub fn read_glb(path: &Path, memory: ReadLimit) -> Result<Gaussians> {
                         format!("Gaussian {row}, {}", sh_attribute(k)),
                         "a finite value",
                         to.to_string(),
-                    ));
+                    )
+                    .hint("export the file again without this Gaussian"));
                 }
             }
         }

@@ -146,7 +146,23 @@ fn damaged_files_are_refused_with_their_place() {
     let mut wrong = whole.clone();
     let at = whole.len() - rest.len() + 8;
     wrong[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-    assert!(refused(&wrong, ReadLimit::NONE).contains("Gaussian 0"));
+    let message = refused(&wrong, ReadLimit::NONE);
+    assert!(message.contains("Gaussian 0") && message.contains("export the file again"), "{message}");
+}
+
+#[test]
+fn zero_quaternions_are_read_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.glb");
+    write_glb(&gaussians(0), &path).unwrap();
+    let mut bytes = fs::read(&path).unwrap();
+    let (document, rest) = parts(&bytes);
+    let at = bytes.len() - rest.len() + 8 + document["bufferViews"][1]["byteOffset"].as_u64().unwrap() as usize;
+    bytes[at..at + 16].fill(0);
+    fs::write(&path, bytes).unwrap();
+    let found = read_glb(&path, ReadLimit::NONE).unwrap();
+    assert_eq!(found.rotation.row::<4>(0), [0.0; 4]);
+    assert_ne!(found.rotation.row::<4>(1), [0.0; 4]);
 }
 
 #[test]

@@ -24,6 +24,9 @@ pub enum PlyEncoding {
 }
 
 impl PlyEncoding {
+    /// Names of all encodings, for messages.
+    const NAMES: &str = "ascii, binary_little_endian or binary_big_endian";
+
     /// Returns the encoding that the `format` line of a header calls `name`; `None` for other names.
     fn parse(name: &str) -> Option<PlyEncoding> {
         match name {
@@ -108,15 +111,19 @@ pub(crate) struct Element {
     pub(crate) name: String,
     pub(crate) count: u64,
     pub(crate) properties: Vec<Property>,
-    /// Length of a binary row in bytes.
+    /// Length of a binary row in bytes, without list properties.
     pub(crate) stride: usize,
+    /// Whether the element has list properties, so that its rows have no fixed size.
+    has_lists: bool,
 }
 
-/// Parsed header of a PLY file. The rows of every element have a fixed size.
+/// Parsed header of a PLY file. The rows of every listed element have a fixed size.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct PlyHeader {
     pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
+    /// Names of the elements that are left out: those with a list property, and those after one of them that has rows.
+    pub(crate) skipped: Vec<String>,
     /// Texts of the `comment` lines of the header, in order.
     pub(crate) comments: Vec<String>,
     /// Bytes of the header, up to and including the line end of `end_header`.
@@ -130,8 +137,8 @@ impl PlyHeader {
     ///
     /// # Errors
     /// Fails if the file is not a PLY, if the header has no `end_header` or more than 1 MiB, if a line, type or count
-    /// is invalid, if there is a list property (its rows have no fixed size), or if a name is used twice. The error
-    /// names the line.
+    /// is invalid, if the rows of Gaussians or rows before them have list properties (these rows have no fixed size), or
+    /// if a name is used twice. The error names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<PlyHeader> {
         let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MAX_HEADER_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
@@ -163,11 +170,8 @@ impl PlyHeader {
                     comments.push(String::from_utf8_lossy(comment).into_owned());
                 }
                 ["format", name, "1.0"] => {
-                    let Some(found) = PlyEncoding::parse(name) else {
-                        let expected = "ascii, binary_little_endian or binary_big_endian";
-                        return Err(Error::input(path, place(), expected, quoted(name)));
-                    };
-                    encoding = Some(found);
+                    let unknown = || Error::input(path, place(), PlyEncoding::NAMES, quoted(name));
+                    encoding = Some(PlyEncoding::parse(name).ok_or_else(unknown)?);
                 }
                 ["element", name, count] => {
                     if !element_names.insert(word(raw, 1)) {
@@ -180,13 +184,17 @@ impl PlyHeader {
                     }
                     let count = count.parse().map_err(|_| Error::input(path, place(), "a row count", quoted(count)))?;
                     property_names.clear();
-                    elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), stride: 0 });
+                    elements.push(Element {
+                        name: name.to_owned(),
+                        count,
+                        properties: Vec::new(),
+                        stride: 0,
+                        has_lists: false,
+                    });
                 }
                 ["property", "list", .., name] => {
-                    let element = elements.last().map_or("no element", |element| &element.name);
-                    let found = format!("list property {} in element {}", quoted(name), quoted(element));
-                    return Err(Error::input(path, place(), "properties of one number", found)
-                        .hint("lists do not occur in Gaussian models; export the points alone"));
+                    check_list(path, place, &elements, name)?;
+                    elements.iter_mut().last().into_iter().for_each(|element| element.has_lists = true);
                 }
                 ["property", kind, name] => {
                     let Some(scalar) = Scalar::parse(kind) else {
@@ -206,13 +214,9 @@ impl PlyHeader {
                     let Some(encoding) = encoding else {
                         return Err(Error::input(path, place(), "a format line before it", "none"));
                     };
-                    return Ok(PlyHeader {
-                        encoding,
-                        elements,
-                        comments,
-                        text: bytes[..end].to_vec(),
-                        lines: index + 1,
-                    });
+                    let (elements, skipped) = without_lists(elements);
+                    let (text, lines) = (bytes[..end].to_vec(), index + 1);
+                    return Ok(PlyHeader { encoding, elements, skipped, comments, text, lines });
                 }
                 _ => {
                     let expected = "a format, comment, element, property or end_header line";
@@ -224,11 +228,11 @@ impl PlyHeader {
     }
 
     /// Returns the bytes of this header changed to `count` Gaussians. `name` receives the name of a property and
-    /// returns its new name, or `None` to remove it. Everything else stays the same, except that a text format becomes
-    /// little-endian binary.
+    /// returns its new name, or `None` to remove it. Skipped elements are left out. Everything else stays the same,
+    /// except that a text format becomes little-endian binary.
     pub(crate) fn text_for(&self, count: usize, name: impl Fn(&str) -> Option<String>) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.text.len() + 16);
-        let mut in_vertex = false;
+        let (mut in_vertex, mut is_skipped) = (false, false);
         for line in self.text.split_inclusive(|&b| b == b'\n') {
             let text = String::from_utf8_lossy(line);
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
@@ -239,6 +243,7 @@ impl PlyHeader {
                 }
                 ["element", element, ..] => {
                     in_vertex = element == "vertex";
+                    is_skipped = self.skipped.iter().any(|name| name == element);
                     let differs = self.vertex().is_some_and(|vertex| vertex.count != count as u64);
                     (in_vertex && differs).then(|| format!("element vertex {count}"))
                 }
@@ -249,6 +254,7 @@ impl PlyHeader {
                 _ => None,
             };
             match changed {
+                _ if is_skipped && !matches!(words[..], ["comment", ..] | ["end_header"]) => (),
                 Some(text) => out.extend([text.as_bytes(), line_end].concat()),
                 None => out.extend(line),
             }
@@ -271,6 +277,39 @@ fn missing_end(path: &Path, length: usize) -> Error {
     }
     let what = format!("the file ends after {length} bytes without one");
     Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again")
+}
+
+/// Checks that the rows of the last of `elements`, which has the list property `name`, may be skipped: they are none, or
+/// come after the rows of Gaussians. The error names the file `path` and the place that `place` returns.
+fn check_list(path: &Path, place: impl Fn() -> String, elements: &[Element], name: &str) -> Result<()> {
+    let is_skippable = |element: &Element, before: &[Element]| {
+        element.name != "vertex" && (element.count == 0 || before.iter().any(|element| element.name == "vertex"))
+    };
+    match elements.split_last() {
+        Some((element, before)) if is_skippable(element, before) => Ok(()),
+        last => {
+            let element = last.map_or("no element", |(element, _)| &element.name);
+            let found = format!("list property {} in element {}", quoted(name), quoted(element));
+            Err(Error::input(
+                path,
+                place(),
+                "properties of one number, at least up to the end of element vertex",
+                found,
+            )
+            .hint("lists do not occur in Gaussian models; export the points alone"))
+        }
+    }
+}
+
+/// Splits `elements` into those whose rows can be found, and the names of the others: elements with lists, and all
+/// elements after one of them that has rows.
+fn without_lists(elements: Vec<Element>) -> (Vec<Element>, Vec<String>) {
+    let first = elements.iter().position(|element| element.has_lists && element.count > 0).unwrap_or(elements.len());
+    let (mut found, mut skipped) = (Vec::new(), Vec::new());
+    for (place, element) in elements.into_iter().enumerate() {
+        if element.has_lists || place > first { skipped.push(element.name) } else { found.push(element) }
+    }
+    (found, skipped)
 }
 
 /// Returns the word with index `at` of a header line; empty if there are fewer words.

@@ -15,6 +15,9 @@ use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 /// f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
+/// Largest SH degree that a file may have.
+const MAX_STORED_DEGREE: usize = 4;
+
 /// Source of the values of one plane (component of an attribute, such as the x of the position).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum PlaneSource {
@@ -28,7 +31,10 @@ pub(crate) enum PlaneSource {
 /// order of [`Gaussians`](crate::model::Gaussians).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
+    /// SH degree that is read, 0 to 3.
     pub(crate) sh_degree: usize,
+    /// SH degree of the file, 0 to 4. Coefficients of degree 4 are left out.
+    pub(crate) stored_degree: usize,
     planes: [Vec<PlaneSource>; 5],
 }
 
@@ -54,19 +60,22 @@ impl PlyLayout {
         let rotation = need_all(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
 
         let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
-        let Some(sh_degree) = (0..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == rest) else {
-            let expected = "0, 9, 24 or 45 properties f_rest_* (degree 0 to 3)";
-            return Err(Error::input(path, "element vertex", expected, rest.to_string()));
+        let is_degree = |&degree: &usize| 3 * (sh_coefficients(degree) - 1) == rest;
+        let Some(stored_degree) = (0..=MAX_STORED_DEGREE).find(is_degree) else {
+            let expected = "0, 9, 24, 45 or 72 properties f_rest_* (degree 0 to 4)";
+            return Err(Error::input(path, "element vertex", expected, rest.to_string())
+                .hint("export the model again with whole SH degrees, or without any f_rest_*"));
         };
+        let sh_degree = stored_degree.min(MAX_SH_DEGREE);
         // The file stores the SH coefficients of red, then those of green, then those of blue. A plane has the index 3
         // · coefficient + channel.
         let per_channel = rest / 3;
-        for coefficient in 0..per_channel {
+        for coefficient in 0..sh_coefficients(sh_degree) - 1 {
             for channel in 0..3 {
                 sh.push(need(&format!("f_rest_{}", channel * per_channel + coefficient))?);
             }
         }
-        Ok(PlyLayout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
+        Ok(PlyLayout { sh_degree, stored_degree, planes: [position, rotation, log_scale, opacity, sh] })
     }
 
     /// Returns the source of the values of each plane (component) of the attribute `column`.
@@ -98,7 +107,8 @@ fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     } else if has("trbf_center") {
         "a SpacetimeGaussians model has x y z f_dc_0..2 opacity scale_0..2 rot_0..3 too"
     } else if has("red") || has("face") {
-        "this looks like a point cloud or a mesh, not a trained Gaussian model"
+        "this looks like a point cloud or a mesh, not a trained Gaussian model: train a model from it (3DGS starts from \
+         such points), and give the point_cloud.ply that the training writes"
     } else {
         "a Gaussian model has x y z f_dc_0..2 opacity scale_0..2 rot_0..3"
     };

@@ -5,10 +5,12 @@
 //! instead. Source: 3D Gaussian Splatting (Kerbl et al., 2023), `save_ply` of its public code.
 //!
 //! Accepted: text, and binary of either byte order; any number type per property; properties in any order, extra
-//! properties, no normals; comments; LF or CRLF; extra elements before or after `vertex`; no `scale_2` (2DGS, see
-//! [`THIN_LOG_SCALE`]); bytes after the last element. This reader does not refuse NaN values.
+//! properties, no normals; comments; LF or CRLF; extra elements before or after `vertex`, those with lists only after
+//! it; no `scale_2` (2DGS, see [`THIN_LOG_SCALE`]); bytes after the last element. This reader does not refuse NaN
+//! values. SH coefficients of degree 4 are left out.
 
 mod ascii;
+mod defects;
 pub(crate) mod header;
 mod layout;
 #[cfg(test)]
@@ -30,7 +32,7 @@ use super::map::FileMap;
 use super::open::open_file;
 use crate::error::{Error, Result, ShowPath};
 use crate::limits::ReadLimit;
-use crate::model::{AttributeValues, Attributes, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians, finite_logit};
 use crate::progress::Events;
 use crate::source::Ids;
 
@@ -80,6 +82,8 @@ pub struct Ply {
     body: PlyBody,
     /// Byte range of the rows of the element `vertex` in the body.
     rows: Range<usize>,
+    /// Offset in the body of the end of the bytes that writers copy.
+    end: usize,
     count: usize,
     memory: ReadLimit,
 }
@@ -159,9 +163,10 @@ impl Ply {
             }
             PlyEncoding::LittleEndian | PlyEncoding::BigEndian => PlyBody { map, start: header.text.len(), text: None },
         };
-        let rows = vertex_rows(path, &header, body.bytes().len())?;
+        let (rows, end) = vertex_rows(path, &header, body.bytes().len())?;
+        let end = if header.skipped.is_empty() { body.bytes().len() } else { end };
         let count = count as usize;
-        Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count, memory })
+        Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, end, count, memory })
     }
 
     /// Returns the converted rows of a text file, to be passed to [`Ply::open_again`]; `None` for a binary file.
@@ -212,7 +217,8 @@ impl Ply {
     }
 
     /// Writes the attributes `want` of the Gaussians `ids`, in that order, into `out`, which is resized to their
-    /// number. f32 values keep their bits; values of other types are rounded to the nearest f32.
+    /// number. f32 values keep their bits; values of other types are rounded to the nearest f32. An infinite opacity
+    /// logit becomes ±[`INFINITE_LOGIT`](crate::model::INFINITE_LOGIT).
     ///
     /// # Errors
     /// Fails if an id is beyond the last Gaussian, or if the file was truncated since it was opened.
@@ -244,6 +250,9 @@ impl Ply {
                     }
                 }
             }
+        }
+        if want.contains(Attributes::OPACITY) {
+            out.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = finite_logit(*logit));
         }
         if want.contains(Attributes::LOG_SCALE)
             && self.layout.planes(Attributes::LOG_SCALE).contains(&PlaneSource::Thin)
@@ -302,7 +311,7 @@ impl Ply {
 
     /// Returns the number of bytes of the binary body before the rows of `vertex`, and the number of bytes after them.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
-        [self.rows.start, self.body.bytes().len() - self.rows.end]
+        [self.rows.start, self.end - self.rows.end]
     }
 
     /// Writes the bytes of the binary body that lie before the rows of `vertex` to `out`.
@@ -312,8 +321,7 @@ impl Ply {
 
     /// Writes the bytes of the binary body that lie after the rows of `vertex` to `out`.
     pub(crate) fn write_tail(&self, out: &mut dyn Write) -> io::Result<()> {
-        let end = self.body.bytes().len();
-        self.body.map.pieces(self.body.range(self.rows.end..end), |piece| out.write_all(piece))
+        self.body.map.pieces(self.body.range(self.rows.end..self.end), |piece| out.write_all(piece))
     }
 
     /// Returns the maximum memory in bytes for reading the whole file.
@@ -362,9 +370,9 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file. Fails if the body has
-/// fewer bytes (`available`) than its header declares.
-fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Range<usize>> {
+/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file, and the end of the last
+/// element that is not skipped. Fails if the body has fewer bytes (`available`) than its header declares.
+fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<(Range<usize>, usize)> {
     let mut end = 0u64;
     let mut rows = 0..0;
     for element in &header.elements {
@@ -383,7 +391,7 @@ fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Rang
             rows = start as usize..next as usize;
         }
     }
-    Ok(rows)
+    Ok((rows, end as usize))
 }
 
 /// Reads the values of `property` into `out`, from the rows that begin at the byte offsets `starts` in `rows`.

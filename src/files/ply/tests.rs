@@ -204,6 +204,63 @@ fn extra_elements_and_bytes_are_skipped() {
     let list = text.replace("property uchar id", "property list uchar int vertex_indices");
     let message = refusal(list.as_bytes());
     assert!(message.contains("list property \"vertex_indices\"") && message.contains("camera"), "{message}");
+    let in_rows = text.replace("property float f_dc_0", "property list uchar float f_dc_0");
+    assert!(refusal(in_rows.as_bytes()).contains("in element \"vertex\""));
+}
+
+#[test]
+fn elements_with_lists_are_skipped_after_the_gaussians() {
+    let names = names();
+    for format in ["ascii", "binary_little_endian"] {
+        let plain = file(format, "float", &names, 2, "\n");
+        let text = header(format, "float", &names, "2", "\n");
+        let lists =
+            "element face 1\nproperty list uchar int vertex_indices\nelement note 1\nproperty int a\nend_header\n";
+        let empty = "element face 0\nproperty list uchar int vertex_indices\nelement vertex";
+        for (head, skipped) in [
+            (text.replace("end_header\n", lists), vec!["face", "note"]),
+            (text.replace("element vertex", empty), vec!["face"]),
+        ] {
+            let ply = open(&[head.as_bytes(), &plain[text.len()..], b"3 0 1 2"].concat()).unwrap();
+            assert_eq!(all(&ply), expected(2, &names));
+            assert_eq!(ply.header().skipped, skipped, "{format}");
+            let little = header("binary_little_endian", "float", &names, "2", "\n");
+            let found = ply.header().text_for(2, |name| Some(name.to_owned()));
+            assert_eq!(String::from_utf8(found).unwrap(), little);
+        }
+    }
+}
+
+#[test]
+fn every_sh_degree_is_read_up_to_degree_3() {
+    for (stored, rest) in [(0usize, 0usize), (1, 9), (2, 24), (3, 45), (4, 72)] {
+        let mut names: Vec<String> = names().into_iter().filter(|name| !name.starts_with("f_rest_")).collect();
+        names.extend((0..rest).map(|k| format!("f_rest_{k}")));
+        let ply = open(&file("binary_little_endian", "float", &names, 2, "\n")).unwrap();
+        assert_eq!(ply.sh_degree(), stored.min(3));
+        let (found, per_channel) = (all(&ply), rest / 3);
+        for k in 1..(stored.min(3) + 1).pow(2) {
+            for channel in 0..3 {
+                let name = format!("f_rest_{}", channel * per_channel + k - 1);
+                let place = names.iter().position(|other| *other == name).unwrap();
+                assert_eq!(found.sh.plane(3 * k + channel)[1], f32::from(value(1, place)), "{stored}: {name}");
+            }
+        }
+    }
+}
+
+#[test]
+fn infinite_opacity_logits_become_finite() {
+    let names = names();
+    let place = names.iter().position(|name| name == "opacity").unwrap();
+    let mut bytes = float_file(3);
+    let start = bytes.len() - 12 * names.len();
+    for (row, logit) in [f32::INFINITY, f32::NEG_INFINITY, f32::NAN].into_iter().enumerate() {
+        bytes[start + 4 * (row * names.len() + place)..][..4].copy_from_slice(&logit.to_le_bytes());
+    }
+    let found = all(&open(&bytes).unwrap());
+    assert_eq!(found.opacity_logit.plane(0)[..2], [100.0, -100.0]);
+    assert!(found.opacity_logit.plane(0)[2].is_nan());
 }
 
 #[test]
@@ -226,7 +283,7 @@ fn a_missing_property_is_named() {
     }
     let names: Vec<String> = names().into_iter().filter(|n| n != "f_rest_3").collect();
     assert!(
-        message_for(&names).contains("0, 9, 24 or 45") && message_for(&names).contains("found 8"),
+        message_for(&names).contains("0, 9, 24, 45 or 72") && message_for(&names).contains("found 8"),
         "{}",
         message_for(&names)
     );

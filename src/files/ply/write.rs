@@ -65,7 +65,7 @@ pub fn write_like_template(
     path: &Path,
 ) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
-    let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
+    let name = |name: &str| name_without_bands(name, template.layout().stored_degree, sh_degree);
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
     write_rows_like(template, &sources, name, path, |place, bytes| {
@@ -250,7 +250,8 @@ fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>
             PlaneSource::Thin => None,
         }));
     }
-    let beside = properties.iter().filter(|property| !used.contains(&property.offset));
+    let is_extra = |property: &&Property| !used.contains(&property.offset) && !property.name.starts_with("f_rest_");
+    let beside = properties.iter().filter(is_extra);
     beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
 }
 

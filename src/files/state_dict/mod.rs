@@ -9,6 +9,7 @@ use std::path::Path;
 use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, TensorView};
+use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 pub(crate) use write::{StoredTensor, TensorValues, write_state_dict};
 
@@ -62,6 +63,20 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
     Ok(tensors)
 }
 
+/// Returns a note for the user if all names of the tensors of the state dict at `path` have a prefix that the model does
+/// not expect; `None` otherwise. No values are read.
+///
+/// # Errors
+/// Fails if the file is not a state dict.
+pub(crate) fn prefix_note(path: &Path, memory: ReadLimit) -> Result<Option<String>> {
+    let prefix = StateDict::open(path, memory)?.prefix;
+    let file = shown_name(path);
+    Ok((!prefix.is_empty()).then(|| {
+        let prefix = quoted(&prefix);
+        format!("{file}: the names of all tensors begin with {prefix}, of a wrapper of the model; read without it")
+    }))
+}
+
 /// Returns the names of the tensors of the state dict at `path`, in order. No values are read.
 ///
 /// # Errors
@@ -92,7 +107,18 @@ pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
 /// by dots.
 struct StateDict {
     checkpoint: Checkpoint,
+    /// Tensors by their names without `prefix`.
     tensors: BTreeMap<String, TensorView>,
+    /// Prefix that all names have in the file and that belongs to a wrapper of the model; empty if there is none.
+    prefix: String,
+}
+
+/// Prefixes of the names of all tensors that `torch.nn.DataParallel` and `torch.compile` add.
+const WRAPPERS: [&str; 2] = ["module.", "_orig_mod."];
+
+/// Returns whether there are tensors, and the names of all of them begin with `prefix` and are longer.
+fn all_begin_with(tensors: &BTreeMap<String, TensorView>, prefix: &str) -> bool {
+    !tensors.is_empty() && tensors.keys().all(|name| name.len() > prefix.len() && name.starts_with(prefix))
 }
 
 impl StateDict {
@@ -113,8 +139,13 @@ impl StateDict {
         let mut search =
             TensorSearch { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
         search.visit(root, &mut String::new(), 0)?;
-        let tensors = search.found;
-        Ok(StateDict { checkpoint, tensors })
+        let mut tensors = search.found;
+        let mut prefix = String::new();
+        while let Some(wrapper) = WRAPPERS.iter().find(|wrapper| all_begin_with(&tensors, wrapper)) {
+            tensors = tensors.into_iter().map(|(name, tensor)| (name[wrapper.len()..].to_owned(), tensor)).collect();
+            prefix += wrapper;
+        }
+        Ok(StateDict { checkpoint, tensors, prefix })
     }
 }
 

@@ -130,6 +130,20 @@ fn tensors_have_their_shapes_and_values() {
 }
 
 #[test]
+fn the_prefix_of_a_wrapper_is_left_out_and_noted() {
+    let temp = TempStateDict::new();
+    let values: [&'static str; 2] = ["module._orig_mod.a.weight", "module._orig_mod.b"];
+    let wrapped = values.map(|name| f32_entry(name, &[1.0, 2.0], &[2], &[1]));
+    let found = temp.read(&state_dict(&wrapped)).unwrap();
+    assert_eq!(found.keys().collect::<Vec<_>>(), ["a.weight", "b"]);
+    let note = prefix_note(&temp.0.path().join("deformation.pth"), ReadLimit::NONE).unwrap().unwrap();
+    assert!(note.contains("\"module._orig_mod.\""), "{note}");
+    let partly = ["module.a", "b"].map(|name| f32_entry(name, &[1.0, 2.0], &[2], &[1]));
+    assert_eq!(temp.read(&state_dict(&partly)).unwrap().keys().collect::<Vec<_>>(), ["b", "module.a"]);
+    assert_eq!(prefix_note(&temp.0.path().join("deformation.pth"), ReadLimit::NONE).unwrap(), None);
+}
+
+#[test]
 fn strides_and_offsets_are_honored() {
     let mut transposed = f32_entry("t", &[9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], &[3, 2], &[1, 3]);
     transposed.offset = 1;

@@ -41,7 +41,7 @@ pub(crate) fn add_cloud(content: &mut ArchiveContent, template: &Ply, rows: impl
     };
     let lead = around(&|out| template.write_lead(out))?;
     let tail = around(&|out| template.write_tail(out))?;
-    let name = |name: &str| name_without_bands(name, template.sh_degree(), content.cloud.sh_degree());
+    let name = |name: &str| name_without_bands(name, template.layout().stored_degree, content.cloud.sh_degree());
     let header = template.header().text_for(content.cloud.len(), name);
     for (name, bytes) in [(HEADER, header), (LEAD, lead), (TAIL, tail)] {
         content.files.insert(name.to_owned(), bytes);

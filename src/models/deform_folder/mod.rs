@@ -32,6 +32,7 @@ use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
+use crate::files::state_dict::prefix_note;
 use crate::limits::Limits;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
@@ -107,7 +108,9 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.format_specific.width(), &*paths.network, &*paths.point_cloud);
         let parts = ModelParts { arguments: &arguments, tensors: &tensors, file, features, cloud };
-        let (motion_model, notes) = make(&parts)?;
+        let (motion_model, mut notes) = make(&parts)?;
+        notes.extend(prefix_note(&paths.network, options.memory)?);
+        notes.extend(ply.notes()?);
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let source_path = arguments.get("source_path").string()?;
         let white_background = arguments.get("white_background").bool(false)?;

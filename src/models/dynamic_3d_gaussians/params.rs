@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use crate::error::{Error, Result};
 use crate::files::npz::write::GaussianAxis;
 use crate::files::npz::{Floats, Npz, NpzArray};
-use crate::model::{Attributes, Gaussians, SequenceInfo, sh_from_color};
+use crate::model::{Attributes, Gaussians, SequenceInfo, finite_logit, sh_from_color};
 use crate::models::archive::reopen::Reopener;
 use crate::source::{BlockReader, FrameSource, Ids, Reads, SharedCounter};
 
@@ -201,7 +201,7 @@ impl BlockReader for TrajectoryBlock<'_> {
                     Attributes::POSITION => out.position.set_row(row, means.row::<3>(3 * at)),
                     Attributes::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
                     Attributes::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
-                    Attributes::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
+                    Attributes::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id).map(finite_logit)),
                     _ => out.sh.set_row(row, colors.row::<3>(3 * at).map(|color| sh_from_color(color.into()))),
                 }
             }

@@ -84,6 +84,50 @@ fn states_are_the_array_values_compressed_or_not() {
     assert_eq!((0..5).map(|id| model.class(id)).collect::<Vec<_>>(), [0, 0, 0, 1, 1]);
 }
 
+/// Writes the file `path` with the array `log_scales` as f64 values of the type `kind` in the order `order`.
+fn write_with_doubles(path: &Path, kind: &str, order: npyz::Order) {
+    let mut npz = NpzWriter::new(File::create(path).unwrap());
+    for (name, shape, values) in &arrays() {
+        let options = FileOptions::default().compression_method(CompressionMethod::Stored);
+        if *name == "log_scales" {
+            let dtype = npyz::DType::Plain(kind.parse().unwrap());
+            let array = npz.array::<f64>(name, options).unwrap().dtype(dtype).order(order).shape(shape);
+            let mut array = array.begin_nd().unwrap();
+            array.extend(values.iter().map(|&x| f64::from(x))).unwrap();
+            array.finish().unwrap();
+        } else {
+            let mut array = npz.array::<f32>(name, options).unwrap().default_dtype().shape(shape).begin_nd().unwrap();
+            array.extend(values.iter().copied()).unwrap();
+            array.finish().unwrap();
+        }
+    }
+}
+
+#[test]
+fn doubles_of_both_byte_orders_in_an_npz_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.npz");
+    write(&path, &arrays(), CompressionMethod::Stored);
+    let expected = states(&*open(&path).unwrap());
+    for kind in ["<f8", ">f8"] {
+        write_with_doubles(&path, kind, npyz::Order::C);
+        assert!(states(&*open(&path).unwrap()) == expected, "{kind}");
+    }
+    write_with_doubles(&path, "<f8", npyz::Order::Fortran);
+    let message = message(&path);
+    assert!(message.contains("log_scales") && message.contains("ascontiguousarray"), "{message}");
+}
+
+#[test]
+fn infinite_opacity_logits_of_an_npz_are_clamped() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut odd = arrays();
+    (odd[4].2[1], odd[4].2[3]) = (f32::INFINITY, f32::NEG_INFINITY);
+    write(&folder.path().join("params.npz"), &odd, CompressionMethod::Stored);
+    let logits = states(&*open(folder.path()).unwrap())[0].opacity_logit.plane(0).to_vec();
+    assert_eq!(logits, [-1.0, 100.0, 0.0, -100.0, 1.0]);
+}
+
 #[test]
 fn kept_rows_keep_their_bytes() {
     for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {

@@ -16,7 +16,7 @@ use super::in_checkpoint::{
     CheckpointModel, CheckpointReader, ModelDescription, RowElement, numbered_files, row_count,
 };
 use crate::error::{Error, Result, quoted};
-use crate::files::checkpoint::{Checkpoint, NodeId};
+use crate::files::checkpoint::{Checkpoint, NodeId, Pickle};
 use crate::files::ftgs::{LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY};
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
@@ -88,13 +88,19 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
 fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
-    pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
+    pickle.item(pickle.root(), "splats").is_some_and(|splats| splat_tensor(pickle, splats, "means").is_some())
+}
+
+/// Returns the tensor `name` of the state dict `splats`; its name may have the prefix that a wrapper of the parameters
+/// adds.
+fn splat_tensor(pickle: &Pickle, splats: NodeId, name: &str) -> Option<NodeId> {
+    pickle.item(splats, name).or_else(|| pickle.item(splats, &format!("module.{name}")))
 }
 
 /// Opens a checkpoint as FreeTimeGS if it has velocities, else as a static model.
 fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let reopener = Some(Reopener::new(ENTRY.open, options));
-    let description = ModelDescription { reopener, ..description };
+    let mut description = ModelDescription { reopener, ..description };
     let checkpoint = Checkpoint::open(&description.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {
@@ -102,20 +108,24 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         return Err(checkpoint.wrong("data.pkl", "a dict with \"splats\"", found));
     };
     let missing = |name: &str| checkpoint.wrong(&place(name), "a tensor of this name", checkpoint.describe(splats));
-    let find = |name: &'static str| pickle.item(splats, name).ok_or_else(|| missing(name));
-    if let Some(name) = ["accels", "jerks"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
+    let find = |name: &'static str| splat_tensor(pickle, splats, name).ok_or_else(|| missing(name));
+    if let Some(name) = ["accels", "jerks"].into_iter().find(|name| splat_tensor(pickle, splats, name).is_some()) {
         return Err(checkpoint
             .wrong(&place(name), "motion along straight lines", "a motion term of higher order, written by a fork")
             .hint("export its frames with its own renderer, as PLY files or as a frame stream, and give those"));
     }
-    if let Some(name) = ["features", "colors"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
+    if let Some(name) = ["features", "colors"].into_iter().find(|name| splat_tensor(pickle, splats, name).is_some()) {
         return Err(checkpoint
             .wrong(&place(name), "sh0 and shN", "colors of an appearance network")
             .hint("train without --app_opt, or export its frames as PLY files with its own renderer"));
     }
     let names = ["means", "scales", "quats", "opacities", "sh0", "shN"];
     let nodes = names.iter().map(|name| find(name)).collect::<Result<Vec<NodeId>>>()?;
-    let has_motion = pickle.item(splats, "velocities").is_some();
+    let has_motion = splat_tensor(pickle, splats, "velocities").is_some();
+    if pickle.item(splats, "means").is_none() {
+        let note = "the names of all tensors begin with \"module.\", of a wrapper of the model; read without it";
+        description.notes.push(note.to_owned());
+    }
     let motion_nodes = if has_motion {
         ["times", "durations", "velocities"].iter().map(|name| find(name)).collect::<Result<_>>()?
     } else {

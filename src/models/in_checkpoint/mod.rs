@@ -116,8 +116,9 @@ impl<L: ProxyRule> CheckpointModel<L> {
     pub(super) fn new(
         reader: CheckpointReader,
         motion_model: L,
-        description: ModelDescription,
+        mut description: ModelDescription,
     ) -> Result<CheckpointModel<L>> {
+        description.notes.extend(reader.note());
         let sh_degree = reader.raw.gaussians.sh_degree();
         let model = MotionModelFrames::new(motion_model, reader.raw, sh_degree);
         let is_still = model.motion_model().varying().is_empty();

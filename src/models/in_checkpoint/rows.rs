@@ -9,7 +9,7 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
-use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams};
+use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, finite_logit};
 use crate::models::trajectories::state_bytes;
 
 /// Meaning of one value in a tensor's row (the values of one Gaussian).
@@ -73,6 +73,8 @@ pub(in crate::models) struct CheckpointReader {
     pub(in crate::models) tensors: RowTensors,
     /// Parameters of all Gaussians that have been read so far; the others are zero.
     pub(in crate::models) raw: StoredParams,
+    /// Number of infinite opacity logits that have been replaced so far.
+    infinite_logits: usize,
 }
 
 impl CheckpointReader {
@@ -95,6 +97,17 @@ impl CheckpointReader {
         Ok(CheckpointReader {
             tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },
             raw,
+            infinite_logits: 0,
+        })
+    }
+
+    /// Returns a note for the user on the infinite opacity logits that have been replaced; `None` if there were none.
+    pub(in crate::models) fn note(&self) -> Option<String> {
+        let (replaced, all) = (self.infinite_logits, self.tensors.count);
+        (replaced > 0).then(|| {
+            format!(
+                "{replaced} of {all} rows repaired: infinite opacity logit; read as ±100, which is opaque or invisible"
+            )
         })
     }
 
@@ -102,7 +115,8 @@ impl CheckpointReader {
     /// expected shape of a row, and `planes` is the meaning of each value of a row.
     ///
     /// # Errors
-    /// Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
+    /// Fails if there is no floating-point tensor of that shape, or if values are missing. Values may be NaN; infinite
+    /// opacity logits become ±[`INFINITE_LOGIT`](crate::model::INFINITE_LOGIT).
     pub(in crate::models) fn read(
         &mut self,
         id: NodeId,
@@ -116,7 +130,7 @@ impl CheckpointReader {
         if tensor.shape != shape {
             return Err(checkpoint.wrong(name, format!("shape {shape:?}"), format!("shape {:?}", tensor.shape)));
         }
-        let values = checkpoint.floats(&tensor, name)?;
+        let values = checkpoint.values(&tensor, name)?;
         let width = planes.len();
         for (c, plane) in planes.iter().enumerate() {
             let to = match *plane {
@@ -125,6 +139,10 @@ impl CheckpointReader {
                 RowElement::Unread => continue,
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
+            if *plane == RowElement::Of(Attributes::OPACITY, 0) {
+                self.infinite_logits += to.iter().filter(|logit| logit.is_infinite()).count();
+                to.iter_mut().for_each(|logit| *logit = finite_logit(*logit));
+            }
         }
         self.tensors.params.push(Param { name: name.to_owned(), tensor, planes });
         Ok(())
@@ -189,7 +207,7 @@ impl RowTensors {
                 .map(|(place, _)| place)
                 .collect();
             let unread = planes.contains(&RowElement::Unread) && !changed.is_empty();
-            let stored = if unread { self.checkpoint.floats(tensor, name)? } else { Vec::new() };
+            let stored = if unread { self.checkpoint.values(tensor, name)? } else { Vec::new() };
             let mut values = Vec::with_capacity(changed.len() * planes.len());
             for &place in &changed {
                 let row = reduction.kept[place as usize] as usize * planes.len();

@@ -83,6 +83,7 @@ impl LinkedFrames {
         options: &PlyOptions,
     ) -> Result<LinkedFrames> {
         let scratch = &*options.scratch;
+        let not_read = frames.frame(0)?.header_notes();
         let mut joiner = joins.then(Joiner::default);
         let (mut tracks, found, linker) = LinkedTracks::link(frames, name, joiner.as_mut(), options)?;
         let joined = joiner.map(|joiner| simplify::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
@@ -94,7 +95,7 @@ impl LinkedFrames {
         let info = container.info().clone();
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(&tracks)?);
-        notes.extend(joined.into_iter().chain(held));
+        notes.extend(joined.into_iter().chain(held).chain(not_read));
         Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, origin: None })
     }
 }

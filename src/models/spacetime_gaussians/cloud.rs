@@ -65,6 +65,11 @@ impl PointCloudFile {
         Ok(PointCloudFile { own: own.collect::<Result<_>>()?, ply })
     }
 
+    /// Returns notes for the user on the defects of the file. Fails if it was cut short since it was opened.
+    pub(super) fn notes(&self) -> Result<Vec<String>> {
+        self.ply.notes()
+    }
+
     /// Returns whether the file belongs to the full model (with features and a decoder network), not to the lite model.
     pub(super) fn is_full(&self) -> bool {
         self.own.len() == FULL_WIDTH

@@ -202,6 +202,7 @@ impl SpacetimeGaussians {
         }
         let raw = cloud.raw(activation)?;
         notes.extend(negative_color_note(&raw));
+        notes.extend(cloud.notes()?);
         let model = MotionModelFrames::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
         let reopener = Reopener::new(ENTRY.open, options);
         Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes, reopener })
