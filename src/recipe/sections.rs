@@ -314,7 +314,8 @@ impl LengthUnit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionSimilarity {
-    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
+    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame. This is the formula
+    /// of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models".
     Cosine,
     /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame;
     /// σ is the parameter `motion_noise`.

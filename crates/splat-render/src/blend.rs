@@ -92,7 +92,8 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) weight: V,
     /// Transmittance behind the splat, never 0. Negative in pixels that have ended, where the weight is 0.
     pub(super) transmittance_after: V,
-    /// Offset along x of the pixel from the largest alpha of the splat in this row, pixels: dx − shear·dy of [`Splat`].
+    /// Offset along x of the pixel from the point of its row at which the alpha of the splat is largest, pixels: dx −
+    /// shear·dy of [`Splat`].
     pub(super) offset_x: V,
     /// Offset along y of the pixel from the center of the splat, pixels: dy of [`Splat`].
     pub(super) offset_y: V,
