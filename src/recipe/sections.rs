@@ -68,7 +68,7 @@ pub enum Coverage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NonFinite {
-    /// Stop the run with an error that names the Gaussians.
+    /// Stop the run with an error that states how many Gaussians have NaN or infinity, and the ids of the first five.
     Error,
     /// Remove the Gaussian.
     Drop,
