@@ -313,7 +313,8 @@ impl Checkpoint {
         }
     }
 
-    /// Returns the tensor that node `id` itself builds; `None` for parameters and other nodes.
+    /// Returns the tensor that node `id` of the object tree builds. Returns `None` for all other nodes, even for a
+    /// PyTorch `Parameter`, which contains the node of a tensor.
     fn plain_tensor(&self, id: NodeId) -> Option<TensorView> {
         let (name, arguments) = self.pickle.call(id)?;
         let [storage, offset, size, stride, ..] = *arguments else { return None };

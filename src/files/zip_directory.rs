@@ -7,8 +7,9 @@ use std::io::{Error, Read, Result, Seek, SeekFrom};
 const END_BYTES: u64 = 22;
 /// Maximum length in bytes of the comment at the end of a zip archive.
 const MAX_COMMENT: u64 = 0xffff;
-/// Length in bytes of the record that locates the 64-bit end record, and ([`END_64_BYTES`]) of that end record itself.
+/// Length in bytes of the ZIP64 locator: the record that contains the offset of the ZIP64 end record.
 const LOCATOR_BYTES: u64 = 20;
+/// Length in bytes of the ZIP64 end record (end of central directory with 64-bit numbers), without optional data.
 const END_64_BYTES: u64 = 56;
 
 /// Size of the list of files that a zip archive declares.

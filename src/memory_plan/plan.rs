@@ -58,8 +58,9 @@ impl MemoryPlan {
         if fits { Ok(plan) } else { Err(plan.too_small_error(budget)) }
     }
 
-    /// Returns whether there are limits under which all stages fit into `budget`. `estimates` returns the estimates of
-    /// all stages for given limits.
+    /// Returns whether all stages can fit into the memory budget `budget` if the amounts that they keep in memory at a
+    /// time (frames, views, Gaussians; see [`Limits`]) are limited far enough. `estimates` returns the estimates of all
+    /// stages for given limits.
     pub fn fits_budget(
         work: Workload,
         budget: Budget,

@@ -128,14 +128,17 @@ pub struct PassCounts {
     pub sequential: bool,
 }
 
-/// Runs all merging passes of `recipe` over `survivors` (Gaussians left by pruning). Every pass first merges nodes
-/// (Gaussians or merged groups) that coincide, then neighbors. A merge joins one or more nodes (members) to a leader:
-/// the node of the resulting group that ranks first by its contribution C.
+/// Merges `survivors` (Gaussians left by pruning) in all merging passes of `recipe`. Returns the groups of survivors, a
+/// proxy for each group of more than one, and statistics of the passes.
 ///
-/// A member must pass three tests with its leader: 1 (place and size), 2 (color) and 3 (motion). `measure` provides the
-/// values for test 3: it returns the motion similarity of every requested pair, in the order of the request. A pair
-/// passes if its similarity exceeds the minimum τ_m of the pass. The similarity depends on the pair alone, so the
-/// caller may cache it.
+/// A pass merges nodes: single Gaussians, or groups that were merged before. It first merges coincident nodes, which
+/// are equal in every attribute that tests 1 and 2 compare, then neighbors. A merge joins one or more nodes, the
+/// members, to another node, the leader. The leader is the node of the new group with the largest contribution C.
+///
+/// A member must pass three tests with its leader: 1 (place and size) and 2 (color), both in [`appearance`], and 3
+/// (motion), in [`motion`]. `measure` provides the values for test 3: it returns the motion similarity of every
+/// requested pair, in the order of the request. A pair passes test 3 if its similarity exceeds τ_m, the minimum that
+/// `recipe` sets for the pass. The similarity depends on the pair alone, so the caller may cache it.
 ///
 /// # Calls of `measure`
 ///
@@ -145,8 +148,9 @@ pub struct PassCounts {
 ///
 /// # Groups as nodes
 ///
-/// In later passes the nodes are groups. A group has the state of the proxy of all its original Gaussians. It is ranked
-/// by the sum of their contributions C. Its trajectory, life span and hash are those of its leader.
+/// A group that was merged before is a node with the state of the proxy of all its original Gaussians. It is ranked by
+/// the sum of their contributions C; ties are broken by the hash of the leader's id. Its trajectory and life span are
+/// those of its leader.
 ///
 /// # Limit of joins
 ///

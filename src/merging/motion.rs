@@ -22,9 +22,11 @@ pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 /// frames, whatever the time between them, because the noise level they are compared with is also one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the velocities of the two Gaussians in a step; a step
-    /// in which a or b is zero counts as 0. The mean is over all frames in which both are alive (opacity ≥ alpha_min)
-    /// (`MotionParams::Literal`), or only over the steps that also begin in such a frame (`MotionParams::Runs`).
+    /// Mean of the cosines a·b/(‖a‖‖b‖ + 1e-8), where a and b are the steps of the two Gaussians from the previous
+    /// frame to this frame. The mean is over the frames in which both Gaussians are alive (opacity ≥ alpha_min). With
+    /// `MotionParams::Runs`, a frame counts only if both are also alive in the previous frame. With
+    /// `MotionParams::Literal`, all these frames count, and the first frame of the sequence, which has no step, counts
+    /// as 0. The cosine is also 0 if a or b is zero.
     pub cosine: f64,
     /// Σ a·b over the steps, where a and b are the velocities of the two Gaussians; squared scene units.
     pub dot: f64,

@@ -1,10 +1,11 @@
 //! A grid of voxels: cubes of equal size, sorted in Morton order, which keeps neighbors together (G. M. Morton, "A
 //! computer oriented geodetic data base", 1966).
 //!
-//! Gaussians that are close in space are mostly close in this order, too. Take a consecutive part of the list, and all
-//! Gaussians within one voxel side of it (its ghosts): together they contain all pairs that are at most one side apart
-//! and whose leader is in the part. The order affects only the speed of reading, never a result. Memory while sorting:
-//! 20 bytes per Gaussian beside the output.
+//! Gaussians that are close in space are mostly close in this order, too. The list of all Gaussians in this order can
+//! therefore be processed in consecutive parts. A part, together with all Gaussians within one voxel side of it (its
+//! ghosts), contains every pair of Gaussians that are at most one side apart if one of the two is in the part. The
+//! order affects only the speed of reading, never a result. Memory while sorting: 20 bytes per Gaussian beside the
+//! output.
 
 use rayon::prelude::*;
 

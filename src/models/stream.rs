@@ -1,9 +1,14 @@
 //! Frame stream (format/STREAM.md) as a model format: the frames are packed into a temporary container as they arrive,
 //! then read from that container.
 //!
-//! Memory, with N Gaussians, b bytes of time-varying attributes per Gaussian, and F frames per block: N·b·F for the
-//! frames of a block, at most 64 MiB or one frame; two more frames in transit; the constant attributes; 24 bytes per
-//! received frame. A thread reads ahead while earlier frames are encoded.
+//! Frames are encoded in blocks of F consecutive frames. A thread reads ahead meanwhile. Memory, with N Gaussians and b
+//! bytes of time-varying attributes per Gaussian:
+//!
+//! - N·b·F bytes for the frames of a block. F is the number of frames that fit into 64 MiB, but at least 1 (a single
+//!   frame may be larger) and at most [`FRAME_BLOCK`].
+//! - 2·N·b bytes for two frames that were read ahead.
+//! - The constant attributes.
+//! - 24 bytes per received frame.
 
 use std::collections::BTreeMap;
 use std::io::Read;

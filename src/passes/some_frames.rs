@@ -13,7 +13,8 @@ pub struct SomeFrames<'a> {
 }
 
 impl<'a> SomeFrames<'a> {
-    /// Creates a source of the frames with the indices `frames`, in increasing order, of `source`.
+    /// Creates a source that consists of some frames of `source`. `frames` lists the indices of these frames and must
+    /// be in increasing order.
     pub fn new(source: &'a dyn FrameSource, frames: Vec<usize>) -> SomeFrames<'a> {
         let times = frames.iter().map(|&frame| source.info().times[frame]).collect();
         SomeFrames { source, info: SequenceInfo { times, ..source.info().clone() }, frames }

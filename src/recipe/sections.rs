@@ -68,7 +68,7 @@ pub enum Coverage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NonFinite {
-    /// Stop the run with an error that names the Gaussians.
+    /// Stop the run with an error that states how many Gaussians have NaN or infinity, and the ids of the first five.
     Error,
     /// Remove the Gaussian if at most 1% of all Gaussians are such; else stop the run like [`NonFinite::Error`].
     Few,
@@ -316,7 +316,8 @@ impl LengthUnit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionSimilarity {
-    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame, as in the paper.
+    /// Mean cosine of the angle between the steps a and b of the two Gaussians from frame to frame. This is the formula
+    /// of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models".
     Cosine,
     /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²), summed over n steps a and b of the two Gaussians from frame to frame;
     /// σ is the parameter `motion_noise`.

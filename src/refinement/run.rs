@@ -192,7 +192,8 @@ struct BestState<Delta, Trajectory> {
     delta: Delta,
     /// Factor on the learning rates, reduced whenever the validation quality became worse.
     rate_factor: f32,
-    /// Part of the best change found so far that varies with time: values to add to each frame.
+    /// Trajectory delta: the time-varying values, added to each frame, that have had the best validation quality so far
+    /// together with `delta`.
     trajectory: Trajectory,
     mean: MeanDelta<Delta>,
 }

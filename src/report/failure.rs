@@ -22,11 +22,14 @@ pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
 /// Minimum gap in dB for a failure mode to be flagged: PSNR where the kind of Gaussian is not visible, minus PSNR where
 /// it is visible. A PSNR lower by 3 dB means twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
-/// Minimum share of a kind of Gaussian in the pixels of a render, from 0 to 1. If the share is smaller, the failure
-/// mode of this kind is not judged in this render.
+/// Minimum share of a kind of Gaussian in a render: Σ alpha · transmittance of the Gaussians of this kind in a pixel,
+/// averaged over the pixels of the render, from 0 to 1. A render with a smaller share is left out of the search for the
+/// render in which damage to this kind (its failure mode) is worst. If the share is smaller in every render, the damage
+/// is not judged.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
-/// Minimum fraction of a kind's contribution to renders that must be lost for its failure mode to be flagged. The
-/// contribution of Gaussians that were dropped or merged is lost.
+/// Minimum lost fraction of the contribution of a kind of Gaussian to renders. The contribution of the Gaussians of
+/// this kind that were dropped or merged counts as lost. If the lost fraction is smaller, damage to this kind (its
+/// failure mode) is not flagged.
 pub const MIN_LOST_SHARE: f64 = 0.01;
 /// Side length in pixels of the square that is shown where a failure mode is worst.
 pub const CROP_SIDE_PX: u32 = 64;

@@ -5,14 +5,17 @@
 //!
 //! | | `Literal` (the paper) | `Runs` |
 //! |---|---|---|
-//! | the step into frame t counts | t alive, t not the first frame | t − 1 and t alive |
-//! | D | √(Σ‖x(t) − x(t−1)‖² / life span) | √(mean ‖x(t) − x(t−1)‖²/h²) |
-//! | the turn about frame t counts | t alive, neither the first nor the last frame alive | t − 1, t and t + 1 alive |
-//! | κ | Σ‖x(t+1) − 2x(t) + x(t−1)‖ / (life span − 2) | mean of the second divided difference |
+//! | the step into frame t counts if | t alive, t > 0 | t − 1 and t alive |
+//! | D | √(Σ‖x(t) − x(t−1)‖² / life span) | √(mean ‖v(t)‖²) |
+//! | the turn about frame t counts if | t alive, but not the first or last alive frame | t − 1, t and t + 1 alive |
+//! | κ | Σ‖x(t+1) − 2x(t) + x(t−1)‖ / (life span − 2) | mean ‖v(t+1) − v(t)‖ / (½·(h(t) + h(t+1))) |
 //!
-//! "t alive" means that the Gaussian is alive in frame t; the life span is the number of such frames. h is the time
-//! from frame t − 1 to frame t, divided by the mean of these times. The previous two positions are stored as received
-//! (f32), and all arithmetic is f64: velocities rounded to f32 would lose 1e-4 of κ.
+//! Frames are numbered from 0. "t alive" means that the Gaussian is alive (opacity ≥ alpha_min) in frame t; the life
+//! span is the number of such frames. Sums and means are over the steps or turns that count. h(t) is the time from
+//! frame t − 1 to frame t, divided by the mean of these times. v(t) = (x(t) − x(t−1)) / h(t) is the velocity.
+//!
+//! The previous two positions are stored as received (f32), and all arithmetic is f64. If velocities were rounded to
+//! f32, κ would have a relative error of 1e-4.
 
 use std::mem::size_of;
 

@@ -54,8 +54,8 @@ pub struct CoverageSums<'a> {
     pub touched: &'a mut [u32],
 }
 
-/// Settings of the sums: the fixed-point scale in which contributions are added, and the minimum opacity at which a
-/// Gaussian is alive.
+/// Settings with which [`CoverageSums`] are computed: the fixed-point scale in which contributions are added, and the
+/// minimum opacity at which a Gaussian is alive.
 #[derive(Debug, Clone, Copy)]
 pub struct CoverageScale {
     /// Exponent of the fixed-point scale: contributions are rounded to multiples of 2^−exponent px. The number of

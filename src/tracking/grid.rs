@@ -131,8 +131,9 @@ fn levels(ln_size: f32) -> RangeInclusive<i64> {
     floor(octave - 0.5)..=floor(octave + 0.5)
 }
 
-/// Returns the width (scene units) of the cells for octave `level` of sizes: the diameter of a search around the
-/// largest Gaussian of that octave, within `reach` times its size.
+/// Returns the width of the grid cells for Gaussians of octave `level`, in scene units. The octave contains the sizes
+/// from 2^level to 2^(level + 1) scene units. Cells are made for searches whose radius is `reach` times the size of a
+/// Gaussian: they are as wide as the diameter of such a search for the largest size of the octave.
 fn side(level: i64, reach: f64) -> f64 {
     2.0 * reach * ((level + 1) as f64).exp2()
 }

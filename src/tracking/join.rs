@@ -49,8 +49,8 @@ struct TrackPair {
     track: u32,
     earlier: u32,
     cost: f32,
-    /// Number of frames in which both tracks were present, less the number of later frames in which only one was; at
-    /// least 0.
+    /// Count of shared frames, see [`MAX_SHARED_FRAMES`]: each frame in which both tracks are present raises it by 1,
+    /// and each frame in which one of them is missing lowers it by 1, down to 0.
     shared_frames: u8,
     /// Whether the two tracks satisfied the rule `CLOSE` in every frame in which both were present.
     are_close: bool,

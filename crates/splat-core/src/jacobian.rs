@@ -51,8 +51,8 @@ impl Jacobian {
         Jacobian { columns: self.columns.each_ref().map(picked) }
     }
 
-    /// Concatenates the derivatives of consecutive `blocks` of Gaussians, `len` Gaussians in total. In all blocks, each
-    /// attribute must have the same number of planes.
+    /// Concatenates the derivatives of consecutive `blocks` of Gaussians, `len` Gaussians in total. The derivative of
+    /// an attribute must have the same form (identity, one factor or a matrix per Gaussian) in all blocks.
     pub fn joined(blocks: &[Jacobian], len: usize) -> Jacobian {
         let mut whole = Jacobian::default();
         for (index, to) in whole.columns.iter_mut().enumerate() {

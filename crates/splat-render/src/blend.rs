@@ -34,8 +34,8 @@ pub(super) struct SampledPixels {
     xs: TileLine,
     /// Offset of each row of the tile from its first row, in pixels of the image.
     ys: TileLine,
-    /// First and last value of `xs` (offset of a column, pixels of the image) in the left and in the right half of the
-    /// tile, which have up to eight columns each.
+    /// Offsets of the first and of the last column of each half of the tile from the first column of the tile, in
+    /// pixels of the image. The left and the right half have up to eight columns of the render each.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of columns of the tile that belong to the render.
     across: usize,
@@ -44,8 +44,8 @@ pub(super) struct SampledPixels {
 }
 
 impl SampledPixels {
-    /// Determines the pixels of the tile in column `tile[0]` and row `tile[1]` of a render of the pixels `grid`. `size`
-    /// is the number of columns and of rows of the whole grid.
+    /// Returns the pixels of one tile of a render. The render has only the pixels of the image that belong to `grid`:
+    /// `size[0]` columns and `size[1]` rows of pixels. The tile is in column `tile[0]` and row `tile[1]` of the tiles.
     pub(super) fn new(tile: [u32; 2], size: [u32; 2], grid: PixelGrid) -> Self {
         let line = |axis: usize| {
             let first = tile[axis] * TILE;
@@ -92,7 +92,8 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) weight: V,
     /// Transmittance behind the splat, never 0. Negative in pixels that have ended, where the weight is 0.
     pub(super) transmittance_after: V,
-    /// Offset along x of the pixel from the largest alpha of the splat in this row, pixels: dx − shear·dy of [`Splat`].
+    /// Offset along x of the pixel from the point of its row at which the alpha of the splat is largest, pixels: dx −
+    /// shear·dy of [`Splat`].
     pub(super) offset_x: V,
     /// Offset along y of the pixel from the center of the splat, pixels: dy of [`Splat`].
     pub(super) offset_y: V,

@@ -95,7 +95,8 @@ pub(super) struct RemovalSink<'a> {
     pub(super) behind: [TilePlane; 3],
     /// Floor of the color difference, see [`RemovalError::contrast_floor`].
     pub(super) contrast_floor: f32,
-    /// Removal error of each splat of the tile.
+    /// For each splat of the tile, the squared error that its removal would cause in the pixels of the tile: Σ w²·(‖c −
+    /// b‖² + floor²), as in [`RemovalError`].
     pub(super) pairs: &'a mut [f32],
 }
 

@@ -208,8 +208,9 @@ pub(super) fn needle_on_screen() -> CaseResult {
     })
 }
 
-/// Compares D and κ of one Gaussian with exact values, for each pair (from, unit) in `sizes`. The Gaussian moves along
-/// x from the position `from` by whole numbers of `unit`, both in scene units. Returns the largest relative error.
+/// Compares the trajectory magnitude D and the curvature κ that a scan computes for one Gaussian with their exact
+/// values, for each pair (from, unit) in `sizes`. The Gaussian starts at x = `from`. In each frame it moves along x by
+/// a whole multiple of `unit`. Both are in scene units. Returns the largest relative error of D and κ.
 fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {

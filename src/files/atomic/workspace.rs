@@ -23,8 +23,8 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Name used in place of an output's name in the names of workspaces (hidden folders) of scratch files, which have no
-/// output path.
+/// Part of the name of the workspace (hidden folder) of a scratch file. For other files this part is the name of the
+/// output, but a scratch file belongs to no output.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";

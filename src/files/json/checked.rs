@@ -140,7 +140,10 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Checks the bytes that were read but not checked yet. `is_end`: no more bytes will follow.
+    /// Checks the bytes of the buffer that were read but not checked yet: they must be UTF-8 text, and its strings,
+    /// numbers and nesting must not exceed their limits. At the first byte that is wrong, checking ends and
+    /// [`CheckedReader::refuse`] handles the error. An incomplete character at the end remains unchecked until more
+    /// bytes are read; if `is_end`, no more bytes will follow, and it is an error.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {

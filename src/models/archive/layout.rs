@@ -118,7 +118,8 @@ impl Field {
         }
     }
 
-    /// Decodes the value of the field from its bytes `stored`; `None` for fields without a plane.
+    /// Decodes the value of the field from its bytes `stored`. Returns `None` if the field holds no value of an
+    /// attribute or column, but bytes that are kept unchanged or are zero.
     pub(super) fn decode(self, stored: &[u8]) -> Option<f32> {
         let half = || Some(f16::from_le_bytes(stored.try_into().ok()?));
         match self {

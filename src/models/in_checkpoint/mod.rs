@@ -328,8 +328,9 @@ pub(super) fn write_frames<L: ProxyRule>(
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind` without fitting curves, if `kind` can store
-/// the motion of the model. Returns notes for the user, or `None` if curves have to be fitted to the motion.
+/// Writes the compressed model `reduction` of `model` to `path` as `kind` and returns notes for the user, if `kind` is
+/// a player format that can store the motion of the model as it is. Else writes nothing and returns `None`; the caller
+/// then writes the model from its states at the frames.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.

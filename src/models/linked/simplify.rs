@@ -19,8 +19,10 @@ use crate::tracking::{Joiner, Linker};
 const MIN_PSNR_DB: f64 = 40.0;
 /// Number of virtual cameras by which each sampled frame is rendered.
 const VIEWS: usize = 3;
-/// Maximum deviations of attributes that become constant. The entries are tried in this order. The first entry has the
-/// size of the differences that trainers leave between tracks of one Gaussian, the second is half as large.
+/// Maximum deviations from the mean, along a track, of attributes that become constant. Colors range from 0 to 1;
+/// `other` limits natural logs of scales, rotations in radians, and opacities. The entries are tried in this order
+/// until renders reach [`MIN_PSNR_DB`]. The first entry has the size of the differences that trainers leave between
+/// tracks of one Gaussian, the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
 /// Joins tracks that seem to be the same Gaussian. Tries the proposals of `joiner` in order and keeps the first one

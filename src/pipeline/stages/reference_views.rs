@@ -45,9 +45,9 @@ const MIN_ERROR: f64 = 1e-14;
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
 /// Number of bisection steps that find the common change of all quantization steps within [`OCTAVE_RANGE`].
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
-/// Range, in octaves (doublings), of the common change of all quantization steps at the end if the archive has a byte
-/// limit: from the coarsest to the finest steps. The change is chosen so that the archive is as large as the limit
-/// allows.
+/// Range, in octaves (doublings), in which the common change of all quantization steps is searched if the archive has a
+/// byte limit: from the coarsest to the finest steps. The search follows the balancing rounds, and finds the finest
+/// steps with which the archive fits the limit.
 pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
 /// Number of bisection steps that find the common change of all quantization steps within [`BYTES_OCTAVE_RANGE`].
 pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;

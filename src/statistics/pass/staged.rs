@@ -111,8 +111,10 @@ fn decode<'a>(
     }
 }
 
-/// Adds the frames of the decoded units of work that a lane receives to the statistics, and returns the readers to the
-/// decoding thread of the lane.
+/// Adds frames to the statistics. Body of the accumulating thread of a lane (a decoding thread and an accumulating
+/// thread). `ready` yields the units of work (a block of Gaussians at the frames of one frame block) that the decoding
+/// thread has decoded, each with its reader; the readers are returned through `done`. The results of finished blocks,
+/// and errors, are stored in `found`.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,

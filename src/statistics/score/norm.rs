@@ -32,8 +32,10 @@ pub enum PercentilePasses {
 }
 
 impl Norm {
-    /// Computes the normalization of the values that `values` iterates over, with the ε and the clipping of `recipe`.
-    /// `passes` states how the percentiles are found. NaN and infinities are ignored.
+    /// Computes the 1st and the 99th percentile of the values that `values` iterates over, and returns the
+    /// normalization by these percentiles, with the ε and the clipping of `recipe`. `passes` selects how the
+    /// percentiles are found: exactly in two passes over the values, or approximately in one. NaN and infinities are
+    /// ignored.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,

@@ -60,7 +60,8 @@ const EXP2: [f32; 6] =
 pub(super) trait Lanes: Copy {
     /// Mask: one truth value per lane.
     type Mask: Copy;
-    /// Type of eight sums, one per lane: sum k is the total of lane k over all groups that were added.
+    /// Type of the sum of several groups of eight lanes. It has eight values: value k is the sum of lane k of all
+    /// groups that were added.
     type Sums: Sums;
     /// Type of two sets of eight sums over groups: one over the groups with even index, one over those with odd index.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
