@@ -206,7 +206,7 @@ impl RenderJob<'_> {
     ) -> Result<()> {
         let progress = self.events.task(NAME, "views", pictures.len() as u64);
         for_each_view_batch(
-            [RenderedSource::all(self.source)],
+            [RenderedSource::all_gaussians(self.source)],
             self.cameras,
             pictures,
             BatchLimits::one_frame(&self.limits),

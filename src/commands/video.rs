@@ -115,8 +115,8 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
     let source =
         FilmSource { cameras: &cameras, views: &views, limits: &scene.limits, background, events: &scene.events };
     match &beside {
-        None => source.film([RenderedSource::all(scene.source())], &mut film)?,
-        Some(other) => source.film([scene.source(), other.source()].map(RenderedSource::all), &mut film)?,
+        None => source.film([RenderedSource::all_gaussians(scene.source())], &mut film)?,
+        Some(other) => source.film([scene.source(), other.source()].map(RenderedSource::all_gaussians), &mut film)?,
     }
     film.finish()?;
     staged.commit()?;

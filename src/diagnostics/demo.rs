@@ -242,7 +242,11 @@ fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()
     let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
     let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
     let progress = events.task("film", "frames", pictures.len() as u64);
-    let subjects = [RenderedSource::all(&scene), RenderedSource::all(&pruned), RenderedSource::all(&refined)];
+    let subjects = [
+        RenderedSource::all_gaussians(&scene),
+        RenderedSource::all_gaussians(&pruned),
+        RenderedSource::all_gaussians(&refined),
+    ];
     for_each_view_batch(subjects, &[camera], &pictures, BatchLimits::one_frame(limits), |views| {
         let render = |view: &ViewStates<'_, 3>| {
             let black = rig.background.unwrap_or_default();

@@ -418,7 +418,7 @@ impl ModelPair {
     /// Calls `visit` with batches of the views `pictures`, in order. A batch holds, for each of its views, the frame
     /// states of the original and of the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
-        let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
+        let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all_gaussians);
         for_each_view_batch(
             subjects,
             &self.scene.rig.cameras,

@@ -317,7 +317,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
             let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
-            let distance = track.relative_distance(frame, curve.position_at(time));
+            let distance = track.distance_in_middle_scales(frame, curve.position_at(time));
             away += share * distance;
             worst = [
                 distance / tolerance.position,

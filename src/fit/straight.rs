@@ -37,7 +37,7 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     for piece in &pieces {
         for frame in piece.frames.clone() {
             misfit.add(
-                track.relative_distance(frame, position_at(piece, track.times[frame])),
+                track.distance_in_middle_scales(frame, position_at(piece, track.times[frame])),
                 track.opacity[frame] - piece.opacity,
                 track.opacity[frame],
             );
@@ -100,7 +100,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
 fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
-        track.relative_distance(frame, position_at(piece, track.times[frame])) <= tolerance.position
+        track.distance_in_middle_scales(frame, position_at(piece, track.times[frame])) <= tolerance.position
             && track.rotation_error(frame, piece.rotation) <= tolerance.rotation
             && near(track.opacity[frame], piece.opacity, tolerance.opacity)
             && (0..3).all(|c| near(track.log_scale[frame][c], piece.log_scale[c], tolerance.log_scale))

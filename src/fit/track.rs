@@ -82,7 +82,7 @@ impl FittedTrack {
     }
 
     /// Returns the distance between `position` and the position at `frame`, in units of the middle scale at `frame`.
-    pub fn relative_distance(&self, frame: usize, position: [f64; 3]) -> f64 {
+    pub fn distance_in_middle_scales(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         apart / self.middle_scale(frame)
     }

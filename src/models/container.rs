@@ -16,7 +16,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;
-        if options.link.always_links() && container.info().times.len() > 1 {
+        if options.link.links_frames_always() && container.info().times.len() > 1 {
             let joins = options.link.joins_tracks();
             return Ok(Box::new(LinkedFrames::relink(&container, "linked gseq container", joins, &options.ply())?));
         }

@@ -442,7 +442,7 @@ pub enum LinkMode {
 
 impl LinkMode {
     /// Returns whether frames are linked even if the input already identifies each Gaussian across frames.
-    pub fn always_links(self) -> bool {
+    pub fn links_frames_always(self) -> bool {
         matches!(self, LinkMode::Always | LinkMode::Apart)
     }
 

@@ -58,7 +58,7 @@ pub(super) fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions)
     options.refuse_for(path)?;
     let order = match options.link {
         _ if frames.paths().len() == 1 => FrameOrder::Assumed,
-        link if link.always_links() => FrameOrder::Lost("as requested".to_owned()),
+        link if link.links_frames_always() => FrameOrder::Lost("as requested".to_owned()),
         LinkMode::Auto => measure_order(&frames)?,
         _ => FrameOrder::Assumed,
     };

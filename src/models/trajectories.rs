@@ -178,7 +178,7 @@ pub fn write_sequence(
             return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
         OutputKind::Sog => {
-            return Ok(vec![write_sog(&gather_all(source, 0, Attributes::all())?, path)?.note()]);
+            return Ok(vec![write_sog(&gather_all(source, 0, Attributes::all())?, path)?.error_note()]);
         }
         OutputKind::Glb => {
             write_glb(&gather_all(source, 0, Attributes::all())?, path)?;
@@ -219,5 +219,5 @@ fn write_sog_sequence(source: &dyn FrameSource, path: &Path, held: usize, events
         errors = errors.max(write_sog(&state, &path.join(format!("frame_{frame:04}.sog")))?);
         progress.advance(1);
     }
-    Ok(vec![errors.note()])
+    Ok(vec![errors.error_note()])
 }

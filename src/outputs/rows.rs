@@ -86,8 +86,8 @@ impl RowTable<'_> {
     /// Returns the columns of the table in order, each with its name.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
         let column = |statistic: Statistic| match statistic.accessors() {
-            model::StatisticAccess::F64(values, _) => (statistic.column_name(), TableColumn::F64(values(self.rows))),
-            model::StatisticAccess::U32(values, _) => (statistic.column_name(), TableColumn::U32(values(self.rows))),
+            model::StatisticArray::F64(values, _) => (statistic.column_name(), TableColumn::F64(values(self.rows))),
+            model::StatisticArray::U32(values, _) => (statistic.column_name(), TableColumn::U32(values(self.rows))),
         };
         let mut columns: Vec<_> =
             Statistic::ALL.into_iter().filter(|&statistic| statistic != Statistic::W).map(column).collect();

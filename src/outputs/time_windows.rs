@@ -69,7 +69,7 @@ pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Res
         OutputKind::Ftgs if timed.timeline == Timeline::Windows => {
             write_exact_ftgs(&timed.params, &timed.clip, path).map(|()| Vec::new())
         }
-        OutputKind::Tsog => Ok(vec![write_tsog(timed, path)?.note()]),
+        OutputKind::Tsog => Ok(vec![write_tsog(timed, path)?.error_note()]),
         _ => Err(Error::internal("time windows in a format without them")),
     }
 }

@@ -35,7 +35,7 @@ pub struct RenderedSource<'a> {
 
 impl<'a> RenderedSource<'a> {
     /// Selects all Gaussians of `source`, with all attributes.
-    pub fn all(source: &'a dyn FrameSource) -> RenderedSource<'a> {
+    pub fn all_gaussians(source: &'a dyn FrameSource) -> RenderedSource<'a> {
         RenderedSource { source, ids: None, columns: Attributes::all() }
     }
 
@@ -310,18 +310,24 @@ mod tests {
             let mut seen = Vec::new();
             let batch = BatchLimits { frames, views: max_batch, held: 4 };
             let position = RenderedSource { source: &scene, ids: None, columns: Attributes::POSITION };
-            for_each_view_batch([RenderedSource::all(&scene), position], &rig.cameras, &all, batch, |views| {
-                assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
-                let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
-                assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
-                for ViewStates { picture, camera, states: [state, places], .. } in views {
-                    assert!(**state == expected[picture.frame], "frame {}", picture.frame);
-                    assert!(places.position == state.position && places.sh.is_empty());
-                    assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
-                    seen.push(*picture);
-                }
-                Ok(())
-            })
+            for_each_view_batch(
+                [RenderedSource::all_gaussians(&scene), position],
+                &rig.cameras,
+                &all,
+                batch,
+                |views| {
+                    assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
+                    let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
+                    assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
+                    for ViewStates { picture, camera, states: [state, places], .. } in views {
+                        assert!(**state == expected[picture.frame], "frame {}", picture.frame);
+                        assert!(places.position == state.position && places.sh.is_empty());
+                        assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
+                        seen.push(*picture);
+                    }
+                    Ok(())
+                },
+            )
             .unwrap();
             assert_eq!(seen, all, "{frames} frames, {max_batch} pictures");
         }
@@ -364,23 +370,30 @@ mod tests {
         let some: Vec<u32> = (0..200).collect();
         let batch = BatchLimits { frames: 2, views: 4, held: 4 };
         let few = RenderedSource { source: &scene, ids: Some(Ids::List(&some)), columns: Attributes::all() };
-        for_each_view_batch([RenderedSource::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
-            for view in views {
-                let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
-                assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
-                for (at, color) in image.data.as_chunks::<3>().0.iter().enumerate() {
-                    let seen = DVec3::from(color.map(f64::from));
-                    assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
-                    // The camera sees this point at the center of the pixel.
-                    let point = camera.rotation * seen + camera.translation;
-                    let found = [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
-                    let pixel = [at % camera.width as usize, at / camera.width as usize];
-                    assert!((0..2).all(|c| (found[c] - pixel[c] as f64 - 0.5).abs() < 0.02), "{found:?} {pixel:?}");
+        for_each_view_batch(
+            [RenderedSource::all_gaussians(&scene), few],
+            &rig.cameras,
+            &pictures(&[0, 2], 2),
+            batch,
+            |views| {
+                for view in views {
+                    let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
+                    assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
+                    for (at, color) in image.data.as_chunks::<3>().0.iter().enumerate() {
+                        let seen = DVec3::from(color.map(f64::from));
+                        assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
+                        // The camera sees this point at the center of the pixel.
+                        let point = camera.rotation * seen + camera.translation;
+                        let found =
+                            [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
+                        let pixel = [at % camera.width as usize, at / camera.width as usize];
+                        assert!((0..2).all(|c| (found[c] - pixel[c] as f64 - 0.5).abs() < 0.02), "{found:?} {pixel:?}");
+                    }
+                    assert_eq!(view.render(1, [1.0; 3]), render(view.states[1], camera, [1.0; 3]));
                 }
-                assert_eq!(view.render(1, [1.0; 3]), render(view.states[1], camera, [1.0; 3]));
-            }
-            Ok(())
-        })
+                Ok(())
+            },
+        )
         .unwrap();
     }
 
@@ -397,7 +410,7 @@ mod tests {
             let before = container.reads();
             let batch = BatchLimits { frames: 1, views: 2, held: usize::MAX };
             for_each_view_batch(
-                [RenderedSource::all(&container)],
+                [RenderedSource::all_gaussians(&container)],
                 &rig.cameras,
                 &pictures(&[1, 4], views),
                 batch,

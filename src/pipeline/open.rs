@@ -303,7 +303,7 @@ impl<'a> Measuring<'a> {
     /// Returns a description of the assumption about the times of the stream that proved wrong, if any. `complete` is
     /// the plan of the scan made from the times of all frames.
     fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
-        if !complete.can_finish(self.plan) {
+        if !complete.fits_scan_begun_with(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }
         (self.schedule != scene.schedule).then_some("the cameras' times are not exactly those of the frames")

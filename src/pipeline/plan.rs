@@ -149,8 +149,10 @@ impl RunPlan {
         let refine = RefineStage::from_recipe(recipe, planning.target_fraction(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
-            MemoryFallback::ConstantInTime { .. } => Some(refine.with_constant_deltas()),
-            MemoryFallback::WithoutHarmonics { .. } => Some(refine.with_constant_deltas().with_fixed_higher_sh()),
+            MemoryFallback::ConstantInTime { .. } => Some(refine.with_time_independent_deltas()),
+            MemoryFallback::WithoutHarmonics { .. } => {
+                Some(refine.with_time_independent_deltas().with_fixed_higher_sh())
+            }
             MemoryFallback::WithoutRefinement { .. } => None,
         });
         // For the same number of Gaussians, refinement keeps more quality than merging. Prune steps of refinement rank

@@ -67,7 +67,7 @@ impl<'a> QualityMeter<'a> {
         let pictures: Vec<FrameView> = places.iter().map(|&k| self.pictures[k].0).collect();
         let mut found = Vec::with_capacity(pictures.len());
         for_each_view_batch(
-            [RenderedSource::all(source)],
+            [RenderedSource::all_gaussians(source)],
             self.cameras,
             &pictures,
             BatchLimits::one_frame(&self.scene.limits),

@@ -39,7 +39,7 @@ pub fn render_poster(
     let picture = FrameView { frame, view: shot.view, camera: 0 };
     let mut uri = None;
     for_each_view_batch(
-        [RenderedSource::all(source)],
+        [RenderedSource::all_gaussians(source)],
         &[camera],
         &[picture],
         BatchLimits::one_frame(limits),

@@ -121,7 +121,7 @@ impl RefineStage {
 
     /// Returns a copy of this stage whose parameter deltas (values that refinement adds to the stored parameters) do
     /// not vary with time.
-    pub fn with_constant_deltas(self) -> RefineStage {
+    pub fn with_time_independent_deltas(self) -> RefineStage {
         RefineStage { knots: 0, ..self }
     }
 
@@ -130,7 +130,7 @@ impl RefineStage {
     pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
         RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
-            .with_constant_deltas()
+            .with_time_independent_deltas()
     }
 
     /// Returns the cache key of these parameters. The input is not part of it.

@@ -92,7 +92,7 @@ impl Targets {
         let (cameras, pictures) = choose_views(scene, max_views);
         let mut targets = Targets { cameras, pictures, stride, has_test_views, values: Vec::new() };
         let make = |some: Range<usize>, values: &mut SpillWriter| {
-            let subject = [RenderedSource::all(scene.source())];
+            let subject = [RenderedSource::all_gaussians(scene.source())];
             let mut next = some.start;
             for_each_view_batch(
                 subject,

@@ -332,7 +332,7 @@ pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -
 
 /// Returns the square part of `image` whose upper left pixel is (`left`, `top`). Its side is [`CROP_SIDE_PX`] pixels,
 /// or less at the border of the image.
-pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
+pub fn crop_square(image: &Image, (left, top): (u32, u32)) -> Image {
     let (width, height) = (CROP_SIDE_PX.min(image.width - left), CROP_SIDE_PX.min(image.height - top));
     let row = |y: u32| {
         let start = 3 * (y as usize * image.width as usize + left as usize);
@@ -341,9 +341,9 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     Image { width, height, data: (top..top + height).flat_map(row).copied().collect() }
 }
 
-/// Returns the PSNR in dB, compressed against original, in the square that [`crop`] cuts out at `corner`.
+/// Returns the PSNR in dB, compressed against original, in the square that [`crop_square`] cuts out at `corner`.
 pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
-    psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
+    psnr(&crop_square(&taken.compressed, corner), &crop_square(&taken.original, corner))
 }
 
 #[cfg(test)]

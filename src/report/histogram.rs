@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::run::Fate;
 use crate::files::csv::table;
-use crate::model::{Statistic, StatisticAccess, StatisticRows};
+use crate::model::{Statistic, StatisticArray, StatisticRows};
 use crate::statistics::score::{ScoredQuantity, Scores};
 
 /// Maximum number of bins of a histogram.
@@ -72,8 +72,8 @@ pub fn histograms(rows: &StatisticRows, scores: &Scores, frames: usize, fates: &
     let part = |&count: &u32| f64::from(count) / frames.max(1) as f64;
     let statistic = |of: Statistic| {
         let (values, most) = match of.accessors() {
-            StatisticAccess::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
-            StatisticAccess::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
+            StatisticArray::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
+            StatisticArray::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
         };
         (of.name(), of.meaning(), values, most)
     };

@@ -317,7 +317,7 @@ fn show_again(
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
             let shares = failure::render_kind_shares(state, traits, camera);
             let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
-            let part = |image| shown_images::data_uri(&failure::crop(image, corner));
+            let part = |image| shown_images::data_uri(&failure::crop_square(image, corner));
             let images = [part(&taken.original)?, part(&taken.compressed)?];
             close.push(WorstPlaceImages { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
         }

@@ -71,7 +71,7 @@ fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Rec
 /// Returns whether Gaussians of successive frames are linked into tracks: if the frames share no Gaussian ids, or if
 /// the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
-    header.is_unlinked || options.link.always_links()
+    header.is_unlinked || options.link.links_frames_always()
 }
 
 /// Receives a stream of frames and links their Gaussians into tracks. Only for streams for which [`is_linked`] returns

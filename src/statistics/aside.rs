@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{AnomalyFlags, Statistic, StatisticAccess, StatisticRows};
+use crate::model::{AnomalyFlags, Statistic, StatisticArray, StatisticRows};
 
 /// Statistics of N Gaussians, one row per Gaussian, in memory or in a temporary file.
 pub(crate) enum StatisticsRows {
@@ -52,8 +52,8 @@ impl StatisticsRows {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {
             match statistic.accessors() {
-                StatisticAccess::F64(values, _) => bytemuck::cast_slice(values(&rows)),
-                StatisticAccess::U32(values, _) => bytemuck::cast_slice(values(&rows)),
+                StatisticArray::F64(values, _) => bytemuck::cast_slice(values(&rows)),
+                StatisticArray::U32(values, _) => bytemuck::cast_slice(values(&rows)),
             }
         };
         let columns: Vec<_> = Statistic::ALL.into_iter().filter(|statistic| !bytes(statistic).is_empty()).collect();
@@ -96,8 +96,8 @@ impl SpilledRows {
         let mut rows = StatisticRows::default();
         for &column in &self.columns {
             match column.accessors() {
-                StatisticAccess::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
-                StatisticAccess::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
+                StatisticArray::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
+                StatisticArray::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
             }
         }
         let flags: Vec<u8> = self.values(&self.columns)?;

@@ -170,7 +170,7 @@ impl<'a> RunningScan<'a> {
     /// Returns the result after the last frame. `plan` is the plan for the complete sequence.
     ///
     /// # Panics
-    /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::can_finish`]).
+    /// Panics if `plan` does not belong to the frames that were added ([`ScanPlan::fits_scan_begun_with`]).
     pub fn finish(self, plan: &ScanPlan) -> ScanResult {
         let blocks = self.blocks.into_iter().map(|block| {
             let found = block.finish_with_plan(plan);

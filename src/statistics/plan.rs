@@ -88,7 +88,7 @@ impl ScanPlan {
 
     /// Creates the plan with which the scan of a stream begins, before its frames have arrived. This plan assumes that
     /// the frames are evenly spaced. If they are, the scan can be finished with the plan that [`ScanPlan::new`] creates
-    /// for the complete sequence (see [`ScanPlan::can_finish`]).
+    /// for the complete sequence (see [`ScanPlan::fits_scan_begun_with`]).
     pub fn for_arriving_frames(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
@@ -103,7 +103,7 @@ impl ScanPlan {
 
     /// Returns whether this plan, made for all frames, can finish a scan that began with the plan `arriving`: whether
     /// the plans differ at most in the numbers of frames and of (frame, view) pairs.
-    pub fn can_finish(&self, arriving: &ScanPlan) -> bool {
+    pub fn fits_scan_begun_with(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pair_count: arriving.pair_count, ..self.clone() }
     }
 
@@ -201,13 +201,13 @@ mod tests {
     fn only_even_frames_finish_a_scan_begun_early() {
         let scan = Recipe::preset("default").unwrap().scan;
         let arriving = ScanPlan::for_arriving_frames(&scan, &[]);
-        assert!(plan(&[0.0, 1.0, 2.0]).unwrap().can_finish(&arriving));
-        assert!(plan(&[]).unwrap().can_finish(&arriving));
-        assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().can_finish(&arriving));
+        assert!(plan(&[0.0, 1.0, 2.0]).unwrap().fits_scan_begun_with(&arriving));
+        assert!(plan(&[]).unwrap().fits_scan_begun_with(&arriving));
+        assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().fits_scan_begun_with(&arriving));
         assert!(
             !plan(&[0.0])
                 .unwrap()
-                .can_finish(&ScanPlan::for_arriving_frames(&ScanParams { alpha_min: 0.5, ..scan }, &[]))
+                .fits_scan_begun_with(&ScanPlan::for_arriving_frames(&ScanParams { alpha_min: 0.5, ..scan }, &[]))
         );
     }
 }

@@ -204,7 +204,10 @@ impl<'a> BlockScan<'a> {
         self.life.count_repeats();
         self.motion.count_steady_frames();
         assert_eq!(self.next_frame, plan.frames, "every frame is scanned");
-        assert!(std::ptr::eq(plan, self.plan) || plan.can_finish(self.plan), "the plan is that of another scan");
+        assert!(
+            std::ptr::eq(plan, self.plan) || plan.fits_scan_begun_with(self.plan),
+            "the plan is that of another scan"
+        );
         let pairs = f64::from(plan.pair_count.max(1));
         let resolution = plan.coverage_resolution_px();
         let sum = |(&coverage, &carried): (&u64, &u32)| (u128::from(carried) << CARRY_BITS) + u128::from(coverage);

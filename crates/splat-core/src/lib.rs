@@ -17,7 +17,7 @@
 mod camera;
 mod covariance;
 pub mod error;
-pub mod functions;
+pub mod exp_log;
 mod gaussians;
 mod gradients;
 mod hash;
@@ -40,7 +40,7 @@ pub use ranges::format_ranges;
 pub use raw::StoredParams;
 pub use rig::{Rig, Shot, Split};
 pub use robust_box::RobustBox;
-pub use rows::{AnomalyFlags, Statistic, StatisticAccess, StatisticRows};
+pub use rows::{AnomalyFlags, Statistic, StatisticArray, StatisticRows};
 pub use schedule::{FrameView, ViewSchedule};
 
 /// Value of the spherical-harmonic (SH) basis function of degree 0. A color is 0.5 + SH_C0 · f_dc, where f_dc is its

@@ -49,7 +49,7 @@ pub enum Statistic {
 /// Functions that return the array of a statistic from [`StatisticRows`], the first for reading and the second for
 /// writing.
 #[derive(Debug, Clone, Copy)]
-pub enum StatisticAccess {
+pub enum StatisticArray {
     /// Statistic whose values are real numbers.
     F64(fn(&StatisticRows) -> &Vec<f64>, fn(&mut StatisticRows) -> &mut Vec<f64>),
     /// Statistic whose values are numbers of frames.
@@ -62,7 +62,7 @@ struct Declaration {
     column: &'static str,
     meaning: &'static str,
     property: &'static str,
-    values: StatisticAccess,
+    values: StatisticArray,
 }
 
 impl Statistic {
@@ -71,7 +71,7 @@ impl Statistic {
 
     /// Returns the declaration of this statistic. A new statistic is described here and nowhere else.
     const fn declaration(self) -> Declaration {
-        use StatisticAccess::{F64, U32};
+        use StatisticArray::{F64, U32};
         match self {
             Statistic::D => Declaration {
                 name: "D",
@@ -154,15 +154,15 @@ impl Statistic {
     }
 
     /// Returns the functions that access the values of the statistic in [`StatisticRows`].
-    pub const fn accessors(self) -> StatisticAccess {
+    pub const fn accessors(self) -> StatisticArray {
         self.declaration().values
     }
 
     /// Returns the bytes that one value of the statistic takes.
     pub const fn bytes(self) -> usize {
         match self.accessors() {
-            StatisticAccess::F64(..) => size_of::<f64>(),
-            StatisticAccess::U32(..) => size_of::<u32>(),
+            StatisticArray::F64(..) => size_of::<f64>(),
+            StatisticArray::U32(..) => size_of::<u32>(),
         }
     }
 }
@@ -219,8 +219,8 @@ impl StatisticRows {
     pub fn append(&mut self, next: &mut StatisticRows) {
         for statistic in Statistic::ALL {
             match statistic.accessors() {
-                StatisticAccess::F64(_, values) => values(self).append(values(next)),
-                StatisticAccess::U32(_, values) => values(self).append(values(next)),
+                StatisticArray::F64(_, values) => values(self).append(values(next)),
+                StatisticArray::U32(_, values) => values(self).append(values(next)),
             }
         }
         self.flags.append(&mut next.flags);
@@ -230,8 +230,8 @@ impl StatisticRows {
     pub fn clear(&mut self, i: usize) {
         for statistic in Statistic::ALL {
             match statistic.accessors() {
-                StatisticAccess::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
-                StatisticAccess::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
+                StatisticArray::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
+                StatisticArray::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
             }
         }
     }
@@ -255,8 +255,8 @@ mod tests {
         let mut rows = StatisticRows::default();
         for (k, statistic) in Statistic::ALL.into_iter().enumerate() {
             match statistic.accessors() {
-                StatisticAccess::F64(_, values) => values(&mut rows).push(k as f64),
-                StatisticAccess::U32(_, values) => values(&mut rows).push(k as u32),
+                StatisticArray::F64(_, values) => values(&mut rows).push(k as f64),
+                StatisticArray::U32(_, values) => values(&mut rows).push(k as u32),
             }
         }
         let mut all = StatisticRows::default();

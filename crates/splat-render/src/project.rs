@@ -13,7 +13,7 @@ use super::color::{self, Colors};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use super::grid::{PixelGrid, SampledView};
 use splat_core::Gaussians;
-use splat_core::functions::exp;
+use splat_core::exp_log::exp;
 
 /// Dilation: variance in pixels² that is added to the diagonal of every 2-D covariance, as in the original rasterizer.
 const DILATION: f64 = 0.3;

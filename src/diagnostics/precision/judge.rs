@@ -44,7 +44,7 @@ impl Judge {
         let count = all.len().min(PICTURES);
         let pictures: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
-        render_views(scene, RenderedSource::all(scene.source()), &pictures, |image| originals.push(image))?;
+        render_views(scene, RenderedSource::all_gaussians(scene.source()), &pictures, |image| originals.push(image))?;
         Ok(Judge { pictures, originals })
     }
 

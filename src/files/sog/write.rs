@@ -45,7 +45,7 @@ impl SogErrors {
     }
 
     /// Returns a note for the user about the errors.
-    pub fn note(&self) -> String {
+    pub fn error_note(&self) -> String {
         let sh = self.sh.map_or_else(String::new, |sh| format!("; RMS error of SH coefficients: {sh:.1e}"));
         format!("maximum position error: {:.2e} scene units{sh}", self.position)
     }

@@ -4,7 +4,7 @@
 //! logit ln α − ln(1 − α) equals e − ln(exp(−o) + 1 − m), which is computed in f64 without loss of precision for α near
 //! 0 or 1.
 
-use crate::model::functions::{exp_m1, ln};
+use crate::model::exp_log::{exp_m1, ln};
 
 /// Maximum absolute value of an opacity logit. Larger ones do not change the opacity noticeably.
 pub(in crate::models) const MAX_LOGIT: f64 = 40.0;

@@ -19,7 +19,7 @@ use super::deform_folder::{
 };
 use crate::deform::{EncodedPositions, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
-use crate::model::functions::{exp, ln};
+use crate::model::exp_log::{exp, ln};
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, logit, opacity};
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};

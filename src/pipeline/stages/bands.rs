@@ -171,7 +171,7 @@ fn quality_without_degrees(
 ) -> Result<[f64; 2]> {
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(result)];
+    let subjects = [RenderedSource::all_gaussians(scene.source()), RenderedSource::all_gaussians(result)];
     for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
         for view in views {
             let picture = |state: &Gaussians| render(state, view.camera, scene.background);

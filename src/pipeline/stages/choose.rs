@@ -151,7 +151,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     let mut sums = [0.0; 2];
     let pictures_together = VIEWS_PER_BATCH.min(scene.limits.views_together);
     let batch = BatchLimits { views: pictures_together, ..BatchLimits::one_frame(&scene.limits) };
-    let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(&*result)];
+    let subjects = [RenderedSource::all_gaussians(scene.source()), RenderedSource::all_gaussians(&*result)];
     for_each_view_batch(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();

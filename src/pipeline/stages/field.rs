@@ -143,7 +143,7 @@ pub(crate) fn least(result: f64, margin: f64) -> f64 {
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
     let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sum = 0.0;
-    let subjects = [RenderedSource::all(a), RenderedSource::all(b)];
+    let subjects = [RenderedSource::all_gaussians(a), RenderedSource::all_gaussians(b)];
     for_each_view_batch(subjects, &scene.schedule.cameras, pictures, BatchLimits::one_frame(&scene.limits), |views| {
         for view in views {
             let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));

@@ -180,7 +180,7 @@ const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
 fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<(f64, f64)> {
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
-    let subjects = [scene.source(), result].map(RenderedSource::all);
+    let subjects = [scene.source(), result].map(RenderedSource::all_gaussians);
     for_each_view_batch(subjects, &scene.rig.cameras, views, BatchLimits::one_frame(&scene.limits), |batch| {
         let score = |view: &ViewStates<'_, 2>| {
             let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
@@ -202,7 +202,7 @@ pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[Fra
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
     let views = spread_views(views.to_vec(), TIMED_VIEWS);
     let mut times = [Vec::new(), Vec::new()];
-    let subjects = [scene.source(), result].map(RenderedSource::all);
+    let subjects = [scene.source(), result].map(RenderedSource::all_gaussians);
     for_each_view_batch(subjects, &scene.rig.cameras, &views, BatchLimits::one_frame(&scene.limits), |batch| {
         for view in batch {
             for (subject, times) in times.iter_mut().enumerate() {

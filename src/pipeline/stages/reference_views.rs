@@ -141,7 +141,7 @@ impl ReferenceViews<'_> {
         let mut rendered = Vec::with_capacity(self.pictures.len());
         let batch = BatchLimits::one_frame(&self.scene.limits);
         for_each_view_batch(
-            [RenderedSource::all(source)],
+            [RenderedSource::all_gaussians(source)],
             &self.scene.schedule.cameras,
             &self.pictures,
             batch,

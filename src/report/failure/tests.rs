@@ -186,9 +186,9 @@ fn the_worst_square_is_where_the_kinds_error_is() {
     mark(99, 89, 0.2, 1.0);
     let (left, top) = worst_corner(&taken, &shares, GaussianKind::Thin);
     assert_eq!((left, top), (36, 26), "the first square that holds the last pixel");
-    let part = crop(&taken.compressed, (left, top));
+    let part = crop_square(&taken.compressed, (left, top));
     assert_eq!((part.width, part.height), (CROP_SIDE_PX, CROP_SIDE_PX));
     assert!((part.data[3 * (63 * 64 + 63)] - 0.7).abs() < 1e-6);
     let small = Image { width: 5, height: 4, data: vec![0.0; 60] };
-    assert_eq!((crop(&small, (0, 0)).width, crop(&small, (0, 0)).height), (5, 4));
+    assert_eq!((crop_square(&small, (0, 0)).width, crop_square(&small, (0, 0)).height), (5, 4));
 }
