@@ -3,27 +3,11 @@
 use std::fs;
 
 use crate::scene::{PlyRows, Workplace, index_map};
+use crate::stills::scattered;
 use serde_json::Value;
-use splatsieve::model::Gaussians;
 
 /// Number of Gaussians of the test files. One Gaussian is half a percent.
 const COUNT: usize = 200;
-
-/// Returns Gaussians without any symmetry, of SH degree 1.
-fn cloud() -> Gaussians {
-    let mut made = Gaussians::zeros(COUNT, 1);
-    let fill = |values: &mut [f32], middle: f32, width: f32| {
-        values.iter_mut().enumerate().for_each(|(k, x)| *x = middle + width * ((k as f32 * 0.618_034).fract() - 0.5));
-    };
-    fill(made.position.plane_mut(0), 5.0, 2.0);
-    fill(made.position.plane_mut(1), -1.0, 4.0);
-    fill(made.position.plane_mut(2), 0.5, 1.0);
-    fill(made.rotation.planes_mut(), 0.1, 1.0);
-    fill(made.log_scale.planes_mut(), -3.0, 1.0);
-    fill(made.opacity_logit.planes_mut(), 1.0, 3.0);
-    fill(made.sh.planes_mut(), 0.1, 1.0);
-    made
-}
 
 /// Returns the notes that `info --json` prints about `input`.
 fn info_notes(workplace: &Workplace, input: &str) -> String {
@@ -38,7 +22,7 @@ fn assert_said(text: &str, parts: &[&str]) {
 #[test]
 fn one_percent_of_nonfinite_rows_is_left_out_and_reported() {
     let workplace = Workplace::new();
-    let mut odd = cloud();
+    let mut odd = scattered(COUNT);
     odd.position.plane_mut(1)[7] = f32::NAN;
     odd.sh.plane_mut(4)[9] = f32::INFINITY;
     workplace.ply("odd.ply", &odd);
@@ -59,7 +43,7 @@ fn one_percent_of_nonfinite_rows_is_left_out_and_reported() {
 #[test]
 fn more_nonfinite_rows_are_refused_with_the_way_out() {
     let workplace = Workplace::new();
-    let mut odd = cloud();
+    let mut odd = scattered(COUNT);
     (20..23).for_each(|row| odd.log_scale.plane_mut(2)[row] = f32::NAN);
     workplace.ply("odd.ply", &odd);
     let parts = ["odd.ply", "Gaussian 20, 21, 22", "3 of 200", "at most 1%", "--set non_finite=drop"];
@@ -71,7 +55,7 @@ fn more_nonfinite_rows_are_refused_with_the_way_out() {
 #[test]
 fn zero_quaternions_are_the_identity_and_counted() {
     let workplace = Workplace::new();
-    let mut odd = cloud();
+    let mut odd = scattered(COUNT);
     [3, 50].iter().for_each(|&row| odd.rotation.set_row(row, [0.0; 4]));
     workplace.ply("odd.ply", &odd);
     [3, 50].iter().for_each(|&row| odd.rotation.set_row(row, [1.0, 0.0, 0.0, 0.0]));
@@ -89,7 +73,7 @@ fn zero_quaternions_are_the_identity_and_counted() {
 fn infinite_opacity_logits_are_clamped_and_counted() {
     let workplace = Workplace::new();
     let write = |name: &str, logit: f32| {
-        let mut odd = cloud();
+        let mut odd = scattered(COUNT);
         (odd.opacity_logit.plane_mut(0)[4], odd.opacity_logit.plane_mut(0)[5]) = (logit, -logit);
         workplace.ply(name, &odd);
     };
@@ -111,7 +95,7 @@ fn infinite_opacity_logits_are_clamped_and_counted() {
 fn defects_of_every_frame_of_a_sequence_are_counted() {
     let workplace = Workplace::new();
     for frame in 0..3 {
-        let mut odd = cloud();
+        let mut odd = scattered(COUNT);
         odd.position.plane_mut(2).iter_mut().for_each(|z| *z += 0.01 * frame as f32);
         odd.rotation.set_row(10 + frame, [0.0; 4]);
         odd.opacity_logit.plane_mut(0)[20 + frame] = f32::INFINITY;
@@ -137,7 +121,7 @@ fn defects_of_every_frame_of_a_sequence_are_counted() {
 #[test]
 fn sh_coefficients_of_degree_4_are_left_out_and_reported() {
     let workplace = Workplace::new();
-    let path = workplace.ply("plain.ply", &cloud());
+    let path = workplace.ply("plain.ply", &scattered(COUNT));
     let plain = PlyRows::read(&path);
     let mut header = format!("ply\nformat ascii 1.0\nelement vertex {COUNT}\n");
     let names: Vec<&String> = plain.names.iter().filter(|name| !name.starts_with("f_rest_")).collect();
@@ -168,7 +152,7 @@ fn sh_coefficients_of_degree_4_are_left_out_and_reported() {
 #[test]
 fn elements_with_lists_after_the_gaussians_are_left_out() {
     let workplace = Workplace::new();
-    let path = workplace.ply("plain.ply", &cloud());
+    let path = workplace.ply("plain.ply", &scattered(COUNT));
     let plain = fs::read(&path).unwrap();
     let end = plain.windows(11).position(|part| part == b"end_header\n").unwrap();
     let list = b"element face 1\nproperty list uchar int vertex_indices\n";

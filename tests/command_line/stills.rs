@@ -8,9 +8,9 @@ use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models::{OpenOptions, open};
 use splatsieve::passes::gather_all;
 
-/// Writes a PLY of 40 Gaussians without any symmetry.
-fn write_ply(workplace: &Workplace, name: &str) -> Gaussians {
-    let mut made = Gaussians::zeros(40, 1);
+/// Returns `count` Gaussians without any symmetry, of SH degree 1.
+pub(crate) fn scattered(count: usize) -> Gaussians {
+    let mut made = Gaussians::zeros(count, 1);
     let fill = |values: &mut [f32], middle: f32, width: f32| {
         values.iter_mut().enumerate().for_each(|(k, x)| *x = middle + width * ((k as f32 * 0.618_034).fract() - 0.5));
     };
@@ -21,6 +21,12 @@ fn write_ply(workplace: &Workplace, name: &str) -> Gaussians {
     fill(made.log_scale.planes_mut(), -3.0, 1.0);
     fill(made.opacity_logit.planes_mut(), 1.0, 3.0);
     fill(made.sh.planes_mut(), 0.1, 1.0);
+    made
+}
+
+/// Writes a PLY of 40 Gaussians without any symmetry. Returns them.
+fn write_ply(workplace: &Workplace, name: &str) -> Gaussians {
+    let made = scattered(40);
     workplace.ply(name, &made);
     made
 }
