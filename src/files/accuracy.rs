@@ -108,6 +108,9 @@ pub struct CodingErrors {
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
+    /// Number of Gaussians with a scale that the file stores smaller by more than the bound, because it is much larger
+    /// than the scene either way.
+    reduced_scales: usize,
     /// Error that exceeds its allowed maximum by the largest factor; `None` if no error exceeds its maximum.
     worst: Option<Excess>,
 }
@@ -121,12 +124,18 @@ impl CodingErrors {
         let middle = [0, 1, 2].map(|k| median(axis(k).collect()));
         let distances: Vec<f64> = (0..count).map(|i| distance(positions.row::<3>(i).map(f64::from), middle)).collect();
         let furthest = (0..count).max_by(|&a, &b| distances[a].total_cmp(&distances[b])).unwrap_or(0);
-        CodingErrors { middle, scene: median(distances), furthest, position: 0.0, worst: None }
+        CodingErrors { middle, scene: median(distances), furthest, position: 0.0, reduced_scales: 0, worst: None }
     }
 
     /// Returns the largest position error among the Gaussians added so far, in scene units.
     pub fn position_error(&self) -> f64 {
         self.position
+    }
+
+    /// Returns the number of Gaussians added so far with a scale that is stored smaller by more than the bound of other
+    /// scales, because it is much larger than the scene either way.
+    pub fn reduced_scales(&self) -> usize {
+        self.reduced_scales
     }
 
     /// Compares the original attributes `wanted` of Gaussian `id` with its stored ones `found` and records the errors.
@@ -150,14 +159,18 @@ impl CodingErrors {
             scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.middle_scale()),
         );
         let flat = FLAT_SCALE * (self.scene + distance(wanted.position, self.middle));
+        let mut is_reduced = false;
         for (before, after) in wanted.scale.into_iter().zip(found.scale) {
+            let (error, bound) = ((before - after).abs(), scene_bound.max(MAX_RELATIVE_SCALE_ERROR * before));
             // False for NaN.
             let is_flat = self.scene > 0.0 && flat <= after && after <= before;
-            if !is_flat {
-                let error = (before - after).abs();
-                self.check_error(id, "scale", error, scene_bound.max(MAX_RELATIVE_SCALE_ERROR * before));
+            if is_flat {
+                is_reduced |= error > bound;
+            } else {
+                self.check_error(id, "scale", error, bound);
             }
         }
+        self.reduced_scales += usize::from(is_reduced);
         self.check_error(id, "opacity", (wanted.opacity - found.opacity).abs(), MAX_COLOR_ERROR);
         self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
@@ -250,7 +263,9 @@ mod tests {
         // Median position 4, scene size 2: the far side of the scene is 4 from the Gaussian at 2.
         let mut found = accuracy();
         found.add(1, &drawn(2.0, 500.0), &drawn(2.0, 40.1));
+        found.add(2, &drawn(2.0, 500.0), &drawn(2.0, 499.0));
         found.check("a file").unwrap();
+        assert_eq!(found.reduced_scales(), 1);
         for (wanted, stored) in [(500.0, 39.9), (39.9, 500.0), (500.0, f64::NAN)] {
             let mut found = accuracy();
             found.add(1, &drawn(2.0, wanted), &drawn(2.0, stored));

@@ -51,20 +51,44 @@ pub enum SpzVersion {
     V4,
 }
 
-/// Writes the Gaussians `state` to an `.spz` file of the version `version` at `path`. Returns the largest error of a
-/// position in the file, in scene units.
+/// Errors of the values that an `.spz` file stores.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SpzErrors {
+    /// Largest error of a position, in scene units.
+    pub position: f64,
+    /// Number of Gaussians with a scale above the largest one of the format that are stored with that one.
+    pub reduced_scales: usize,
+}
+
+impl SpzErrors {
+    /// Returns notes for the user about the errors.
+    pub fn notes(&self) -> Vec<String> {
+        let mut notes = vec![format!("maximum position error: {:.2e} scene units", self.position)];
+        if self.reduced_scales > 0 {
+            notes.push(format!(
+                "Gaussians much larger than the scene: {}; stored with the largest scale of a .spz, {:.0} scene units",
+                self.reduced_scales,
+                scale_of_byte(u8::MAX)
+            ));
+        }
+        notes
+    }
+}
+
+/// Writes the Gaussians `state` to an `.spz` file of the version `version` at `path`. Returns the errors of the stored
+/// values.
 ///
 /// # Errors
 /// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
 /// if there are more Gaussians than the format can count, or if writing fails.
-pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<f64> {
+pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<SpzErrors> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     check_positions(state, path, "a .spz")?;
     let count = u32::try_from(state.len())
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
     let bits = (MAX_FIXED / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MAX_FRACTION_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
-    let position_error = check_accuracy(state, unit)?;
+    let errors = check_accuracy(state, unit)?;
     let file = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
     let head = |version: u32, streams: usize| {
         let words: Vec<u8> = [MAGIC, version, count].into_iter().flat_map(u32::to_le_bytes).collect();
@@ -75,7 +99,7 @@ pub fn write_spz(state: &Gaussians, version: SpzVersion, path: &Path) -> Result<
         SpzVersion::V4 => write_streams(&head, state, unit, file),
     };
     write().map_err(Error::io("write", path))?;
-    Ok(position_error)
+    Ok(errors)
 }
 
 /// Writes an `.spz` file of version 3: the header `head` and the arrays of the Gaussians `state`, compressed together
@@ -152,19 +176,23 @@ const ARRAYS: [WriteArray; 6] = [
     },
 ];
 
-/// Measures the coding errors of an `.spz` file of `state` whose positions are stored in units of `unit`. Returns the
-/// largest error of a position in scene units.
+/// Returns the scale, in scene units, that `byte` stands for.
+fn scale_of_byte(byte: u8) -> f64 {
+    (f64::from(byte) / 16.0 - 10.0).exp()
+}
+
+/// Returns the coding errors of an `.spz` file of `state` whose positions are stored in units of `unit`.
 ///
 /// # Errors
 /// Fails if an error exceeds its bound in [`accuracy`](super::accuracy).
-fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
+fn check_accuracy(state: &Gaussians, unit: f64) -> Result<SpzErrors> {
     let mut accuracy = CodingErrors::new(&state.position);
     for row in 0..state.len() {
         let wanted = RenderedAttributes::from_state(state, row);
         let color = |dc: f32| color_from_sh(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
         let found = RenderedAttributes {
             position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),
-            scale: state.log_scale.row::<3>(row).map(|scale| (f64::from(scale_byte(scale)) / 16.0 - 10.0).exp()),
+            scale: state.log_scale.row::<3>(row).map(|scale| scale_of_byte(scale_byte(scale))),
             opacity: f64::from(opacity_byte(state.opacity_logit.row::<1>(row)[0])) / 255.0,
             color: state.sh.row::<3>(row).map(color),
         };
@@ -179,7 +207,7 @@ fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
         }
     }
     accuracy.check("a .spz")?;
-    Ok(accuracy.position_error())
+    Ok(SpzErrors { position: accuracy.position_error(), reduced_scales: accuracy.reduced_scales() })
 }
 
 /// Returns the coordinate `value` in units of `unit`, as an integer that fits into 24 bits with its sign. Rounds to the
@@ -293,7 +321,7 @@ mod tests {
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");
-        let position_error = write_spz(&state, SpzVersion::V3, &path).unwrap();
+        let position_error = write_spz(&state, SpzVersion::V3, &path).unwrap().position;
         for (row, (place, visible, color, scales, q, sh)) in read(&path).into_iter().enumerate() {
             let near = |found: &[f64], expected: &[f64], within: f64, what: &str| {
                 for (a, b) in found.iter().zip(expected) {

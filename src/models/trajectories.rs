@@ -174,8 +174,7 @@ pub fn write_sequence(
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz | OutputKind::Spz4 => {
             let version = if kind == OutputKind::Spz { SpzVersion::V3 } else { SpzVersion::V4 };
-            let off = write_spz(&gather_all(source, 0, Attributes::all())?, version, path)?;
-            return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
+            return Ok(write_spz(&gather_all(source, 0, Attributes::all())?, version, path)?.notes());
         }
         OutputKind::Sog => {
             return Ok(vec![write_sog(&gather_all(source, 0, Attributes::all())?, path)?.error_note()]);

@@ -262,7 +262,7 @@ fn old_checkpoint_is_refused_with_a_remedy() {
     let old = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.".to_vec();
     let model = model_with_network(&folder, Entry::stored("a/data.pkl", once(b"N.")));
     folder.write("model/point_cloud/iteration_7/deformation.pth", &old);
-    info(&folder, model).refused(1, &["deformation.pth", "if PyTorch before 1.6 saved it, load it and save it again"]);
+    info(&folder, model).refused(1, &["deformation.pth", "convert it: python3 -c"]);
 }
 
 /// Creates the file at `path`, lets `write` write to it, and returns the path.

@@ -284,7 +284,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         for (degree, version) in [(0, SpzVersion::V3), (3, SpzVersion::V3), (0, SpzVersion::V4), (2, SpzVersion::V4)] {
             let (state, path) = (gaussians(degree), folder.path().join("a.spz"));
-            let step = 2.0 * write_spz(&state, version, &path).unwrap();
+            let step = 2.0 * write_spz(&state, version, &path).unwrap().position;
             let found = read_spz(&path, ReadLimit::NONE).unwrap();
             let near = |a: &AttributeValues, b: &AttributeValues, most: f64, what: &str| {
                 assert_eq!(a.width(), b.width(), "{what}");
