@@ -433,7 +433,7 @@ fn scripts_report_errors_without_a_traceback() {
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
     let workplace = Workplace::new();
     fs::write(workplace.path("bad"), b"\xff\0no container, no table, no model").unwrap();
-    let mut named: Vec<_> = [scripts.clone(), scripts.join("slurm")]
+    let mut named: Vec<_> = [scripts.clone(), scripts.join("slurm"), scripts.join("benchmark")]
         .iter()
         .flat_map(|folder| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()))
         .filter(|path| path.extension().is_some_and(|end| end == "py"))

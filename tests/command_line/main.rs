@@ -1,5 +1,6 @@
 //! Tests of the command line as users and scripts use it.
 
+mod benchmark_tables;
 mod beside_others;
 mod cli;
 mod defects;

@@ -293,13 +293,13 @@ fn scale_script_reports_cost_of_every_size() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let mut scale = Command::new(python);
-    scale.arg(script("scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("here");
-    scale.args(["--sizes", "300x20", "3000x20", "--budgets", "none", "--preset", "paper"]);
-    let printed = String::from_utf8(run(&mut scale, &workplace)).unwrap();
-    assert!(printed.contains("\n| 3,000 | 20 |"), "{printed}");
-    assert!(printed.contains("bytes of peak for each further one"), "{printed}");
-    let kept: Vec<_> = fs::read_dir(workplace.path("here")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
+    scale.arg(script("benchmark/scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("unused");
+    scale.args(["--sizes", "300x20,3000x20", "--limits", "none", "--results", "here"]);
+    run(&mut scale, &workplace);
+    let written = fs::read_to_string(workplace.path("here/scale.csv")).unwrap();
+    let rows: Vec<_> = written.lines().filter(|line| !line.starts_with('#')).collect();
+    assert!(rows[0].starts_with("gaussians,frames,memory_limit,"), "{written}");
+    assert!(rows[1].starts_with("300,20,none,") && rows[2].starts_with("3000,20,none,"), "{written}");
 }
 
 /// Checks that the bar of a sweep is drawn above the bars of its runs, and that no bar is longer than the terminal or

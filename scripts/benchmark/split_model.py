@@ -2,28 +2,25 @@
 """Makes a large model from a small one: every Gaussian of a 4DGaussians model folder is split into nine or more, with
 views of 1352x1014.
 
-    python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
-    python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # figures of docs/benchmarks.md
-    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of docs/benchmarks.md
-    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --set look_pictures=0   # having looked at all
+    python3 scripts/benchmark/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
 
 The children of a Gaussian form a grid of SIDE x SIDE along its two longest axes (for nine: one standard deviation
 apart, √⅓ as wide along these axes), which preserves mass and variance. FOLDER gets the views of the model at every
-frame, with those of transforms_test.json as test views, and some views between neighboring ones. `--compare` refines
-and prunes FOLDER to 20% within one GiB and prints the quality of both on the test views. `--row` prunes it to 30% with
-the given options and prints the cost and the quality on 15 frames of the test views. Needs only the standard library.
+frame, with those of transforms_test.json as test views, and some views between neighboring ones. `large_scene.py`
+measures such models. Needs only the standard library.
 """
 
-import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
-import argparse
-import json
-import math
-import shutil
-import struct
-import tempfile
+import sys
 from pathlib import Path
 
-from models_table import evaluated, peak, run
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import plainly  # noqa: E402, F401 (an error ends with a sentence)
+import argparse  # noqa: E402
+import json  # noqa: E402
+import math  # noqa: E402
+import shutil  # noqa: E402
+import struct  # noqa: E402
 
 # Distance of children in units of their width.
 APART = math.sqrt(3)
@@ -114,38 +111,6 @@ def make(model, folder, side, frames, views, size):
     print(f"{folder}: {count} Gaussians, {frames} frames of {views} views of {size[0]}x{size[1]}")
 
 
-def compare(binary, folder):
-    with tempfile.TemporaryDirectory() as results:
-        found = []
-        for name, options in (("pruned", ["--no-refine", "--prune-only"]), ("refined", [])):
-            output = Path(results) / name
-            summary = run(
-                binary, "compress", folder, "--cameras", folder, "-o", output, "--ratio", 0.2,
-                "--memory", "1GiB", "--json", *options,
-            )  # fmt: skip
-            seconds = sum(stage["seconds"] for stage in summary["stages"])
-            found.append(evaluated(binary, folder, output, folder)["psnr"])
-            print(f"{name}: {found[-1]:.1f} dB, {seconds:.0f} s, {peak(summary):.0f} MiB", flush=True)
-
-
-def row(binary, folder, options):
-    with tempfile.TemporaryDirectory(dir=folder.parent) as results:
-        output = Path(results) / "small"
-        summary = run(
-            binary, "compress", folder, "--cameras", folder, "-o", output, "--ratio", 0.3, "--no-refine", "--json", *options
-        )  # fmt: skip
-        psnr = evaluated(binary, folder, output, folder)["psnr"]
-    stages = summary["stages"]
-    took = {name: sum(s["processor_seconds"] or 0 for s in stages if s["name"] == name) for name in ("scan", "visible", "rounds")}
-    whole = sum(stage["processor_seconds"] or 0 for stage in stages)
-    parts = " + ".join(f"{seconds:.0f} {name}" for name, seconds in took.items())
-    print(
-        f"| {summary['input']['gaussians']} | {summary['input']['frames']} | {' '.join(options)} | {whole:.0f} ({parts}) "
-        f"| {sum(stage['seconds'] for stage in stages):.0f} | {peak(summary):.0f} | {psnr:.2f} |",
-        flush=True,
-    )
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path)
@@ -154,17 +119,8 @@ def main():
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--views", type=int, default=18)
     parser.add_argument("--size", type=lambda text: tuple(map(int, text.split("x"))), default=(1352, 1014))
-    parser.add_argument("--compare", metavar="SPLATSIEVE")
-    parser.add_argument("--row", metavar="SPLATSIEVE")
-    args, options = parser.parse_known_args()
-    if options and not args.row:
-        parser.error(f"unknown: {' '.join(options)}")
-    if not args.folder.exists():
-        make(args.model, args.folder, args.side, args.frames, args.views, args.size)
-    if args.compare:
-        compare(args.compare, args.folder)
-    if args.row:
-        row(args.row, args.folder, options)
+    args = parser.parse_args()
+    make(args.model, args.folder, args.side, args.frames, args.views, args.size)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,73 @@
+#!/usr/bin/env python3
+"""Measures what each stage brings, and other values of single parameters: docs/benchmarks/ablation.csv.
+
+    cargo build --release
+    python3 scripts/benchmark/ablation.py target/release/splatsieve DATA [--models A,B] [--kept 40%,20%,10%,5%]
+
+Rows of kind `stage` add one stage after the other, from pruning by the paper's score to `default`, then take single
+parts of `default` away. Rows of kind `setting` change one parameter of `default`; they are measured at 10% only, and
+`robustness.py` compares `default` with the best of them for each model. PSNR is the mean over test views.
+"""
+
+import tempfile
+from pathlib import Path
+
+from error_against_time import VISIBLE
+from measuring import KEPT, Results, arguments, chosen, compress, evaluate
+
+PRUNE = ["--no-refine", "--prune-only"]
+SETTINGS = {
+    "contrast_floor=0": ["contrast_floor=0"],
+    "contrast_floor=0.3": ["contrast_floor=0.3"],
+    "round_pictures=96": ["round_pictures=96"],
+    "round_fraction=0.8": ["round_fraction=0.8"],
+    "refine_ssim=0.2": ["refine_ssim=0.2"],
+    "static_term=mean": ["static_term=mean"],
+}
+
+
+def sets(*settings):
+    """Returns the options that set parameters."""
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+def stages(kept):
+    """Returns the name and the options of every row of kind `stage` for the fraction `kept`, a percentage."""
+    fraction = float(kept.rstrip("%")) / 100
+    return {
+        "score of the paper, pruned": ["--preset", "paper", "--prune-only"],
+        "visible contribution, pruned": [*PRUNE, *sets(*VISIBLE)],
+        "removal error, one ranking": [*PRUNE, *sets(f"round_fraction={fraction}")],
+        "pruning rounds": PRUNE,
+        "merging": ["--no-refine"],
+        "refinement at the target count": sets("refine_cut_steps=0"),
+        "default": [],
+        "default, colors refined only": sets("refine=color"),
+        "default, exact field": sets("field=exact"),
+        "default, every SH degree": sets("bands=all"),
+    }
+
+
+def main():
+    default = {"type": lambda text: text.split(","), "default": KEPT, "help": "fractions of the Gaussians to keep"}
+    args = arguments(__doc__, ("--kept", default))
+    columns = ["model", "kept", "kind", "setting", "gaussians", "bytes", "psnr_db", "ssim"]
+    results = Results("ablation", args.program, columns)
+    with tempfile.TemporaryDirectory() as scratch:
+        for model in chosen(args, scratch):
+            output = Path(scratch) / f"small{model.suffix}"
+            for kept in args.kept:
+                rows = [("stage", name, options) for name, options in stages(kept).items()]
+                if kept == "10%":
+                    rows += [("setting", name, sets(*settings)) for name, settings in SETTINGS.items()]
+                for kind, name, options in rows:
+                    summary, _ = compress(args.program, model, output, "--ratio", kept, *options)
+                    quality = evaluate(args.program, model, output)
+                    results.add(
+                        model=model.name, kept=kept, kind=kind, setting=name, gaussians=summary["gaussians"],
+                        bytes=summary["output_bytes"], psnr_db=quality["psnr"], ssim=quality["ssim"],
+                    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Measures whole runs of `compress` to a tenth, and the result: docs/benchmarks/run_time.csv.
+
+    cargo build --release
+    python3 scripts/benchmark/run_time.py target/release/splatsieve DATA [--models A,B] [--repeats 3] [--kept 10%]
+
+Wall time with one and with two threads (medians of the repeats, with the range), processor time and peak memory of the
+whole process with one thread. Of the result: bytes and PSNR on test views, of the model and of its archive, and the
+time of a render before and after (median of the test views, one thread).
+"""
+
+import tempfile
+from pathlib import Path
+
+from measuring import Results, arguments, chosen, compress, evaluate, middle_and_range
+
+
+def size(summary):
+    """Returns the bytes of the files that a renderer opens, before and after."""
+    return summary["input"]["bytes"], summary["output_bytes"]
+
+
+def main():
+    repeats = ("--repeats", {"type": int, "default": 3, "help": "runs with each number of threads"})
+    part = ("--kept", {"default": "10%", "help": "fraction of the Gaussians to keep"})
+    args = arguments(__doc__, repeats, part)
+    columns = ["model", "gaussians_before", "gaussians", "runs", "wall_s", "wall_s_min", "wall_s_max", "processor_s"]
+    columns += ["peak_mib", "wall_two_threads_s", "two_threads_part", "psnr_db", "ssim", "bytes_before", "bytes"]
+    columns += ["archive_bytes", "archive_part", "archive_psnr_db", "render_ms_before", "render_ms", "render_fps_before", "render_fps"]
+    results = Results("run_time", args.program, columns)
+    with tempfile.TemporaryDirectory() as scratch:
+        for model in chosen(args, scratch):
+            output, archive = Path(scratch) / f"small{model.suffix}", Path(scratch) / "small.gsz"
+            one, two = [], []
+            for _ in range(args.repeats):
+                summary, cost = compress(args.program, model, output, "--ratio", args.kept, "--threads", 1)
+                one.append(cost)
+                two.append(compress(args.program, model, output, "--ratio", args.kept, "--threads", 2)[1])
+            quality = evaluate(args.program, model, output, "--threads", 1)
+            compress(args.program, model, archive, "--ratio", args.kept)
+            wall, low, high = middle_and_range([cost.wall for cost in one])
+            wall_two = middle_and_range([cost.wall for cost in two])[0]
+            before, after = size(summary)
+            render = quality["render_ms"]
+            results.add(
+                model=model.name, gaussians_before=summary["input"]["gaussians"], gaussians=summary["gaussians"],
+                runs=args.repeats, wall_s=wall, wall_s_min=low, wall_s_max=high,
+                processor_s=middle_and_range([cost.processor for cost in one])[0],
+                peak_mib=max(cost.peak for cost in one), wall_two_threads_s=wall_two, two_threads_part=wall_two / wall,
+                psnr_db=quality["psnr"], ssim=quality["ssim"], bytes_before=before, bytes=after,
+                archive_bytes=archive.stat().st_size, archive_part=archive.stat().st_size / before,
+                archive_psnr_db=evaluate(args.program, model, archive)["psnr"],
+                render_ms_before=render["before"], render_ms=render["after"],
+                render_fps_before=1e3 / render["before"], render_fps=1e3 / render["after"],
+            )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+//! Tests that the tables of figures in README.md and docs/benchmarks.md have the values of the CSV files in
+//! docs/benchmarks.
+//!
+//! The line before such a table is a comment with the cells of a row:
+//!
+//! ```text
+//! <!-- cells of run_time where kept=10%: model | psnr_db:1 | bytes:, | equal_count/psnr_db[method=paper,kept=10%]:1 -->
+//! ```
+//!
+//! One row of the table stands for each combination of the columns without a format (here `model`) in the rows of
+//! `run_time.csv` that fulfil the conditions. A cell `FILE/COLUMN[CONDITIONS]:FORMAT` is the value of the first row of
+//! FILE that fulfils its conditions and agrees with that combination where FILE has these columns; a dash if there is
+//! none. Formats: `1` is one decimal, `,` an integer with commas, `%1` a percentage with one decimal, `=` the value as it
+//! is.
+//!
+//! `SPLATSIEVE_WRITE_DOCS=1` writes the tables instead of comparing them.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Rows of a CSV file, each a value by column name.
+type Rows = Vec<BTreeMap<String, String>>;
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Returns the pages whose tables are compared.
+fn pages() -> [PathBuf; 2] {
+    ["README.md", "docs/benchmarks.md"].map(|name| root().join(name))
+}
+
+/// Returns the text of `docs/benchmarks/NAME.csv`.
+fn csv(name: &str) -> String {
+    let path = root().join(format!("docs/benchmarks/{name}.csv"));
+    fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// Returns the rows of a CSV file without quoted commas.
+fn rows(name: &str) -> Rows {
+    let text = csv(name);
+    let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(cells_of_line);
+    let header = lines.next().unwrap_or_default();
+    lines.map(|cells| header.iter().cloned().zip(cells).collect()).collect()
+}
+
+/// Returns the cells of a CSV line, some of them in double quotes.
+fn cells_of_line(line: &str) -> Vec<String> {
+    let (mut cells, mut is_quoted) = (vec![String::new()], false);
+    for character in line.chars() {
+        match character {
+            '"' => is_quoted = !is_quoted,
+            ',' if !is_quoted => cells.push(String::new()),
+            _ => cells.last_mut().unwrap().push(character),
+        }
+    }
+    cells
+}
+
+/// Returns the conditions `A=B,C=D` as pairs.
+fn conditions(text: &str) -> Vec<(String, String)> {
+    let pairs = text.split(',').filter(|pair| !pair.is_empty());
+    pairs.map(|pair| pair.split_once('=').expect("COLUMN=VALUE")).map(|(a, b)| (a.to_owned(), b.to_owned())).collect()
+}
+
+fn fulfils(row: &BTreeMap<String, String>, conditions: &[(String, String)]) -> bool {
+    conditions.iter().all(|(column, value)| row.get(column) == Some(value))
+}
+
+/// Returns the value as the format `how` writes it; a dash if it is empty.
+fn formatted(value: &str, how: &str) -> String {
+    if value.is_empty() {
+        return "–".to_owned();
+    }
+    if how == "=" || value == "inf" {
+        return value.replace("inf", "exact");
+    }
+    let number: f64 = value.parse().unwrap_or_else(|_| panic!("{value} is no number"));
+    match how.strip_prefix('%') {
+        Some(decimals) => format!("{:.*}%", decimals.parse().unwrap(), 100.0 * number),
+        None if how == "," => with_commas(number),
+        None => format!("{number:.*}", how.parse().unwrap()),
+    }
+}
+
+fn with_commas(number: f64) -> String {
+    let digits = format!("{number:.0}");
+    let groups = digits.as_bytes().rchunks(3).rev().map(|group| std::str::from_utf8(group).unwrap());
+    groups.collect::<Vec<_>>().join(",")
+}
+
+/// Returns the rows of the Markdown table that the comment `<!-- cells of … -->` describes.
+fn table_of(comment: &str) -> Vec<String> {
+    let inside = comment.trim_start_matches("<!-- cells of ").trim_end_matches(" -->");
+    let (source, cells) = inside.split_once(": ").expect("cells of FILE: CELLS");
+    let (base, filter) = source.split_once(" where ").unwrap_or((source, ""));
+    let cells: Vec<&str> = cells.split(" | ").collect();
+    let keys: Vec<&str> = cells.iter().copied().filter(|cell| !cell.contains(':')).collect();
+    let mut combinations: Vec<Vec<(String, String)>> = Vec::new();
+    for row in rows(base).iter().filter(|row| fulfils(row, &conditions(filter))) {
+        let found = keys.iter().map(|key| ((*key).to_owned(), row[*key].clone())).collect();
+        if !combinations.contains(&found) {
+            combinations.push(found);
+        }
+    }
+    assert!(!combinations.is_empty(), "no row for {comment}");
+    let written = |key: &[(String, String)]| {
+        let values: Vec<String> = cells.iter().map(|cell| cell_of(cell, base, &conditions(filter), key)).collect();
+        format!("| {} |", values.join(" | "))
+    };
+    combinations.iter().map(|key| written(key)).collect()
+}
+
+/// Returns the text of one cell: that of its column in the combination `key`, or a value of a file.
+fn cell_of(cell: &str, base: &str, filter: &[(String, String)], key: &[(String, String)]) -> String {
+    let Some((place, how)) = cell.rsplit_once(':') else {
+        return key.iter().find(|(column, _)| column == cell).unwrap().1.clone();
+    };
+    let (place, own) = place.strip_suffix(']').and_then(|place| place.split_once('[')).unwrap_or((place, ""));
+    let (file, column) = place.split_once('/').unwrap_or((base, place));
+    let own = conditions(own);
+    let fits = |row: &&BTreeMap<String, String>| {
+        fulfils(row, &own)
+            && (file != base || fulfils(row, filter))
+            && key.iter().all(|(column, value)| row.get(column).is_none_or(|found| found == value))
+    };
+    let rows = rows(file);
+    assert!(rows.iter().all(|row| row.contains_key(column)), "{file}.csv has no column {column}");
+    rows.iter().find(fits).map_or("–".to_owned(), |row| formatted(&row[column], how))
+}
+
+/// Returns `text` with the rows of each table replaced by those that its comment describes.
+fn with_tables(text: &str) -> String {
+    let (mut written, mut lines) = (String::new(), text.lines().peekable());
+    while let Some(line) = lines.next() {
+        written += &format!("{line}\n");
+        if !line.starts_with("<!-- cells of ") {
+            continue;
+        }
+        // The comment takes one line or several.
+        let mut comment = line.to_owned();
+        while !comment.ends_with("-->") {
+            let next = lines.next().expect("the end of the comment");
+            written += &format!("{next}\n");
+            comment += &format!(" {}", next.trim());
+        }
+        let expected = table_of(&comment);
+        for _ in 0..2 {
+            let head = lines.next().filter(|line| line.starts_with('|')).expect("a table below its comment");
+            assert_eq!(head.matches('|').count(), expected[0].matches('|').count(), "columns of {comment}");
+            written += &format!("{head}\n");
+        }
+        while lines.next_if(|line| line.starts_with('|')).is_some() {}
+        written += &expected.iter().map(|row| format!("{row}\n")).collect::<String>();
+    }
+    written
+}
+
+#[test]
+fn benchmark_tables_have_the_values_of_their_files() {
+    for path in pages() {
+        let text = fs::read_to_string(&path).unwrap();
+        let expected = with_tables(&text);
+        if std::env::var_os("SPLATSIEVE_WRITE_DOCS").is_some() {
+            fs::write(&path, &expected).unwrap();
+            continue;
+        }
+        let different = text.lines().zip(expected.lines()).find(|(found, expected)| found != expected);
+        let advice = "SPLATSIEVE_WRITE_DOCS=1 cargo test --test command_line benchmark";
+        assert!(text == expected, "{}: {different:?}; write it anew: {advice}", path.display());
+    }
+}
+
+#[test]
+fn every_table_on_the_benchmarks_page_has_a_file() {
+    let text = fs::read_to_string(root().join("docs/benchmarks.md")).unwrap();
+    let mut before = "";
+    for line in text.lines() {
+        let begins = line.starts_with('|') && !before.starts_with('|');
+        let has_figures = !line.starts_with("| script ");
+        assert!(!begins || !has_figures || before.ends_with("-->"), "no comment with the file above: {line}");
+        before = line;
+    }
+}
+
+#[test]
+fn every_benchmark_file_names_its_origin_and_is_shown() {
+    let shown: String = pages().iter().map(|path| fs::read_to_string(path).unwrap()).collect();
+    for entry in fs::read_dir(root().join("docs/benchmarks")).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|ending| ending == "csv") {
+            let name = path.file_stem().unwrap().to_str().unwrap();
+            let text = csv(name);
+            for (line, start) in text.lines().zip(["# program: ", "# machine: ", "# date: ", "# command: "]) {
+                assert!(line.starts_with(start), "{name}.csv: expected {start:?}, found {line}");
+            }
+            assert!(!rows(name).is_empty(), "{name}.csv has no rows");
+            assert!(shown.contains(&format!("benchmarks/{name}.csv")), "no page names {name}.csv");
+        }
+    }
+}
+
+#[test]
+fn a_table_with_a_wrong_value_is_found() {
+    let text = fs::read_to_string(root().join("docs/benchmarks.md")).unwrap();
+    let row = text.lines().skip_while(|line| !line.starts_with("<!-- cells of ")).find(|line| line.starts_with("|---"));
+    let head = row.expect("a table");
+    let wrong = text.replacen(head, &format!("{head}\n| a | wrong | row |"), 1);
+    assert_ne!(with_tables(&wrong), wrong);
+}
