@@ -62,5 +62,6 @@ def report(kind, error, trace):
 if Path(getattr(sys.modules["__main__"], "__file__", "")).resolve().parent in {
     Path(__file__).resolve().parent,
     Path(__file__).resolve().parent / "slurm",
+    Path(__file__).resolve().parent / "benchmark",
 }:
     sys.excepthook = report

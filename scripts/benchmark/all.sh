@@ -26,5 +26,5 @@ measure ablation
 measure robustness
 measure large_scene --models room2_dynerf
 measure scale
-python3 scripts/benchmark/plots.py
+python3 scripts/benchmark/plots.py docs/benchmarks
 SPLATSIEVE_WRITE_DOCS=1 cargo test --test command_line benchmark

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Draws the plots of docs/benchmarks.md as SVG files in docs/benchmarks, from the CSV files there.
+"""Draws the plots of docs/benchmarks.md as SVG files, from the CSV files in the same folder.
 
-    python3 scripts/benchmark/plots.py
+    python3 scripts/benchmark/plots.py docs/benchmarks
 
 One small plot per model: PSNR against processor time (error_against_time.svg), against the part of the Gaussians that
 stays (equal_count.svg), and by stage (ablation.svg). Needs only the standard library.
@@ -10,8 +10,10 @@ stays (equal_count.svg), and by stage (ablation.svg). Needs only the standard li
 import html
 import math
 import sys
+from pathlib import Path
 
-from measuring import RESULTS, read_results
+import measuring
+from measuring import read_results
 
 WIDTH, HEIGHT, COLUMNS = 300, 220, 3
 LEFT, RIGHT, TOP, BOTTOM = 40, 10, 26, 34
@@ -94,7 +96,7 @@ def write(name, panels, heading):
         out.append(f'<circle cx="{x}" cy="{y - 4}" r="4" fill="{colors[curve]}"/>')
         out.append(f'<text x="{x + 10}" y="{y}">{html.escape(curve)}</text>')
     out.append("</svg>\n")
-    (RESULTS / f"{name}.svg").write_text("\n".join(out))
+    (measuring.RESULTS / f"{name}.svg").write_text("\n".join(out))
 
 
 def curves_by_model(rows, curve, x, keep=lambda row: True):
@@ -142,10 +144,11 @@ def shown_in_ablation(row):
 
 
 def main():
-    if len(sys.argv) != 1:
+    if len(sys.argv) != 2:
         sys.exit(__doc__)
+    measuring.RESULTS = Path(sys.argv[1])
     for name, draw in {"error_against_time": error_against_time, "equal_count": equal_count, "ablation": ablation}.items():
-        if (RESULTS / f"{name}.csv").exists():
+        if (measuring.RESULTS / f"{name}.csv").exists():
             draw()
 
 
