@@ -26,7 +26,7 @@ STYLE = (
 
 
 def ticks(low, high, wanted=4):
-    """Returns round numbers from `low` to `high`."""
+    """Returns about `wanted` round numbers from `low` to `high`, for the labels of an axis."""
     step = 10 ** math.floor(math.log10((high - low) / wanted))
     step *= next(factor for factor in (1, 2, 5, 10) if (high - low) / (step * factor) <= wanted + 1)
     first = math.ceil(low / step)

@@ -32,30 +32,16 @@ fn pages() -> [PathBuf; 2] {
 }
 
 /// Returns the text of `docs/benchmarks/NAME.csv`.
-fn csv(name: &str) -> String {
+fn csv_text(name: &str) -> String {
     let path = root().join(format!("docs/benchmarks/{name}.csv"));
     fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// Returns the rows of a CSV file without quoted commas.
+/// Returns the rows of a CSV file. Lines that begin with `#` are no rows.
 fn rows(name: &str) -> Rows {
-    let text = csv(name);
-    let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(cells_of_line);
-    let header = lines.next().unwrap_or_default();
-    lines.map(|cells| header.iter().cloned().zip(cells).collect()).collect()
-}
-
-/// Returns the cells of a CSV line, some of them in double quotes.
-fn cells_of_line(line: &str) -> Vec<String> {
-    let (mut cells, mut is_quoted) = (vec![String::new()], false);
-    for character in line.chars() {
-        match character {
-            '"' => is_quoted = !is_quoted,
-            ',' if !is_quoted => cells.push(String::new()),
-            _ => cells.last_mut().unwrap().push(character),
-        }
-    }
-    cells
+    let text = csv_text(name);
+    let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(text.as_bytes());
+    reader.deserialize().collect::<Result<_, _>>().unwrap_or_else(|error| panic!("{name}.csv: {error}"))
 }
 
 /// Returns the conditions `A=B,C=D` as pairs.
@@ -191,7 +177,7 @@ fn every_benchmark_file_names_its_origin_and_is_shown() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|ending| ending == "csv") {
             let name = path.file_stem().unwrap().to_str().unwrap();
-            let text = csv(name);
+            let text = csv_text(name);
             for (line, start) in text.lines().zip(["# program: ", "# machine: ", "# date: ", "# command: "]) {
                 assert!(line.starts_with(start), "{name}.csv: expected {start:?}, found {line}");
             }
