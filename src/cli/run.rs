@@ -255,10 +255,7 @@ fn run_convert(args: Convert, events: &Events) -> Result<()> {
     } else {
         convert::convert(&input, &path, kind, args.earlier.replace())?
     };
-    if !args.json {
-        tell_notes(&converted.notes);
-    }
-    print_as(args.json, || json_text(&converted), || converted.text())
+    print_result(args.json, &converted, &converted.notes, || converted.text())
 }
 
 /// Runs `info`: prints the content of an input, or checks or repairs a container.
@@ -361,7 +358,7 @@ fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
 /// Prints a result: as JSON, which contains the notes, or as text, with the notes on standard error before it.
 fn print_result(
     as_json: bool,
-    value: &serde_json::Value,
+    value: &impl serde::Serialize,
     notes: &[String],
     text: impl FnOnce() -> String,
 ) -> Result<()> {

@@ -2,7 +2,9 @@
 //! or repaired.
 
 /// Maximum number of row indices that a note to the user lists per kind of defect.
-const LISTED_ROWS: usize = 5;
+pub const LISTED_ROWS: usize = 5;
+/// How an infinite opacity logit is repaired, for notes to the user.
+pub const INFINITE_LOGIT_REPAIR: &str = "read as ±100, which is opaque or invisible";
 /// Fraction of dropped rows above which the note with the totals comes before the notes about single kinds of defects.
 const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
@@ -72,17 +74,15 @@ impl Defects {
         }
         let percent = |rows: usize| 100.0 * rows as f64 / self.rows.max(1) as f64;
         let note = |kind: &DefectCount| {
-            let first: Vec<String> = kind.first.iter().map(u32::to_string).collect();
-            let more = if kind.rows > first.len() { ", ..." } else { "" };
             format!(
-                "{} of {} rows ({:.2}%) {}: {}; {} (rows {}{more})",
+                "{} of {} rows ({:.2}%) {}: {}; {} (rows {})",
                 kind.rows,
                 self.rows,
                 percent(kind.rows),
                 if kind.dropped { "left out" } else { "repaired" },
                 kind.what,
                 kind.why,
-                first.join(", "),
+                first_of(&kind.first, kind.rows),
             )
         };
         let mut notes: Vec<String> = self.kinds.iter().map(note).collect();
@@ -98,6 +98,13 @@ impl Defects {
         notes.insert(if is_totals_first { 0 } else { notes.len() }, total);
         notes
     }
+}
+
+/// Returns the first of `count` row indices or ids as a list for messages. `first` holds at least the first five of them,
+/// or all; further ones are not listed.
+pub fn first_of(first: &[u32], count: usize) -> String {
+    let listed: Vec<String> = first.iter().take(LISTED_ROWS).map(u32::to_string).collect();
+    listed.join(", ") + if count > listed.len() { ", ..." } else { "" }
 }
 
 #[cfg(test)]

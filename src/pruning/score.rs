@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::compressed_model::ReferenceFrame;
 use crate::error::{Error, Result, ShowPath};
+use crate::files::defects::first_of;
 use crate::journal::Journal;
 use crate::journal::records::{FlagSummary, SavedCost, TermSummary};
 use crate::limits::Limits;
@@ -180,10 +181,11 @@ impl ScoreStage {
             }
             let mut drop = self.user.drop.clone();
             let absent = self.non_finite_ids_to_drop(&rows);
+            drop.extend(&absent);
             match self.non_finite {
-                NonFinite::Error | NonFinite::Few if absent.is_empty() => refuse_non_finite(scene, &rows)?,
-                NonFinite::Error | NonFinite::Few | NonFinite::Drop => drop.extend(&absent),
                 NonFinite::Keep => protected.extend(non_finite(&rows)),
+                NonFinite::Error | NonFinite::Few if absent.is_empty() => refuse_non_finite(scene, &rows)?,
+                NonFinite::Error | NonFinite::Few | NonFinite::Drop => {}
             }
             for ids in [&mut protected, &mut drop] {
                 ids.sort_unstable();
@@ -235,18 +237,12 @@ fn refuse_non_finite(scene: &Scene, rows: &StatisticRows) -> Result<()> {
     if ids.is_empty() {
         return Ok(());
     }
-    let place = format!("Gaussian {}", some_ids(&ids));
+    let place = format!("Gaussian {}", first_of(&ids, ids.len()));
     let found = format!("NaN or infinity in {} of {} Gaussians", ids.len(), rows.len());
     Err(Error::input(&scene.path, place, "finite values in every frame", found).hint(
         "at most 1% of such Gaussians are left out without asking; --set non_finite=drop removes any number of \
              them, --set non_finite=keep leaves them as they are",
     ))
-}
-
-/// Returns the first five of `ids` as a list for messages.
-fn some_ids(ids: &[u32]) -> String {
-    let some: Vec<String> = ids.iter().take(5).map(u32::to_string).collect();
-    some.join(", ") + if ids.len() > some.len() { ", ..." } else { "" }
 }
 
 /// Returns the number of Gaussians with unusual values, such as NaN, for each kind of unusual value.
@@ -390,7 +386,7 @@ impl Scored {
         let absent = self.absent.len();
         if absent > 0 {
             let (all, percent) = (info.count, 100.0 * absent as f64 / info.count as f64);
-            let ids = some_ids(&self.absent);
+            let ids = first_of(&self.absent, absent);
             journal.notes.push(format!(
                 "{absent} of {all} Gaussians ({percent:.2}%) left out: NaN or infinity in some frame, which no renderer \
                  draws (Gaussian {ids})"

@@ -3,7 +3,7 @@
 use super::write::value;
 use super::{PlaneSource, Ply, PlyEncoding};
 use crate::error::Result;
-use crate::files::defects::Defects;
+use crate::files::defects::{Defects, INFINITE_LOGIT_REPAIR, LISTED_ROWS, first_of};
 use crate::model::{Attributes, Gaussians, INFINITE_LOGIT};
 
 /// Number of rows that are checked together.
@@ -42,45 +42,76 @@ impl Ply {
     /// # Errors
     /// Fails if the file was truncated since it was opened.
     pub(crate) fn notes(&self) -> Result<Vec<String>> {
-        let mut repaired = Defects::new(self.count);
-        let mut non_finite: Vec<usize> = Vec::new();
-        let mut non_finite_count = 0;
+        let mut found = RowDefects::new(self);
         let mut block = Gaussians::zeros(0, self.sh_degree());
         for start in (0..self.count).step_by(CHECKED_ROWS) {
             let end = self.count.min(start + CHECKED_ROWS);
             self.gaussians(start..end, Attributes::all(), &mut block)?;
-            for row in 0..end - start {
-                let mut found = Vec::new();
-                if block.rotation.row::<4>(row) == [0.0; 4] {
-                    found.push(("zero quaternion", false, "taken as the identity, as 3DGS does"));
-                }
-                // The reader replaces infinite logits by this value.
-                if block.opacity_logit.row::<1>(row)[0].abs() == INFINITE_LOGIT && self.has_infinite_logit(start + row)
-                {
-                    found.push(("infinite opacity logit", false, "read as ±100, which is opaque or invisible"));
-                }
-                repaired.add((start + row) as u32, &found);
-                let is_finite = |column: Attributes| {
-                    let values = block.column(column);
-                    (0..values.width()).all(|c| values.plane(c)[row].is_finite())
-                };
-                if !Attributes::all().iter().all(is_finite) {
-                    non_finite_count += 1;
-                    non_finite.extend((non_finite.len() < 5).then_some(start + row));
-                }
+            found.add(start, &block);
+        }
+        Ok(found.notes())
+    }
+
+    /// Returns the notes of [`Ply::notes`] without reading the rows again. `whole` has all attributes of all rows, as
+    /// the file was read.
+    pub(crate) fn notes_with(&self, whole: &Gaussians) -> Vec<String> {
+        let mut found = RowDefects::new(self);
+        found.add(0, whole);
+        found.notes()
+    }
+}
+
+/// Rows of a PLY file with unusual values.
+struct RowDefects<'a> {
+    ply: &'a Ply,
+    /// Rows with values that the reader replaces.
+    repaired: Defects,
+    /// First rows with NaN or infinity, and the number of all such rows.
+    non_finite: (Vec<u32>, usize),
+}
+
+impl RowDefects<'_> {
+    fn new(ply: &Ply) -> RowDefects<'_> {
+        RowDefects { ply, repaired: Defects::new(ply.count), non_finite: (Vec::new(), 0) }
+    }
+
+    /// Counts the defects of the rows from `start` on, whose values are in `block`.
+    fn add(&mut self, start: usize, block: &Gaussians) {
+        for row in 0..block.len() {
+            let mut found = Vec::new();
+            if block.rotation.row::<4>(row) == [0.0; 4] {
+                found.push(("zero quaternion", false, "taken as the identity, as 3DGS does"));
+            }
+            // The reader replaces infinite logits by this value.
+            let is_replaced = block.opacity_logit.row::<1>(row)[0].abs() == INFINITE_LOGIT;
+            if is_replaced && self.ply.has_infinite_logit(start + row) {
+                found.push(("infinite opacity logit", false, INFINITE_LOGIT_REPAIR));
+            }
+            self.repaired.add((start + row) as u32, &found);
+            let is_finite = |column: Attributes| {
+                let values = block.column(column);
+                (0..values.width()).all(|c| values.plane(c)[row].is_finite())
+            };
+            if !Attributes::all().iter().all(is_finite) {
+                let (first, count) = &mut self.non_finite;
+                *count += 1;
+                first.extend((first.len() < LISTED_ROWS).then_some((start + row) as u32));
             }
         }
-        let rows: Vec<String> = non_finite.iter().map(usize::to_string).collect();
-        let more = if non_finite_count > rows.len() { ", ..." } else { "" };
-        let not_drawn = (non_finite_count > 0).then(|| {
+    }
+
+    /// Returns the notes for the user, those on the header last.
+    fn notes(&self) -> Vec<String> {
+        let (first, count) = &self.non_finite;
+        let not_drawn = (*count > 0).then(|| {
             format!(
-                "{non_finite_count} of {} rows ({:.2}%) have NaN or infinity, so no renderer draws them: compress leaves \
-                 them out if they are at most 1%, or with --set non_finite=drop (rows {}{more})",
-                self.count,
-                100.0 * non_finite_count as f64 / self.count as f64,
-                rows.join(", "),
+                "{count} of {} rows ({:.2}%) have NaN or infinity, so no renderer draws them: compress leaves \
+                 them out if they are at most 1%, or with --set non_finite=drop (rows {})",
+                self.ply.count,
+                100.0 * *count as f64 / self.ply.count as f64,
+                first_of(first, *count),
             )
         });
-        Ok(repaired.notes().into_iter().chain(not_drawn).chain(self.header_notes()).collect())
+        self.repaired.notes().into_iter().chain(not_drawn).chain(self.ply.header_notes()).collect()
     }
 }

@@ -31,6 +31,15 @@ const TENSOR_BYTES: u64 = 512;
 /// Fails if the file is not a state dict, is truncated or damaged, declares more values than it can hold, or takes more
 /// memory than allowed.
 pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors> {
+    read_state_dict_with_note(path, memory).map(|(tensors, _)| tensors)
+}
+
+/// Reads tensors like [`read_state_dict`]. Also returns a note for the user if all names of tensors have a prefix in the
+/// file that is left out.
+///
+/// # Errors
+/// Fails like [`read_state_dict`].
+pub(crate) fn read_state_dict_with_note(path: &Path, memory: ReadLimit) -> Result<(Tensors, Option<String>)> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     let dict = StateDict::open(path, memory)?;
     let bytes = |tensor: &TensorView, width: usize| {
@@ -60,21 +69,13 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
             tensors.insert(name.clone(), Tensor { shape: tensor.shape.clone(), data });
         }
     }
-    Ok(tensors)
+    let note = (!dict.prefix.is_empty()).then(|| format!("{}: {}", shown_name(path), wrapper_note(&dict.prefix)));
+    Ok((tensors, note))
 }
 
-/// Returns a note for the user if all names of the tensors of the state dict at `path` have a prefix that the model does
-/// not expect; `None` otherwise. No values are read.
-///
-/// # Errors
-/// Fails if the file is not a state dict.
-pub(crate) fn prefix_note(path: &Path, memory: ReadLimit) -> Result<Option<String>> {
-    let prefix = StateDict::open(path, memory)?.prefix;
-    let file = shown_name(path);
-    Ok((!prefix.is_empty()).then(|| {
-        let prefix = quoted(&prefix);
-        format!("{file}: the names of all tensors begin with {prefix}, of a wrapper of the model; read without it")
-    }))
+/// Returns the note for the user that all names of tensors begin with `prefix`, which is left out.
+pub(crate) fn wrapper_note(prefix: &str) -> String {
+    format!("the names of all tensors begin with {}, of a wrapper of the model; read without it", quoted(prefix))
 }
 
 /// Returns the names of the tensors of the state dict at `path`, in order. No values are read.

@@ -136,11 +136,12 @@ fn the_prefix_of_a_wrapper_is_left_out_and_noted() {
     let wrapped = values.map(|name| f32_entry(name, &[1.0, 2.0], &[2], &[1]));
     let found = temp.read(&state_dict(&wrapped)).unwrap();
     assert_eq!(found.keys().collect::<Vec<_>>(), ["a.weight", "b"]);
-    let note = prefix_note(&temp.0.path().join("deformation.pth"), ReadLimit::NONE).unwrap().unwrap();
-    assert!(note.contains("\"module._orig_mod.\""), "{note}");
+    let note = || read_state_dict_with_note(&temp.0.path().join("deformation.pth"), ReadLimit::NONE).unwrap().1;
+    let found_note = note().unwrap();
+    assert!(found_note.contains("\"module._orig_mod.\""), "{found_note}");
     let partly = ["module.a", "b"].map(|name| f32_entry(name, &[1.0, 2.0], &[2], &[1]));
     assert_eq!(temp.read(&state_dict(&partly)).unwrap().keys().collect::<Vec<_>>(), ["b", "module.a"]);
-    assert_eq!(prefix_note(&temp.0.path().join("deformation.pth"), ReadLimit::NONE).unwrap(), None);
+    assert_eq!(note(), None);
 }
 
 #[test]

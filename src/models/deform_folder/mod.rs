@@ -32,7 +32,6 @@ use crate::error::{Error, Result};
 use crate::files::cameras::TimeConvention;
 use crate::files::ply::write::{rows_of_model, write_like_template};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
-use crate::files::state_dict::prefix_note;
 use crate::limits::Limits;
 use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, TimeOrigin};
@@ -103,14 +102,14 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     ) -> Result<Box<dyn InputModel>> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
-        let tensors = paths.tensors(options.memory)?;
+        let (tensors, prefix_note) = paths.tensors(options.memory)?;
         let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.format_specific.width(), &*paths.network, &*paths.point_cloud);
         let parts = ModelParts { arguments: &arguments, tensors: &tensors, file, features, cloud };
         let (motion_model, mut notes) = make(&parts)?;
-        notes.extend(prefix_note(&paths.network, options.memory)?);
-        notes.extend(ply.notes()?);
+        notes.extend(prefix_note);
+        notes.extend(ply.notes_with(&raw.gaussians));
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let source_path = arguments.get("source_path").string()?;
         let white_background = arguments.get("white_background").bool(false)?;

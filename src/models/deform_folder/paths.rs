@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
 use crate::files::digest::digest_of_files;
-use crate::files::state_dict::{is_pair, names, read_state_dict};
+use crate::files::state_dict::{is_pair, names, read_state_dict_with_note};
 use crate::limits::ReadLimit;
 use crate::models::iterations::iteration_numbers;
 
@@ -100,14 +100,15 @@ impl Paths {
         }
     }
 
-    /// Reads the tensors of the network.
+    /// Reads the tensors of the network. Also returns a note for the user if all their names have a prefix in the file
+    /// that is left out.
     ///
     /// # Errors
     /// Fails if the file is not a state dict (tensors by name), or belongs to a Grid4D model.
-    pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
+    pub(super) fn tensors(&self, memory: ReadLimit) -> Result<(Tensors, Option<String>)> {
         let grid4d_hint = "hash grids are not supported: export the Gaussians of each frame as a PLY with the model's \
                            own code, and give the folder of these files";
-        read_state_dict(&self.network, memory).map_err(|error| match is_pair(&self.network, memory) {
+        read_state_dict_with_note(&self.network, memory).map_err(|error| match is_pair(&self.network, memory) {
             true => Error::input(
                 &self.network,
                 "",

@@ -18,6 +18,7 @@ use super::in_checkpoint::{
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId, Pickle};
 use crate::files::ftgs::{LOG_TIME_DEVIATION, PARAMS_PER_GAUSSIAN, TIME_CENTER, VELOCITY};
+use crate::files::state_dict::wrapper_note;
 use crate::limits::ReadLimit;
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
@@ -123,8 +124,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let nodes = names.iter().map(|name| find(name)).collect::<Result<Vec<NodeId>>>()?;
     let has_motion = splat_tensor(pickle, splats, "velocities").is_some();
     if pickle.item(splats, "means").is_none() {
-        let note = "the names of all tensors begin with \"module.\", of a wrapper of the model; read without it";
-        description.notes.push(note.to_owned());
+        description.notes.push(wrapper_note("module."));
     }
     let motion_nodes = if has_motion {
         ["times", "durations", "velocities"].iter().map(|name| find(name)).collect::<Result<_>>()?

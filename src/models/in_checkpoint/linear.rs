@@ -138,7 +138,7 @@ pub(in crate::models) fn match_proxies(
 /// [`ProxyAtFrame`]).
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
-    /// Sum over the frames of m·α: window times opacity of the moment match.
+    /// Sum over the frames of m·α, the window times the opacity.
     product: f64,
     /// Sum over the frames of m², the square of the window.
     square: f64,

@@ -9,6 +9,7 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
+use crate::files::defects::INFINITE_LOGIT_REPAIR;
 use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, finite_logit};
 use crate::models::trajectories::state_bytes;
 
@@ -104,11 +105,8 @@ impl CheckpointReader {
     /// Returns a note for the user on the infinite opacity logits that have been replaced; `None` if there were none.
     pub(in crate::models) fn note(&self) -> Option<String> {
         let (replaced, all) = (self.infinite_logits, self.tensors.count);
-        (replaced > 0).then(|| {
-            format!(
-                "{replaced} of {all} rows repaired: infinite opacity logit; read as ±100, which is opaque or invisible"
-            )
-        })
+        (replaced > 0)
+            .then(|| format!("{replaced} of {all} rows repaired: infinite opacity logit; {INFINITE_LOGIT_REPAIR}"))
     }
 
     /// Reads the tensor at the node `id` of the checkpoint. `name` is what error messages call it, `row` is the

@@ -20,7 +20,7 @@ use super::cfg_args::ModelConfig;
 use super::small_field::rounded;
 use crate::files::digest::digest_of_files;
 use crate::files::ply::{Ply, PlyOptions};
-use crate::files::state_dict::{prefix_note, read_state_dict};
+use crate::files::state_dict::{read_state_dict, read_state_dict_with_note};
 use crate::models::iterations::find_iteration;
 
 /// Paths of the files of a model folder.
@@ -114,9 +114,9 @@ impl ModelFolder {
         memory: ReadLimit,
     ) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
-        let tensors = read_state_dict(&paths.deformation, memory)?;
+        let (tensors, prefix_note) = read_state_dict_with_note(&paths.deformation, memory)?;
         let mut notes = config.contradicted_by(&tensors);
-        notes.extend(prefix_note(&paths.deformation, memory)?);
+        notes.extend(prefix_note);
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
@@ -144,8 +144,10 @@ impl ModelFolder {
     pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open_with(&paths.point_cloud, options)?;
-        let mut model = Self::with_gaussians(paths, ply.whole()?, ply.sh_degree(), options.memory)?;
-        model.notes.extend(ply.notes()?);
+        let whole = ply.whole()?;
+        let ply_notes = ply.notes_with(&whole);
+        let mut model = Self::with_gaussians(paths, whole, ply.sh_degree(), options.memory)?;
+        model.notes.extend(ply_notes);
         Ok(model)
     }
 
