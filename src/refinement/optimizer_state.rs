@@ -33,8 +33,9 @@ pub(super) struct StepParams {
 /// each frame, interpolated between keyframes).
 const FRAMES_PER_KEYFRAME: usize = 4;
 
-/// Returns the number of keyframes, at most `max_keyframes`, of the time-varying delta (values that refinement adds to
-/// each frame) for a sequence of `frames` frames. Returns 0 instead of 1, because one keyframe does not vary with time.
+/// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame) for a sequence
+/// of `frames` frames: one for every [`FRAMES_PER_KEYFRAME`] frames, and at most `max_keyframes`. Returns 0 if that is 1,
+/// because a delta with a single keyframe does not vary with time.
 pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     let keyframe_count = max_keyframes.min(frames / FRAMES_PER_KEYFRAME);
     if keyframe_count > 1 { keyframe_count } else { 0 }

@@ -23,9 +23,8 @@ pub const VISIBLE_ERROR_PSNR_DB: f64 = 40.0;
 /// it is visible. A PSNR lower by 3 dB means twice the squared error.
 pub const MIN_PSNR_GAP_DB: f64 = 3.0;
 /// Minimum share of a kind of Gaussian in a render: Σ alpha · transmittance of the Gaussians of this kind in a pixel,
-/// averaged over the pixels of the render, from 0 to 1. A render with a smaller share is left out of the search for the
-/// render in which damage to this kind (its failure mode) is worst. If the share is smaller in every render, the damage
-/// is not judged.
+/// averaged over the pixels of the render, from 0 to 1. Renders with a smaller share are ignored in the search for the
+/// worst damage to this kind. If all renders are ignored, the damage is not judged.
 pub const MIN_PIXEL_SHARE: f64 = 1e-3;
 /// Minimum lost fraction of the contribution of a kind of Gaussian to renders. The contribution of the Gaussians of
 /// this kind that were dropped or merged counts as lost. If the lost fraction is smaller, damage to this kind (its
