@@ -71,7 +71,7 @@ const player = {
         document.currentScript?.remove();
         models[model]?.worker.postMessage({ kind: "chunk", place, text });
     },
-    /// Resolves when everything has arrived and the image on the canvas matches the controls.
+    /// Resolves when everything has arrived and the image on the canvas matches the controls at full resolution.
     settled: () => new Promise((resolve) => { waiting.push(resolve); isDirty = true; }),
     /// Returns the canvas: width, height, and red, green, blue from its top left on, in base64.
     pixels() {
@@ -214,7 +214,7 @@ async function refresh() {
     // Frames that have not arrived yet are replaced by the last one that has.
     const until = Math.min(...seen().map((place) => models[place].until));
     if (until > -Infinity) {
-        const at = Math.min(time, until), from = sight();
+        const at = Math.min(time, until), from = sight(), isWhole = exact || coarse === 1;
         await Promise.all(seen().map((place) => models[place].show(at, from)));
         current = from;
         draw();
@@ -222,7 +222,7 @@ async function refresh() {
         el("poster")?.remove();
         el("outside").hidden = !isOutside();
         rate();
-        if (!isDirty && !playing && arrivals()) {
+        if (isWhole && !isDirty && !playing && arrivals()) {
             isDirty = false;
             document.documentElement.dataset.shown = location.hash;
             waiting.splice(0).forEach((resolve) => resolve());
