@@ -34,7 +34,8 @@ pub struct Proxies {
     /// Stored parameters of the proxies, one row per cluster, for model formats that store a proxy like any other
     /// Gaussian. `None` if each proxy is computed from its members frame by frame.
     pub raw: Option<StoredParams>,
-    /// Indices of the clusters that no proxy represents well enough, increasing. Their leaders stay unmerged.
+    /// Indices of the clusters that no proxy represents well enough, increasing. The leader (most important member) of
+    /// such a cluster stays, unmerged.
     pub refused: Vec<usize>,
     /// Largest distance between the position of a proxy and the position expected from its members, over all proxies
     /// and sampled frames, scene units. `None` if every proxy follows its members exactly.
@@ -137,7 +138,7 @@ impl TrajectoryDelta {
         self.0.first().map_or(Attributes::empty(), ParamDelta::attributes)
     }
 
-    /// Returns the change at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
+    /// Returns the delta at frame `frame` of a sequence of `frames` frames, interpolated between two keyframes; empty
     /// if there are no keyframes.
     pub fn at_frame(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
@@ -258,8 +259,8 @@ impl CompressedModel {
         }
     }
 
-    /// Returns the total change of the Gaussians at frame `frame` of a sequence of `frames` frames: the sum of the
-    /// constant delta and of the trajectory delta at this frame.
+    /// Returns everything that refinement adds to the Gaussians at frame `frame` of a sequence of `frames` frames: the
+    /// sum of the constant delta and of the trajectory delta at this frame.
     pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.trajectory_delta.at_frame(frame, frames).plus(self.delta.clone())

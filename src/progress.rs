@@ -13,8 +13,8 @@ pub trait EventSink: Send + Sync {
         let _ = stages;
     }
 
-    /// Receives the event that a run has ended, with a result or an error. It is the run that the last call of
-    /// [`EventSink::run_begun`] announced.
+    /// Receives the event that the run announced by the last call of [`EventSink::run_begun`] has ended, with a result
+    /// or an error.
     fn run_ended(&self) {}
 
     /// Receives the event that a task begins. Returns the sink that receives the progress of the task and is dropped
@@ -61,7 +61,7 @@ pub enum Message<'a> {
     Plan(&'a str),
     /// Problem that the user should solve before the run goes on, such as missing cameras.
     Warning(&'a str),
-    /// Notice that a stage computed a result which is then not used.
+    /// Notice that the result of a stage is not used.
     Discarded {
         /// Name of the stage whose result is not used.
         stage: &'a str,

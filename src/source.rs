@@ -1,5 +1,5 @@
-//! Traits for reading the frames of a sequence. A source opens readers for blocks of Gaussians and counts what is read;
-//! a reader is told in advance which frames it will read.
+//! Traits for reading the frames of a sequence. A source opens readers for blocks of Gaussians and counts what is read.
+//! The caller can announce to a reader which frames it will read.
 
 use std::ops::{Add, Range, Sub};
 use std::sync::Arc;
@@ -43,8 +43,8 @@ impl Ids<'_> {
     }
 }
 
-/// Plan of the frames that will be read from a reader. With the plan, the reader decodes a tile (some Gaussians at
-/// consecutive frames) once and keeps only the frames that will be read.
+/// Plan of the frames that the caller will read from a reader. With the plan, the reader decodes a tile (some Gaussians
+/// at consecutive frames) once and keeps only the planned frames.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
     /// Frames that will be read, in increasing order; `None` means every frame.
@@ -156,8 +156,8 @@ impl Clone for SharedCounter {
     }
 }
 
-/// Sequence of Gaussians that can be read block by block and frame by frame, in any order, from several threads. A
-/// Gaussian at a frame has the same bits whichever block it is read with.
+/// Sequence of Gaussians that can be read block by block and frame by frame, in any order, from several threads. The
+/// values of a Gaussian at a frame are the same to the bit, whichever block of Gaussians they are read with.
 pub trait FrameSource: Send + Sync {
     /// Returns the number of Gaussians, the time stamps of the frames and the attributes that vary in time.
     fn info(&self) -> &SequenceInfo;
@@ -172,8 +172,9 @@ pub trait FrameSource: Send + Sync {
         None
     }
 
-    /// Returns the function that computes states from stored parameters. `None` if the state at every frame is stored
-    /// (explicit trajectories); a change of a stored parameter then changes every state by the same amount.
+    /// Returns the function that computes the states of Gaussians from stored parameters. Returns `None` for models
+    /// that store the state at every frame (explicit trajectories). In such models, a change of a parameter is added to
+    /// the states at all frames.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
@@ -189,7 +190,8 @@ pub trait FrameSource: Send + Sync {
         Reads::default()
     }
 
-    /// Returns the object that fetches bytes from the disk before they are read; `None` if this saves no time.
+    /// Returns the object that can fetch bytes from the disk ahead of a reader that needs them; `None` if this saves no
+    /// time.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }

@@ -38,8 +38,9 @@ const VALUES_PER_EXCEPTION: usize = 16;
 /// Limit of the absolute value of a multiple of the quantization step. All multiples are below this limit, so that the
 /// differences of their differences fit 32 bits.
 const MAX_MULTIPLE: f64 = (1 << 28) as f64;
-/// zstd level of the trial that decides whether static tracks use half the step. Half the step makes more tracks
-/// static, but each of them takes a bit more space.
+/// zstd level of the trial that decides whether static tracks (components of a Gaussian whose values in all frames are
+/// stored as one number) use half the quantization step. Half the step makes more tracks static, but each of them takes
+/// a bit more space.
 const TRIAL_LEVEL: i32 = 1;
 
 /// Encoded tile whose decoded values differ from the original ones by at most the error bound.
@@ -168,8 +169,8 @@ impl Multiples {
         self.moves.iter().filter(|&&moves| !moves).count()
     }
 
-    /// Drops the multiples and exceptions (values stored with their original bits) of all frames but the first. Returns
-    /// the rest.
+    /// Returns these multiples for the first frame only: drops the multiples and exceptions (values stored with their
+    /// original bits) of all later frames.
     fn first_frame(mut self) -> Multiples {
         self.values.truncate(self.plane);
         self.exceptions.retain(|&(place, _)| (place as usize) < self.plane);
@@ -224,7 +225,8 @@ impl Multiples {
     }
 }
 
-/// Returns the quantization step of static tracks: `step` halved `halvings` times (0 or 1).
+/// Returns the quantization step of static tracks (components of a Gaussian whose values in all frames are stored as
+/// one number): `step` halved `halvings` times (0 or 1).
 fn static_step(step: f64, halvings: u32) -> f64 {
     if halvings == 0 { step } else { 0.5 * step }
 }
@@ -233,17 +235,20 @@ fn static_step(step: f64, halvings: u32) -> f64 {
 /// tracks.
 #[derive(Debug, Default)]
 pub(crate) struct BoundedTracks {
-    /// Quantization steps of static tracks and of moving tracks.
+    /// Quantization steps: first of static tracks (components of a Gaussian whose values in all frames are stored as
+    /// one number), then of all other tracks.
     steps: [f64; 2],
     exceptions: Vec<(u32, u32)>,
     plane: usize,
     frames: usize,
-    /// Number of moving tracks: tracks whose values are not all stored as a single multiple.
+    /// Number of moving tracks: components of a Gaussian whose values in the frames of the tile are not all stored as
+    /// one number.
     moving: usize,
 }
 
 impl BoundedTracks {
-    /// Reads the fields before the zstd frame from `stored`, and returns the bytes of the zstd frame.
+    /// Reads the fields at the start of `stored`, the stored bytes of a tile of `frames` frames with `plane` values
+    /// each. Returns the bytes of the zstd frame that follows these fields. `max_error` is the error bound of the tile.
     ///
     /// # Errors
     /// Fails if the tile is malformed; the error says what was found instead of a valid tile.
@@ -284,8 +289,9 @@ impl BoundedTracks {
         self.mask_bytes() + 4 * self.frames * self.plane
     }
 
-    /// Counts the moving tracks in the mask (one bit per track) at the start of `bytes`, the decompressed bytes of the
-    /// tile, and checks the length of `bytes`. An error says what was found instead of a valid tile.
+    /// Counts the moving tracks (components of a Gaussian that change in the tile) in the mask at the start of `bytes`,
+    /// the decompressed bytes of the tile. The mask has one bit per track. Also checks the length of `bytes`. An error
+    /// says what was found instead of a valid tile.
     pub(crate) fn read_mask(&mut self, bytes: &[u8]) -> Result<(), String> {
         let wrong = || format!("{} bytes after decompression", bytes.len());
         let mask = bytes.get(..self.mask_bytes()).ok_or_else(wrong)?;
@@ -298,15 +304,15 @@ impl BoundedTracks {
         Ok(())
     }
 
-    /// Returns for each track its multiple of the quantization step in the first frame, zigzag-coded. `bytes` are the
-    /// decompressed bytes of the tile.
+    /// Returns for each track (component of a Gaussian) its value in the first frame, as a zigzag-coded multiple of the
+    /// quantization step. `bytes` are the decompressed bytes of the tile.
     pub(crate) fn first_frame<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = u32> + 'a {
         let (from, plane) = (self.mask_bytes(), self.plane);
         (0..plane).map(move |track| shuffled_value(&bytes[from..], plane, track))
     }
 
-    /// Returns for each moving track its index and its prediction error at frame `frame`, which must not be the first.
-    /// `bytes` are the decompressed bytes of the tile.
+    /// Returns for each moving track (component of a Gaussian that changes in the tile) its index and its zigzag-coded
+    /// prediction error at frame `frame`, which must not be the first. `bytes` are the decompressed bytes of the tile.
     pub(crate) fn residuals<'a>(&self, bytes: &'a [u8], frame: usize) -> impl Iterator<Item = (usize, u32)> + 'a {
         let from = self.mask_bytes() + 4 * self.plane;
         let (after_first, values) = (self.frames - 1, self.moving * (self.frames - 1));
@@ -334,13 +340,15 @@ impl BoundedTracks {
         size_of::<(u32, u32)>() * self.exceptions.capacity()
     }
 
-    /// Returns the length in bytes of the mask that tells which tracks are moving (one bit per track).
+    /// Returns the length in bytes of the mask with one bit per track (component of a Gaussian) that is set if the
+    /// track changes in the tile.
     fn mask_bytes(&self) -> usize {
         self.plane.div_ceil(8)
     }
 }
 
-/// Returns whether the track `track` is moving, according to the mask (one bit per track) at the start of `bytes`.
+/// Returns whether track `track` (component of a Gaussian) changes in the tile, according to the mask at the start of
+/// `bytes`, which has one bit per track.
 fn moves(bytes: &[u8], track: usize) -> bool {
     bytes[track / 8] >> (track % 8) & 1 != 0
 }

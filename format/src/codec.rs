@@ -31,7 +31,8 @@ use crate::bounded::{self, BoundedTracks};
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
 
-/// Storage method of the values of a tile, chosen by the caller of [`encode_tile`].
+/// Storage method of the values of a tile (one column for a block of Gaussians and frames), chosen by the caller of
+/// [`encode_tile`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
     /// Raw: plain f32 values, which readers use in place from the memory map.
@@ -49,7 +50,7 @@ pub enum Compression {
     },
 }
 
-/// Encoding of the values of a tile in its stored bytes.
+/// Encoding of the values of a tile (one column for a block of Gaussians and frames) in its stored bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
     /// Raw: little-endian f32.
@@ -76,7 +77,8 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// Statistics of the stored values of a tile. A constant tile (all frames equal) stores one frame.
+/// Statistics of the stored values of a tile (one column for a block of Gaussians and frames). A constant tile, whose
+/// frames are all equal, stores one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileStats {
     /// Smallest finite value, with −0 counted as +0; +∞ if no value is finite.
@@ -94,7 +96,7 @@ impl fmt::Display for TileStats {
     }
 }
 
-/// Encoded tile, to be passed to [`crate::Writer::write_tile`].
+/// Encoded tile (one column for a block of Gaussians and frames), to be passed to [`crate::Writer::write_tile`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedTile {
     pub(crate) frames: u32,
@@ -189,7 +191,8 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
     Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
 }
 
-/// Decoder of one tile that is not raw (lossless or lossy encoding), frame by frame.
+/// Decoder of one tile (one column for a block of Gaussians and frames) that is stored in the lossless or the lossy
+/// encoding. Decodes the tile frame by frame.
 ///
 /// Memory: for a lossless tile, 4 bytes per value of the tile, and two decoded frames. For a lossy tile, in addition
 /// 1/8 byte per value of one frame, and up to 1/2 byte per value of the tile for exceptions (if every 16th value is
@@ -208,7 +211,7 @@ pub(crate) struct TileDecoder {
     tracks: BoundedTracks,
 }
 
-/// Stored bytes of a tile, and the parameters needed to decode them.
+/// Stored bytes of a tile (one column for a block of Gaussians and frames), and the parameters needed to decode them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct StoredTile<'a> {
     pub(crate) bytes: &'a [u8],
@@ -257,8 +260,9 @@ impl TileDecoder {
     }
 
     /// Decodes frame `frame` into `out`, which has one element for each value of a frame. A frame that is predicted
-    /// from earlier frames needs all of them: decoding goes on after the last decoded frame if `frame` is a later one,
-    /// and otherwise starts again at the first. With prediction order 0 only `frame` itself is decoded.
+    /// from earlier frames needs all earlier frames. Decoding therefore continues after the last decoded frame if
+    /// `frame` is later, and otherwise starts again at the first frame. With prediction order 0 only `frame` itself is
+    /// decoded.
     pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
         if self.order == 0 || frame < self.next {
             self.next = if self.order == 0 { frame } else { 0 };

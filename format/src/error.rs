@@ -60,7 +60,7 @@ impl Error {
         move |source| Error::Io { action, path, source }
     }
 
-    /// Creates an [`Error::Usage`].
+    /// Creates an [`Error::Usage`], the error about invalid arguments, with the text `message`.
     pub(crate) fn usage(message: impl Into<String>) -> Self {
         Error::Usage(message.into())
     }

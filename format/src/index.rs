@@ -19,19 +19,21 @@ pub(crate) struct Index {
 }
 
 impl Index {
-    /// Returns the offset in the file of entry number `index` of the index.
+    /// Returns the offset in the file of entry `index` (counted from 0) of the index, the table of tiles.
     pub(crate) fn entry_offset(&self, index: u64) -> u64 {
         self.offset + RECORD_BYTES * index
     }
 
-    /// Reads and checks entry number `index` of the index. Fails if the entry is damaged or describes another tile.
+    /// Reads and checks entry `index` (counted from 0) of the index, the table of tiles. Fails if the entry is damaged
+    /// or describes another tile than the one that belongs there.
     pub(crate) fn record(&self, file: &MappedFile, layout: &Layout, index: u64) -> Result<TileRecord> {
         let mut bytes = [0; RECORD_BYTES as usize];
         file.read_at(self.entry_offset(index), &mut bytes)?;
         self.parse(layout, index, &bytes).map_err(|fault| fault.at(file.path()))
     }
 
-    /// Decodes entry number `index` of the index from its bytes and checks it against the layout.
+    /// Decodes entry `index` (counted from 0) of the index, the table of tiles, from its bytes, and checks it against
+    /// the layout.
     fn parse(
         &self,
         layout: &Layout,

@@ -197,7 +197,7 @@ impl Layout {
         VERSIONS[usize::from(self.columns.iter().any(|column| column.max_error != 0.0))]
     }
 
-    /// Returns the length of the header in bytes, including its checksum.
+    /// Returns the length of the encoded header in bytes, including its checksum, but without padding.
     fn header_len(&self) -> usize {
         let fields = if self.version() == VERSIONS[0] { 6 } else { 14 };
         let columns: usize = self.columns.iter().map(|column| fields + column.name.len()).sum();
@@ -239,7 +239,7 @@ impl Layout {
     }
 
     /// Returns the length in bytes of the whole header, read from `fixed`, the first bytes of the file. Fails if the
-    /// magic or the version is another, or if the length is not allowed.
+    /// file does not begin with [`MAGIC`], if its format version is unknown, or if the header length is not allowed.
     pub(crate) fn header_len_from(fixed: &[u8; FIXED_HEADER_BYTES]) -> std::result::Result<usize, Fault> {
         let mut fields = Fields { bytes: fixed, at: 0 };
         let magic = fields.take(8)?;

@@ -45,8 +45,8 @@ pub struct Reader {
     read_tiles: AtomicU64,
 }
 
-/// Buffer for reading and decoding tiles, which can be used again for the next tile. Grows to three times the size of
-/// the largest decoded tile.
+/// Buffer for reading and decoding tiles (each one column for a block of Gaussians and frames). The buffer can be used
+/// again for the next tile. Grows to three times the size of the largest decoded tile.
 #[derive(Default)]
 pub struct TileBuffer {
     stored: Vec<u8>,
@@ -75,7 +75,7 @@ pub struct Tile<'a> {
     constant: bool,
 }
 
-/// Entry of a tile in the index (table of tiles) of a container.
+/// Entry in the index (table of tiles) of a container for one tile: one column for a block of Gaussians and frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileInfo {
     /// Encoding of the tile's values in its stored bytes.
@@ -418,8 +418,8 @@ impl TileBuffer {
     }
 }
 
-/// Reads a tile's stored bytes into `buffer`, checks their checksum and decodes them. The record `tile` must have been
-/// checked.
+/// Reads the stored bytes of a tile into `buffer`, checks their checksum and decodes them. The caller must have checked
+/// the record `tile` against the layout.
 pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, buffer: &mut TileBuffer) -> Result<()> {
     let TileBuffer { stored, decoder, values, zstd } = buffer;
     read_stored(file, tile, stored)?;
@@ -474,7 +474,7 @@ fn plane_len(layout: &Layout, tile: &TileRecord) -> usize {
     layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize
 }
 
-/// Reads and checks the header of a file. Returns the layout that it describes, and its bytes.
+/// Reads and checks the header of a file. Returns the layout that the header describes, and the bytes of the header.
 pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
     let fault = |fault: Fault| fault.at(file.path());
     let mut fixed = [0; FIXED_HEADER_BYTES];
@@ -494,8 +494,8 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
-/// Checks the footer at `offset` against the header. The footer's payload must have the length `payload_bytes`, which
-/// is the number of bytes between the footer record and the trailer.
+/// Checks the footer, whose record is at byte `offset` of the file, against the header. The footer's payload must have
+/// the length `payload_bytes`, which is the number of bytes between the footer record and the trailer.
 fn check_footer(
     footer: &FooterRecord,
     layout: &Layout,

@@ -23,7 +23,8 @@ pub(crate) fn align(offset: u64) -> u64 {
     offset.next_multiple_of(RECORD_BYTES)
 }
 
-/// Record of one tile. The same 64 bytes lie before the tile's stored bytes and in the index (table of tiles).
+/// Record of one tile (one column for a block of Gaussians and frames). The same 64 bytes lie before the tile's stored
+/// bytes and in the index (table of tiles).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TileRecord {
     pub(crate) id: TileId,

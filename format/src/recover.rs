@@ -158,16 +158,17 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<F
 }
 
 impl FoundRecords {
-    /// Returns the bytes of memory that the records found so far and the decoding of the largest tile take. Includes
-    /// the growth of the lists of records.
+    /// Returns the bytes of memory that the records found so far take, including the growth of their lists, plus those
+    /// for decoding the largest tile.
     fn bytes(&self, layout: &Layout) -> u64 {
         let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);
         let times = 2 * self.time_bytes + 64 * self.times.len() as u64;
         tiles as u64 + times + 3 * layout.largest_tile(u64::MAX)
     }
 
-    /// Adds the tile of the record at `position` if it is intact. Returns the number of stored bytes after the record,
-    /// which is 0 if the tile shares those of an earlier tile; `None` if the tile is damaged.
+    /// Adds the tile whose record is at byte `position` of the file, if the tile is intact. Returns the number of
+    /// stored bytes after the record, which is 0 if the tile shares those of an earlier tile; `None` if the tile is
+    /// damaged.
     fn add_tile(
         &mut self,
         file: &MappedFile,
@@ -195,8 +196,8 @@ impl FoundRecords {
     }
 }
 
-/// Reads the time stamps that follow the record at `position`, and checks them against the record's checksum and the
-/// layout.
+/// Reads the time stamps after the record `times`, which is at byte `position` of the file. Checks them against the
+/// record's checksum and the layout.
 pub(crate) fn read_times(file: &MappedFile, layout: &Layout, times: &TimesRecord, position: u64) -> Result<Vec<f64>> {
     let fault = |fault: Fault| fault.at(file.path());
     if !(1..=layout.frame_block).contains(&times.frames) {

@@ -1,4 +1,5 @@
-//! Serialization of encoded tiles that are kept outside a container until they are written.
+//! Serialization of encoded tiles (each one column for a block of Gaussians and frames) that are kept outside a
+//! container until they are written.
 
 use xxhash_rust::xxh3::xxh3_64;
 

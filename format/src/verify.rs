@@ -100,8 +100,8 @@ impl Reader {
         Ok(report)
     }
 
-    /// Checks that the record at `position` is followed by the time stamps of frame block `block`, equal to those in
-    /// the footer.
+    /// Checks that the record at byte `position` of the file is followed by the time stamps of frame block `block`, and
+    /// that these equal the time stamps in the footer.
     fn check_times(&self, record: &TimesRecord, block: u32, position: u64) -> Result<()> {
         let stamps = read_times(&self.file, &self.layout, record, position)?;
         let range = self.layout.frame_range(block, self.times.len() as u64);
@@ -128,7 +128,8 @@ impl Reader {
     }
 }
 
-/// Checks that the statistics in the record `tile` at `position` are those of the tile's values.
+/// Checks that the statistics in the record `tile` match `values`, the values of the tile. The record is at byte
+/// `position` of the file.
 pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
     let found = stats(bytemuck::cast_slice(values));
     // Bits are compared: a forged NaN must not pass, and −0 must not pass for +0.

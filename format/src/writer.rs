@@ -38,7 +38,7 @@ pub struct Writer {
     file: File,
     layout: Layout,
     header: Vec<u8>,
-    /// Offset in the file of the next record; a multiple of 64.
+    /// Offset in the file at which the next record is written; a multiple of 64.
     position: u64,
     times: Vec<f64>,
     /// Unnamed temporary file that contains the record of tile i at byte 64·i, or zeros if the tile is not written yet.
@@ -175,9 +175,9 @@ impl Writer {
     }
 
     /// Writes a tile that equals the last constant tile (all frames equal) of its column and Gaussian block. The file
-    /// becomes the same as by [`Writer::write_tile`] with that tile, but nothing is encoded again. Fails if there is no
-    /// such tile, if its time stamps have not been appended, if it was written before, or if no constant tile came
-    /// before it.
+    /// gets the same bytes as from [`Writer::write_tile`] with that constant tile, but nothing is encoded again. Fails
+    /// if there is no such tile, if its time stamps have not been appended, if it was written before, or if no constant
+    /// tile came before it.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
         let (index, frames) = self.unwritten_entry(at)?;
         let slot = index as usize % self.constants.len();
@@ -192,8 +192,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the position of a tile in the index (table of tiles) and its number of frames. Fails if the tile was
-    /// written before.
+    /// Returns the position of the tile `at` in the index (table of tiles), and its number of frames. Fails if the tile
+    /// does not exist yet or was written before.
     fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
@@ -205,7 +205,7 @@ impl Writer {
         Ok((index, (frames.end - frames.start) as u32))
     }
 
-    /// Returns whether the tile at position `index` of the index has been written.
+    /// Returns whether the tile at position `index` of the index (table of tiles) has been written.
     fn has_entry(&mut self, index: u64) -> Result<bool> {
         let mut bytes = Vec::new();
         let read = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
@@ -214,8 +214,8 @@ impl Writer {
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Adds the index entry of a tile whose record was appended to the file at `start`. After an error, the next record
-    /// is written at `start` again.
+    /// Adds the index entry `record` of a tile at position `index` of the index (table of tiles). The tile's record was
+    /// appended to the file at `start`. After an error, the next record is written at `start` again.
     fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
         let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));

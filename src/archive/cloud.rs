@@ -1,9 +1,10 @@
-//! Encodes the canonical Gaussians, each attribute and each further column on its own quantization grid.
+//! Encodes the canonical Gaussians of a model. Each attribute and each column (values of a Gaussian beyond its
+//! attributes) has its own quantization grid.
 //!
-//! Input: Gaussians with their attributes and further columns, and a quantization step for each. Output: entropy-coded
-//! symbols, and the order in which the Gaussians are restored. This order follows a Morton curve; a position is stored
-//! as the distance along the curve from the previous position. All other values are coded plane by plane; a plane is
-//! one scalar component for all Gaussians.
+//! Input: Gaussians with their attributes and columns, and a quantization step for each attribute and column. Output:
+//! entropy-coded symbols, and the order in which a decoder restores the Gaussians. This order follows a Morton curve. A
+//! position is stored as the distance along the curve from the previous position. All other values are coded plane by
+//! plane; a plane is one scalar component for all Gaussians.
 
 use std::collections::BTreeMap;
 
@@ -20,23 +21,23 @@ use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coe
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
-/// Quantization step number `k` of each attribute, in the order of [`ATTRIBUTES`]. The step is 2^(k/8); see
+/// Exponents `k` of the quantization steps 2^(k/8) of the attributes, in the order of [`ATTRIBUTES`]; see
 /// [`super::step_size()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
 /// Number of known values from which a value is predicted: the value of the previous Gaussian, the mean of the previous
 /// four, and the values of the same Gaussian in the two previous planes (scalar components).
 const NEIGHBORS: usize = 4;
-/// Number of bits per axis from which an index along the Morton curve is made.
+/// Number of bits per axis in an index along the Morton curve; the three axes together take 63 bits.
 const CURVE_BITS: u32 = 21;
 
-/// Further values of the Gaussians, which only some model formats have, such as coefficients of a motion. The values of
-/// a column share one quantization step.
+/// Column: values of the Gaussians beyond their attributes, which only some model formats have, such as coefficients of
+/// a motion. All values of a column share one quantization step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Column {
     /// Name of the column, unique among the columns of an archive.
     pub name: String,
-    /// Values of all Gaussians.
+    /// Values of the column, one row per Gaussian.
     pub values: AttributeValues,
 }
 
@@ -45,9 +46,9 @@ pub struct Column {
 #[serde(deny_unknown_fields)]
 pub(super) struct ColumnShape {
     pub(super) name: String,
-    /// Number of planes (scalar components).
+    /// Number of planes (scalar components) of the column.
     pub(super) planes: usize,
-    /// Quantization step `k`: 2^(k/8); see [`super::step_size()`].
+    /// Exponent `k` of the quantization step 2^(k/8) of the column; see [`super::step_size()`].
     pub(super) step: i32,
 }
 
@@ -59,9 +60,10 @@ pub(super) struct PointCloudShape {
     pub(super) sh_degree: usize,
     pub(super) steps: CloudSteps,
     pub(super) columns: Vec<ColumnShape>,
-    /// Minimum position on each axis, in quantization steps.
+    /// Minimum of the positions of all Gaussians on each axis, in quantization steps.
     pub(super) lowest: [i64; 3],
-    /// Number of low bits of each coordinate that are stored as plain bits and not used by the Morton curve.
+    /// Number of low bits of each coordinate of a position that are stored as plain bits. The Morton curve does not use
+    /// these bits.
     pub(super) loose: u32,
     /// Mean of every plane (scalar component), in quantization steps. The three planes of the position have none.
     pub(super) means: Vec<i64>,
@@ -74,17 +76,17 @@ pub(super) struct PointCloudShape {
 #[derive(Debug, Clone, Copy)]
 struct Plane {
     source: PlaneSource,
-    /// Index of the values that share a quantization step and entropy models: an index in [`ATTRIBUTES`], or the number
-    /// of attributes plus the index of a column.
+    /// Group of planes with which this plane shares its quantization step and entropy models: an attribute (its index
+    /// in [`ATTRIBUTES`]) or a column (the number of attributes plus the index of the column).
     group: usize,
 }
 
-/// Place of the values of a [`Plane`].
+/// Origin of the values of a [`Plane`]: an attribute or a [`Column`].
 #[derive(Debug, Clone, Copy)]
 enum PlaneSource {
-    /// Component of an attribute.
+    /// Attribute, and index of the scalar component of this attribute that the plane holds.
     Attribute(Attributes, usize),
-    /// Component (second number) of a column.
+    /// Index of a [`Column`], and index of the scalar component of this column that the plane holds.
     Column(usize, usize),
 }
 
@@ -137,13 +139,14 @@ impl PointCloudShape {
         })
     }
 
-    /// Returns the number of f32 values that all Gaussians have together; `None` if it overflows.
+    /// Returns the number of f32 values in the attributes and columns of all Gaussians; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
         self.gaussians.checked_mul(self.plane_count()?.checked_add(3)?)
     }
 }
 
-/// Returns `x` with two zero bits inserted between consecutive bits.
+/// Returns the lowest 21 bits of `x` with two zero bits inserted between consecutive bits. Higher bits of `x` are
+/// dropped.
 pub(crate) fn spread(x: u64) -> u64 {
     let mut x = x & ((1 << CURVE_BITS) - 1);
     for (shift, mask) in [
@@ -184,8 +187,8 @@ fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u
     (above, lowest, (64 - most.leading_zeros()).saturating_sub(CURVE_BITS))
 }
 
-/// Returns the index along the Morton curve of the position `place`, which is in quantization steps. The `loose` lowest
-/// bits of each coordinate are left out.
+/// Returns the index along the Morton curve of the position `place`, which is given in quantization steps from the
+/// minimum on each axis. The index leaves out the `loose` lowest bits of each coordinate.
 fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
     let [x, y, z] = place.map(|x| spread(x >> loose));
     x | y << 1 | z << 2
@@ -303,8 +306,8 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
     decoder.is_finished().then_some((cloud, columns))
 }
 
-/// Adaptive models for coding distances along the Morton curve. The number of bits of a distance is coded as two
-/// symbols; the bits below the highest one are plain.
+/// Adaptive entropy models of distances along the Morton curve. The number of bits of a distance is coded as two
+/// symbols. The bits below the highest one are stored as plain bits.
 struct CurveDistances {
     high: SymbolModel,
     low: [SymbolModel; 4],
@@ -384,7 +387,8 @@ impl PlaneCoder {
     }
 }
 
-/// Returns attribute, component and index in [`ATTRIBUTES`] of every plane of the attributes, with the position.
+/// Returns one entry for each plane (scalar component) of the attributes, including the position: the attribute, the
+/// index of the component in this attribute, and the index of the attribute in [`ATTRIBUTES`].
 fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usize)> {
     let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     positions.chain(attribute_planes(sh_degree).into_iter().filter_map(|plane| match plane.source {
@@ -393,8 +397,9 @@ fn components(sh_degree: usize) -> impl Iterator<Item = (Attributes, usize, usiz
     }))
 }
 
-/// Returns the quaternions `rotation`, but those that `grid` would make zero with ± one step in their largest component
-/// and zeros in the others. Renderers cannot show a Gaussian with a quaternion of zero.
+/// Returns a copy of the quaternions `rotation`. A quaternion that is not zero, but that `grid` would round to zero, is
+/// replaced by ± one step in its largest component and zeros in the others. Renderers cannot show a Gaussian with a
+/// quaternion of zero.
 fn nonzero_rotations(rotation: &AttributeValues, grid: QuantizationGrid) -> AttributeValues {
     let mut nonzero = rotation.clone();
     for i in 0..rotation.len() {
@@ -410,8 +415,8 @@ fn nonzero_rotations(rotation: &AttributeValues, grid: QuantizationGrid) -> Attr
     nonzero
 }
 
-/// Rounds values in place to the quantization grids of `steps`. Only attributes whose index in [`ATTRIBUTES`] is in
-/// `attributes` are rounded.
+/// Rounds attributes of the Gaussians `cloud` in place to the quantization grids of `steps`. `attributes` lists the
+/// attributes to round, as indices in [`ATTRIBUTES`].
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     if attributes.contains(&1) {
         cloud.rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));

@@ -98,7 +98,8 @@ impl BitModel {
     /// Model that has seen no bit: 0 and 1 are equally likely.
     pub(super) const NEW: BitModel = BitModel { zero: 1 << (PRECISION - 1), seen: 0 };
 
-    /// Returns the interval of `bit`, in units of 1/2^15: its start and its length.
+    /// Returns the probability interval of `bit`, in units of 1/2^15: its start, and its length, which is the
+    /// probability of `bit`.
     fn interval(&self, bit: bool) -> (u32, u32) {
         let zero = self.zero as u32;
         if bit { (zero, (1 << PRECISION) - zero) } else { (0, zero) }
@@ -142,7 +143,7 @@ impl SymbolEncoder {
         model.learn(bit);
     }
 
-    /// Writes a symbol with this start and length of its interval, in units of 1/2^15.
+    /// Writes the symbol that has the given probability interval (start and length), in units of 1/2^15.
     fn interval(&mut self, (start, length): (u32, u32)) {
         self.cost += f64::from(PRECISION) - f64::from(length).log2();
         self.symbols.push((start as u16, length as u16));

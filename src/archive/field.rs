@@ -18,13 +18,13 @@ use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::AttributeValues;
 
-/// Refinement of the quantization step of a texel that is read more, in eighths of an octave: the step becomes finer by
-/// this much when the squared interpolation weights, summed over the Gaussians that read the texel, double. The squared
-/// error of the texel counts in proportion to this sum.
+/// Decrease of the exponent `k` of a texel's quantization step 2^(k/8) for each doubling of the sum of its squared
+/// interpolation weights. The sum is over the Gaussians that read the texel. The squared error of the texel counts in
+/// proportion to this sum.
 const FINER_PER_OCTAVE: i32 = 4;
 
-/// Class of a weight whose quantization step has no offset. The class of another weight is this number plus its offset
-/// in eighths of an octave.
+/// Class of a weight whose quantization step has no offset. A class is a number that selects the quantization step: for
+/// any weight, it is this constant plus the offset of the weight's step, in eighths of an octave.
 const ZERO_OFFSET_CLASS: u8 = 100;
 
 /// Use of a tensor by the deformation field. It decides how an archive stores the tensor.
@@ -56,7 +56,8 @@ pub(super) struct TensorEntry {
     /// followed by one per column; any other tensor of weights has one per element. Empty if no offset is needed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
-    /// Mean of the values of the tensor, in quantization steps.
+    /// Mean of the texels that the deformation field reads, in quantization steps, for a feature plane; 0 for other
+    /// tensors.
     pub(super) mean: i64,
     /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
     pub(super) parts: PredictorWeights<NEIGHBORS>,
@@ -300,8 +301,8 @@ pub(super) fn decode(
 }
 
 /// Returns `tensor` rounded to the quantization grids of `steps`, as an archive would restore it. `position` holds the
-/// canonical positions, `space` is the box that the feature planes cover. One difference to an archive: rows of a plane
-/// over time that are read at no time keep their values.
+/// canonical positions, `space` is the box that the feature planes cover. Unlike an archive, treats all rows of a plane
+/// over time as read, so that each row keeps its own values.
 pub fn round_tensor(
     tensor: &Tensor,
     role: TensorRole,

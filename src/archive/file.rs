@@ -26,11 +26,11 @@ const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
 pub const HEADER_BYTES: usize = 12 + SECTIONS * 24 + 8;
 /// Compression level of zstd for the table of contents and the plain bytes (`blobs`), which are small sections.
 const ZSTD_LEVEL: i32 = 19;
-/// Maximum number of bytes of content per byte of the file. The contents of trained models are 20 to 60 times as large
-/// as their archives. In a malicious file, one bit of symbols could stand for about 800 bytes, and texels that are not
-/// stored for any number, but a file of 300 KB must not cost gigabytes.
+/// Maximum number of bytes of decoded content per byte of the file. The contents of trained models are 20 to 60 times
+/// as large as their archives. In a malicious file, one bit of symbols could stand for about 800 bytes of content, and
+/// texels that are not stored could add any amount. This limit prevents a file of 300 KB from taking gigabytes.
 const MAX_CONTENT_PER_BYTE: u64 = 512;
-/// Number of bytes that may be allocated while decoding even if the file is short.
+/// Number of bytes that may be allocated for decoding any archive, however short its file is.
 const ALWAYS_ALLOWED_BYTES: u64 = 64 << 20;
 
 /// Maximum length in bytes of the table of contents. The table of a trained model has about 50 KB. The values parsed
@@ -62,8 +62,8 @@ pub struct ArchiveSize {
 }
 
 impl ArchiveSize {
-    /// Creates the division of an archive of `total` bytes: `cloud` bytes for Gaussians, `field` bytes for the
-    /// deformation field, and the rest.
+    /// Returns the size of an archive of `total` bytes, divided by purpose: `cloud` bytes for Gaussians, `field` bytes
+    /// for the deformation field, and the remaining bytes for everything else.
     fn new(total: u64, cloud: u64, field: u64) -> ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
@@ -74,24 +74,26 @@ impl ArchiveSize {
     }
 }
 
-/// Defect of an archive: where it is, what was expected and what was found. Does not know the path of the file.
+/// Defect of an archive: its place in the file, the expected content and the content found. Does not contain the path
+/// of the file.
 #[derive(Debug)]
 pub(super) struct Damage {
     place: String,
     expected: String,
     found: String,
-    /// What the user can do.
+    /// Advice to the user, shown with the error message.
     advice: &'static str,
 }
 
-/// What a user can do about a damaged archive.
+/// Advice to the user for a damaged archive.
 const COPY_AGAIN: &str = "the archive is damaged or cut short; copy it again";
-/// What a user can do about an archive of another version.
+/// Advice to the user for an archive of another version.
 const WRITE_AGAIN: &str = "write the archive again from its model with this version of splatsieve, or open it with the \
                            version that wrote it";
 
 impl Damage {
-    /// Creates a defect. `place` is a part of the file, such as a section.
+    /// Creates a defect in the part `place` of the file, such as a section. `expected` and `found` describe the
+    /// expected content and the content found.
     pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into(), advice: COPY_AGAIN }
     }
@@ -187,8 +189,9 @@ impl ArchiveHeader {
         Ok(ArchiveHeader { whole, sections })
     }
 
-    /// Returns the number of bytes of memory for decoding, as far as the header tells: the bytes of the file and of the
-    /// `blobs`, each counted twice (as a whole and in parts), and 16 times the table of contents.
+    /// Returns the number of bytes of memory for decoding, estimated from the header alone: twice the bytes of the
+    /// file, twice the bytes of the `blobs` (both are held as a whole and in parts), and 16 times the table of
+    /// contents.
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;
         2 * self.whole + 16 * table + 2 * blobs

@@ -13,13 +13,14 @@ use super::field::TensorRole;
 use crate::deform::{Box3, Tensor, Tensors, TexelPair, texel_pair};
 use crate::model::AttributeValues;
 
-/// Maximum number of Gaussians at which the field is sampled.
+/// Maximum number of Gaussians at whose positions the deformation field is sampled.
 const GAUSSIANS: usize = 256;
 /// Number of times at which the field is sampled for each sampled Gaussian.
 const TIMES: usize = 4;
-/// Unit of the offsets, in eighths of an octave. Offsets are multiples of half an octave.
+/// Unit of the offsets of quantization steps, in eighths of an octave. Offsets are whole multiples of it, that is, of
+/// half an octave.
 const OFFSET_UNIT: f64 = 4.0;
-/// Maximum absolute offset, in units of [`OFFSET_UNIT`].
+/// Maximum absolute offset of a quantization step, in units of [`OFFSET_UNIT`].
 const MAX_OFFSET: f64 = 6.0;
 
 /// Returns, for each tensor of the deformation field, the offsets of its quantization steps, in eighths of an octave:
@@ -85,17 +86,17 @@ pub fn step_offsets(
     found
 }
 
-/// Adds to `found` the offsets of the quantization steps ([`importance_offsets`]) of the weights and of the bias of
-/// `layer`, by the names of the tensors. `rows` holds the importance of each output (effect of its errors on the
-/// result), `columns` the mean square of each input.
+/// Adds the offsets of the quantization steps ([`importance_offsets`]) of the weights and of the bias of `layer` to
+/// `found`, under the names of these two tensors. `rows`: importance of each output (effect of its errors on the
+/// result). `columns`: mean square of each input.
 fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [importance_offsets(rows), importance_offsets(columns)].concat());
     found.insert(format!("{}.bias", layer.name), importance_offsets(rows));
 }
 
-/// Returns offsets of quantization steps, in eighths of an octave. With them, steps are proportional to 1/√importance,
-/// and the factors of all steps have a geometric mean of one. Importance below 1e-4 of the largest counts as 1e-4 of
-/// the largest.
+/// Returns one offset of a quantization step per entry of `importance`, in eighths of an octave. The offsets make steps
+/// proportional to 1/√importance and leave their geometric mean unchanged, apart from rounding to [`OFFSET_UNIT`].
+/// Importance below 1e-4 of the largest counts as 1e-4 of the largest.
 fn importance_offsets(importance: &[f64]) -> Vec<i8> {
     let most = importance.iter().copied().fold(0.0, f64::max);
     let octaves: Vec<f64> = importance.iter().map(|x| -0.5 * (x.max(1e-4 * most) / most).log2()).collect();
@@ -213,8 +214,8 @@ struct Samples {
     width: usize,
     /// Inputs of the trunk (the layers that all heads share), `[samples, width]`.
     features: Vec<f32>,
-    /// For every plane: its name, the index of its first channel among the inputs, and for each channel the sum over
-    /// all samples of the squared product of the five other planes.
+    /// For every plane: its name, the index of its first channel among the inputs of the trunk, and for each channel
+    /// the sum over all samples of the squared product of the five other planes.
     plane_factors: Vec<(String, usize, Vec<f64>)>,
 }
 

@@ -46,7 +46,7 @@ pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 pub struct ArchiveContent {
     /// Canonical Gaussians.
     pub cloud: Gaussians,
-    /// Further values of the Gaussians, as many rows as `cloud` has.
+    /// Columns: values of the Gaussians beyond their attributes. Each column has one row per Gaussian of `cloud`.
     pub columns: Vec<Column>,
     /// Use of each tensor by the deformation field, by name; empty if there is no field.
     pub field: BTreeMap<String, TensorRole>,
@@ -61,10 +61,10 @@ pub struct ArchiveContent {
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// Quantization steps for encoding a [`ArchiveContent`].
+/// Quantization steps with which an [`ArchiveContent`] is encoded.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct QuantizationSteps {
-    /// Quantization step number of each attribute of the Gaussians.
+    /// Quantization step of each attribute of the Gaussians, as an exponent; see [`step_size()`].
     pub cloud: CloudSteps,
     /// Quantization step of each of [`ArchiveContent::columns`], as an exponent; see [`step_size()`].
     pub columns: Vec<i32>,
@@ -90,7 +90,8 @@ pub struct EncodedArchive {
 #[serde(deny_unknown_fields)]
 struct Table {
     cloud: cloud::PointCloudShape,
-    /// Bit patterns of the first and the last time (f32); decimal text would round them.
+    /// Bit patterns (f32) of the first and the last time at which the deformation field is evaluated; decimal text
+    /// would round these times.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
     /// Number of extra bytes per Gaussian that belong to no attribute.
@@ -253,8 +254,8 @@ pub fn field_box(content: &ArchiveContent) -> Option<Box3> {
     content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
 }
 
-/// Rounds values in place to the quantization grids of `steps`, as an archive would, but without changing the order of
-/// the Gaussians. Only attributes whose index in [`ATTRIBUTES`] is in `attributes` are rounded.
+/// Rounds attributes of the Gaussians `cloud` in place to the quantization grids of `steps`, as an archive would, but
+/// keeps the order of the Gaussians. `attributes` lists the attributes to round, as indices in [`ATTRIBUTES`].
 pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     cloud::round(cloud, steps, attributes);
 }

@@ -28,9 +28,9 @@ pub(super) struct QuantizedTensor<'a> {
     pub(super) classes: &'a [u8],
     /// Function that returns a quantization grid, given the index of a channel and the class of a place in it.
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
-    /// Number of classes that select a quantization grid.
+    /// Number of classes that select a quantization grid. [`UNREAD`] is not counted.
     pub(super) class_count: usize,
-    /// Mean of all values of the tensor, from which predictions start.
+    /// Value from which predictions start: the mean of a feature plane; 0 for weights.
     pub(super) mean: f32,
 }
 

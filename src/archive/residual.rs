@@ -1,9 +1,9 @@
 //! Codes prediction errors, in quantization steps. The expected size of an error, known from neighboring errors,
 //! selects the entropy model.
 //!
-//! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. Its position within the
-//! class is plain bits, because probabilities within a class hardly differ. The sign depends on the side of the
-//! predicted multiple on which the predicted value lies.
+//! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. The position of the
+//! magnitude within its class is stored as plain bits, because probabilities within a class hardly differ. The model of
+//! the sign depends on how far the predicted value lies above or below the nearest multiple of the step.
 
 use super::entropy::{BitModel, SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 use super::step::{OFFSETS, PredictedMultiple};
@@ -33,16 +33,16 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
 /// a quantization step.
 const CONTEXTS: usize = 16;
 
-/// Number of entropy models of signs for each offset of the predicted value: for the magnitudes 1, 2, 3, and all
-/// others.
+/// Number of entropy models of the sign for each [`PredictedMultiple::offset`]: one each for errors of magnitude 1, 2
+/// and 3, and one for all larger errors.
 const SIGN_CONTEXTS: usize = 4;
 
 /// Entropy models of prediction errors. Similar planes or tensors share them.
 #[derive(Debug, Clone)]
 pub(super) struct Residuals {
-    /// Model of the class of the magnitude for each range of the expected error size.
+    /// Entropy model of the class of an error's magnitude, for each range of the expected error size.
     classes: [SymbolModel; CONTEXTS],
-    /// Models of the sign by [`PredictedMultiple::offset`] and class of the magnitude.
+    /// Entropy models of the sign of an error, by [`PredictedMultiple::offset`] and class of the magnitude.
     signs: [[BitModel; SIGN_CONTEXTS]; OFFSETS],
 }
 
@@ -60,8 +60,8 @@ impl Residuals {
         &mut self.classes[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    /// Returns the entropy model of the sign of a prediction error. `class` is the class of its magnitude (the length
-    /// of its bits), which is not 0; `offset` is the fractional part of the prediction, in classes.
+    /// Returns the entropy model of the sign of a prediction error. `offset`: [`PredictedMultiple::offset`] of the
+    /// prediction. `class`: class of the magnitude of the error (index in [`CLASSES`]), not 0.
     fn sign_model(&mut self, offset: usize, class: usize) -> &mut BitModel {
         &mut self.signs[offset][(class - 1).min(SIGN_CONTEXTS - 1)]
     }

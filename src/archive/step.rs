@@ -44,10 +44,10 @@ pub fn nearest_step_number(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEP_NUMBERS.start(), *STEP_NUMBERS.end())
 }
 
-/// Number of intervals of a [`PredictedMultiple`].
+/// Number of intervals into which [`PredictedMultiple::offset`] divides a quantization step.
 pub(super) const OFFSETS: usize = 8;
 
-/// Multiple of a quantization step that is nearest to a predicted value.
+/// Multiple of a quantization step that is nearest to a predicted value, and the offset of the value from it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PredictedMultiple {
     pub(super) multiple: i64,

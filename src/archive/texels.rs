@@ -49,8 +49,9 @@ pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usi
     squared_weights.into_iter().map(class).collect()
 }
 
-/// Returns the class (which selects the quantization grid) of each column, `[size]`, of a feature plane over one
-/// spatial axis and time. `position` holds the canonical positions, `space` is the box that the plane covers.
+/// Returns the class of each of the `size` columns of a feature plane over one spatial axis and time. A class selects
+/// the quantization grid of its column. `position` holds the canonical positions, `space` is the box that the plane
+/// covers.
 pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {

@@ -33,7 +33,7 @@ const VERSION: u32 = 1;
 const HEADER: usize = 48;
 /// Extension of the file names of cache entries.
 pub(super) const EXTENSION: &str = ".piece";
-/// Maximum size, bytes, of the buffer into which all strings in the value of an entry are read.
+/// Maximum size, in bytes, of the buffer that holds the strings of a cache entry while its value is deserialized.
 const MAX_STRING_BYTES: u64 = 8 << 20;
 
 /// File name of a cache entry.

@@ -35,8 +35,8 @@ pub use folder::{StoredResult, format_list, list_results, remove_entries};
 pub use key::CacheKey;
 pub use spill::{Spill, SpillWriter};
 
-/// Work folder that the user asks for, and the shard (part of a divided stage) that the run is to compute, if it is
-/// limited to one.
+/// Request for a cache: the path of the work folder, and the shard (part of a divided stage) to which the run is
+/// limited, if any.
 #[derive(Debug, Clone)]
 pub struct CacheRequest {
     /// Path of the work folder.
@@ -46,8 +46,8 @@ pub struct CacheRequest {
     pub part: Option<Shard>,
 }
 
-/// Cache of stage results in a work folder, and the shard (part of a divided stage) that this run computes. Without a
-/// work folder, nothing is stored.
+/// Cache of stage results in a work folder. Without a work folder, nothing is stored. Also holds the shard (part of a
+/// divided stage) to which this run is limited, if any.
 #[derive(Debug, Default)]
 pub struct Cache {
     dir: Option<CacheDir>,
@@ -128,9 +128,9 @@ impl Cache {
         self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
-    /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it. A
-    /// run that is limited to one shard (part) of a divided stage does the same, because `stage` is not divided. To end
-    /// such a run instead, `compute` calls [`Cache::end_shard_run_before`].
+    /// Returns the result of `stage` for `key` if it is stored. Otherwise computes it with `compute` and stores it.
+    /// `stage` is not divided into shards (parts), so a run that is limited to one shard does the same. To end such a
+    /// run instead, `compute` calls [`Cache::end_shard_run_before`].
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -148,8 +148,8 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends the run by an error if it is limited to one shard (part) of a divided stage. To be called before `stage`,
-    /// which cannot be divided. In all other runs does nothing.
+    /// Ends the run with an error if it is limited to one shard (part of a divided stage). Otherwise does nothing. To
+    /// be called before `stage`, which cannot be divided.
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] if the run is limited to one shard.
@@ -195,10 +195,10 @@ impl Cache {
         self.complete(stage, whole)
     }
 
-    /// Returns the result of `stage` for `key`, which is computed in shards like [`Cache::compute_in_shards`] but stays
-    /// on disk. `write` writes the result of a range of units of work. Without a work folder, the results go to a
-    /// scratch file in the folder `scratch`. For each shard, returns the range of its units, and the file content that
-    /// holds their result.
+    /// Computes the result of `stage` for `key` in shards, as [`Cache::compute_in_shards`] does, but leaves it on disk.
+    /// `write` writes the result of a range of units of work. Without a work folder, the result goes to a scratch file
+    /// in the folder `scratch`. For each shard, returns the range of its units, and the file content that holds their
+    /// result.
     ///
     /// # Errors
     /// Fails where [`Cache::compute_in_shards`] fails.
@@ -231,8 +231,8 @@ impl Cache {
         self.complete(stage, spills)
     }
 
-    /// Returns `whole`, the full result of `stage`. If the run is limited to shard (part of a divided stage) 1 of 1,
-    /// which is the whole stage, fails with [`Error::ShardDone`] instead.
+    /// Returns `whole`, the full result of `stage`. Fails with [`Error::ShardDone`] instead if the run is limited to
+    /// shard 1 of 1: this shard is the whole stage, and such a run ends when its shard is done.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Shard::WHOLE) => {

@@ -45,7 +45,7 @@ impl Shard {
     /// Shard 1 of 1, which contains all the work.
     pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
-    /// Returns all shards (parts of a divided stage) of a stage divided into `count` shards, in order.
+    /// Returns all `count` shards (parts) of a divided stage, in order.
     pub(super) fn all(count: usize) -> impl Iterator<Item = Shard> {
         (1..=count).map(move |index| Shard { index, count })
     }

@@ -29,8 +29,8 @@ const MIN_BAR_COLUMNS: usize = 8;
 
 /// Receiver of the library's events, which displays them on standard error.
 pub(super) struct Display {
-    /// Whether to hide progress and the messages about results that a stage computed but the run does not use. Plans
-    /// are always shown, because the user requests them. Warnings are always shown too.
+    /// Whether to hide progress, and messages about a result that a stage computed but the run does not use
+    /// ([`Message::Discarded`]). Plans are always shown, because the user requests them. Warnings are always shown too.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
@@ -42,7 +42,7 @@ struct Shared {
     bars: MultiProgress,
     /// Number of running tasks whose progress is written as log lines.
     logs: AtomicUsize,
-    /// Running stage and start of the current run; `None` outside a run.
+    /// Stages, start and running stage of the current run; `None` outside a run.
     run: Mutex<Option<RunPosition>>,
 }
 

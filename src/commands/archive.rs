@@ -40,10 +40,10 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 }
 
 /// Writes the model in the archive at `path` to `output` in the form in which it was archived: as a model folder or a
-/// single file. Some archives also hold the file layout of their model format. If such an archive is to become another
-/// kind of output (`kind`), returns `None` and writes nothing; the caller then opens the archive as an input and
-/// converts it.
-///
+/// single file. Returns `None` and writes nothing if this form does not match `kind`, the requested kind of output. An
+/// archive that holds the file layout of its model format matches only the kind of this layout; any other archive
+/// matches a model folder and a PLY. If there is no match, the caller then opens the archive as an input and converts
+/// it.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
@@ -100,8 +100,8 @@ pub fn unpack_archive(
 /// archive have about 50 dB PSNR against renders of the input. If the input consists of explicit frames, the archive is
 /// a container with bounded errors, whose bounds are chosen in the same way. Returns the report on the written file.
 ///
-///  # Errors Fails if the input cannot be read or has no archives, or if the output exists already or cannot be
-/// written.
+/// # Errors
+/// Fails if the input cannot be read or has no archives, or if the output exists already or cannot be written.
 pub fn write_archive(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<ConvertReport> {
     if input.is_stream() {
         return Err(Error::usage(

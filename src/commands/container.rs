@@ -179,7 +179,7 @@ fn packed(
     }
 }
 
-/// Writes any input to `to` as a frame stream and returns the opened input.
+/// Writes all frames of `input` to `to` as a frame stream and returns the opened input.
 ///
 /// Memory: see [`unpack_estimates`].
 pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput> {

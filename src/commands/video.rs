@@ -124,7 +124,7 @@ pub fn video(options: &VideoOptions) -> Result<VideoReport> {
 }
 
 /// Removes the times from the shots (views of the scene) of `opened`, so that every camera can show every frame.
-/// Returns a copy of the shots from before, with their times. Does nothing and returns `None` in two cases:
+/// Returns a copy of the original shots, with their times. Does nothing and returns `None` in two cases:
 /// - There are no cameras.
 /// - `has_other_frames` is false: the frames are at the times of the cameras.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {

@@ -161,8 +161,8 @@ fn merge_only_count(found: &TradeOff) -> Option<usize> {
     found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Returns whether `method` is merging without pruning and merging alone leaves more Gaussians than `fraction` allows,
-/// according to the points in `found`.
+/// Returns whether `method` is merging without pruning and cannot reach `fraction`, because merging alone leaves more
+/// Gaussians. This is known from the points measured so far, in `found`.
 fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
     let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)

@@ -50,9 +50,9 @@ pub struct TestSceneOptions {
 pub struct TestSceneReport {
     /// Summary of the compression.
     pub summary: Summary,
-    /// One entry per body (object of the test scene): the body, its number of Gaussians, the number of those that were
-    /// kept (unmerged, or as the first member of a merged group), and the number of those that were merged into others.
-    /// The rest was pruned.
+    /// One entry per body (object of the test scene): the body, its number of Gaussians, the number of its Gaussians
+    /// that were kept (unmerged, or as the first member of a merged group), and the number of its Gaussians that were
+    /// merged into others. All other Gaussians of the body were pruned.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 

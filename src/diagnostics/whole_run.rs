@@ -35,9 +35,10 @@ pub(crate) struct WholeRun<'a> {
 }
 
 impl WholeRun<'_> {
-    /// Compresses the input to `target` Gaussians by the recipe or baseline `means`, as often as `repeats` allows, and
-    /// measures time and memory. Then calls `look` with the path of the last result, and deletes this result. Returns
-    /// the value of `look` and the cost of the compression.
+    /// Compresses the input by the recipe or baseline `means`, as often as `repeats` allows, and measures time and
+    /// memory. `target`: number or fraction of the Gaussians to keep; `None`: `means` decides. Then calls `look` with
+    /// the path of the last result, and deletes this result. Returns the value of `look` and the cost of the
+    /// compression.
     ///
     /// # Errors
     /// Returns the errors of `compress` and of `look`.

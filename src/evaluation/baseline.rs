@@ -51,8 +51,8 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     write_without_companions(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// Returns the `target_count` ids in `ids` with the largest values of the property by which `baseline` ranks, sorted by
-/// id. `state`: attributes of the Gaussians, in the row of their id.
+/// Returns the `target_count` ids in `ids` with the largest values of the property by which `baseline` ranks, in
+/// increasing order. Row i of `state` holds the attributes of the Gaussian with the id i.
 fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;

@@ -1,4 +1,4 @@
-//! Measurement of the time and memory of work that is repeated.
+//! Measurement of the time and memory of a piece of work, by running the work several times.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,7 @@ use crate::machine::{peak_memory_bytes, reset_peak_memory};
 /// Time and memory of repeated runs of the same work.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
-    /// Number of runs.
+    /// Number of runs that were measured.
     pub runs: usize,
     /// Wall-clock seconds of one run.
     pub seconds: MedianAndRange,
@@ -23,11 +23,11 @@ pub struct Cost {
 /// Median and range of the values of repeated runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MedianAndRange {
-    /// Median; the mean of the two middle values if the number of values is even.
+    /// Median of the measured values; the mean of the two middle values if their number is even.
     pub median: f64,
-    /// Smallest value.
+    /// Smallest of the measured values.
     pub least: f64,
-    /// Largest value.
+    /// Largest of the measured values.
     pub most: f64,
 }
 
@@ -52,7 +52,7 @@ impl MedianAndRange {
 pub struct RepeatLimits {
     /// Maximum number of runs; the work always runs at least once.
     pub most: usize,
-    /// Total seconds of all runs after which no further run starts.
+    /// Limit on the total time of the runs, seconds. No further run starts after this time is reached.
     pub enough: f64,
 }
 

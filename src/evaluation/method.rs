@@ -68,8 +68,8 @@ impl Method {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
-    /// Returns the recipe by which this method compresses, with the stages that run (pruning, merging or both), or the
-    /// baseline by which it prunes.
+    /// Returns how this method compresses. This is either a recipe, together with the stages that run (pruning, merging
+    /// or both), or a baseline, which only prunes by one property.
     ///
     /// # Errors
     /// Fails only if a built-in preset does not parse.
@@ -104,14 +104,15 @@ impl Method {
         }
     }
 
-    /// Returns whether this method can choose the number of Gaussians itself, by thresholds.
+    /// Returns whether this method has thresholds by which it can choose the number of Gaussians itself, without a
+    /// target.
     pub(crate) fn chooses_size(self) -> bool {
         matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
     }
 }
 
-/// Recipe or baseline by which a method compresses. The second field of a recipe states which stages run: pruning,
-/// merging or both.
+/// Recipe or baseline by which a method compresses. The second field of [`MethodKind::Recipe`] states which stages run:
+/// pruning, merging or both.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, PruneOrMerge),
     Baseline(Baseline),
@@ -120,8 +121,8 @@ pub(crate) enum MethodKind {
 /// Name of the recipe parameter that the option `--steps` varies.
 pub(crate) const STEPS: &str = "refine_steps";
 
-/// Returns the preset `default` with `steps` optimization steps of refinement, as a method. The number of steps before
-/// each prune step changes in proportion to `steps`.
+/// Returns the method that compresses by the preset `default` with `steps` optimization steps of refinement. The number
+/// of steps before each prune step changes in proportion to `steps`.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
     Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.with_refinement_steps(steps)), PruneOrMerge::Both))
 }

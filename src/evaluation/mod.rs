@@ -1,10 +1,10 @@
 //! Evaluation: compares renders of the original and the compressed model with each other and with photographs.
 //!
-//! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. For the
-//! temporal error (flicker between two frames of a view), the last images of every view that occurs again are kept: 12
-//! bytes per pixel and image, with two images per view (renders of both models), or three with photographs. A run that
-//! computes only a shard (a range of the (frame, view) pairs) first renders again, for each view in its range, the last
-//! image before the range.
+//! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. Memory
+//! also holds the last images of every view that occurs again at a later frame, to measure the temporal error (flicker
+//! between two frames of a view). These images take 12 bytes per pixel each. There are two per view (renders of both
+//! models), or three with photographs. A run can be limited to a shard, which is a range of the (frame, view) pairs. It
+//! first renders again, for each view in its range, the last image of this view before the range.
 
 pub mod baseline;
 pub mod cost;
@@ -209,9 +209,10 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// Compares all views, as [`ModelPair::evaluate`] does, but as the first stage of a longer run. The difference: a
-    /// run that is limited to one shard (part of a divided stage) returns the evaluation if the scores of all shards
-    /// are in the cache, so that it can go on to the next stage.
+    /// Compares all views and returns the evaluation, as [`ModelPair::evaluate`] does, but as the first stage of a
+    /// longer run. Such a run may be limited to one shard (part of a divided stage). If the cache has the scores of all
+    /// shards, this function then returns the evaluation, so that the run can go on to its next stage; otherwise it
+    /// fails with [`Error::ShardDone`].
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -350,7 +351,8 @@ impl ModelPair {
     /// indices of these views in [`Evaluation::views`], in any order. Arguments of `see`: the index, the frame state of
     /// the original, the camera, and the images of the view.
     ///
-    /// Renders are not kept from the comparison, because they would take memory that grows with frames and views.
+    /// The comparison does not keep its renders for this purpose, because they would take memory that grows with the
+    /// numbers of frames and views.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -428,9 +430,9 @@ impl ModelPair {
         )
     }
 
-    /// Returns, for the views in `range`, the scores and the values of `observe`. The temporal error of a view compares
-    /// it with the image of the same view at an earlier frame. So the last image before `range` of every view in
-    /// `range` is rendered again first.
+    /// Renders and compares the views in `range`. Returns the scores of these views and the values of `observe` for
+    /// them. The temporal error of a view needs the image of the same view at an earlier frame. Therefore the last
+    /// image before `range` is first rendered again, for every view in `range`.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -496,9 +498,9 @@ impl ModelPair {
     }
 }
 
-/// Returns, for every view that occurs in a range of images, the last image of this view before the range. `all`:
-/// (frame, view) pairs of all images, sorted by frame. `range`: pairs of the images in the range, which begins at the
-/// index `start` of `all`. The result is in the order of `all`.
+/// Returns, for each view number in `range`, the last (frame, view) pair with this view number before the range. `all`:
+/// (frame, view) pairs of all images, sorted by frame. `range`: part of `all` that begins at the index `start`. The
+/// result has the order of `all`.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =
@@ -507,8 +509,8 @@ fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<F
     last
 }
 
-/// Scores of one view: first of the compressed model against the original, then of each model against the photograph if
-/// there is one.
+/// Scores of one view. First: scores of the compressed model against the original. Second: scores of each model against
+/// the photograph, if there is one.
 type PairScores = (ImageScore, Option<OriginalAndCompressed<ImageScore>>);
 
 /// Images of one view at one frame, all of the same size.

@@ -52,11 +52,11 @@ pub struct PrecisionDiagram {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ErrorSource {
-    /// Sampling, such as leaving out views, or a finite step size.
+    /// Error of sampling, such as leaving out views or using a finite step size.
     Discretization,
-    /// Rounding to a finite number of digits.
+    /// Error of rounding to a finite number of digits.
     Rounding,
-    /// Replacement of a model by a smaller one.
+    /// Error of replacing a model by a smaller one.
     Model,
 }
 
@@ -100,8 +100,9 @@ pub struct PrecisionCurve {
     /// Value that the recipe has for the parameter; `None` if this value was not measured.
     #[serde(rename = "own")]
     pub recipe_value: Option<f64>,
-    /// Coarsest sufficient value of the parameter: at this and all finer values, the error added to renders stays below
-    /// a tenth of the error of the compressed model itself. `None` if there is no such value.
+    /// Coarsest sufficient value of the parameter; `None` if no value is sufficient. A value is sufficient if, at this
+    /// value and at all finer ones, the error added to renders stays below a tenth of the error of the compressed model
+    /// itself.
     #[serde(rename = "enough")]
     pub sufficient_value: Option<f64>,
 }
@@ -111,8 +112,8 @@ pub struct PrecisionCurve {
 pub struct PrecisionSetting {
     /// Value of the varied parameter.
     pub value: f64,
-    /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, whose
-    /// rounding errors grow with the number of frames, h is this number.
+    /// Step size h that belongs to this value: an error of order p is proportional to h^p. For sums over frames, h is
+    /// the number of frames, because rounding errors grow with it.
     pub step: f64,
     /// Time and memory of the runs with this setting.
     pub cost: Cost,
@@ -154,8 +155,8 @@ pub const PERCENTILE_ERROR: &str = "percentiles";
 /// 0.
 pub const DIFFERENT_BYTES: &str = "bytes";
 
-/// Upper limit of a small error [`ADDED_ERROR`]: at [`PrecisionCurve::sufficient_value`] and at all finer values, the
-/// error is below this limit.
+/// Limit below which the error [`ADDED_ERROR`] counts as small. The error is below this limit at
+/// [`PrecisionCurve::sufficient_value`] and at all finer values.
 const SMALL_ADDED_ERROR: f64 = 0.1;
 
 /// Returns the axis label of a diagram for the error with the name `error`.

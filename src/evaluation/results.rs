@@ -102,9 +102,9 @@ pub struct Comparison {
     /// Mean scores over all views.
     #[serde(flatten)]
     pub overall: QualityMeans,
-    /// Means over the frames of each view, by increasing view number.
+    /// Mean scores over the frames of each view, by increasing view number.
     pub per_view: Vec<ViewMeans>,
-    /// Means over the views of each frame, by increasing frame.
+    /// Mean scores over the views of each frame, by increasing frame.
     pub per_frame: Vec<FrameMeans>,
 }
 
@@ -126,10 +126,10 @@ pub struct TruthComparison {
 /// the rig of the training cameras (the cone of their directions, [`RigCone`](crate::scene::views_outside::RigCone)).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct InsideOutsideMeans {
-    /// Means over the views inside the rig: in the directions of the training cameras and between them. `None` if there
-    /// are no such views.
+    /// Mean scores over the views inside the rig: in the directions of the training cameras and between them. `None` if
+    /// there are no such views.
     pub inside: Option<QualityMeans>,
-    /// Means over the views outside the rig.
+    /// Mean scores over the views outside the rig of the training cameras.
     pub outside: QualityMeans,
 }
 

@@ -20,7 +20,7 @@ pub struct TradeOff {
     pub gaussians: usize,
     /// Bytes of all files of the input.
     pub bytes: u64,
-    /// Number of threads.
+    /// Number of threads that every measured run used.
     pub threads: usize,
     /// Number of (frame, view) pairs on which every result is compared with the original.
     pub pictures: usize,
@@ -74,7 +74,7 @@ pub struct EffortCurve {
 pub struct EffortSetting {
     /// Value of the varied parameter.
     pub value: u32,
-    /// Method, fraction of kept Gaussians, and measurements.
+    /// Measurements with this value of the parameter, with the method and the fraction of kept Gaussians.
     #[serde(flatten)]
     pub point: TradeOffPoint,
 }

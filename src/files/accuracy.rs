@@ -15,10 +15,11 @@
 //! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
 //! change it. The distance of two positions is the largest of the differences along x, y and z.
 //!
-//! A scale may become smaller by any amount if the stored one is still more than ten times the distance from the
-//! Gaussian's center to the far side of the scene (the distance from the median position, plus the scene size, which must
-//! not be 0). Along such an axis the density falls by less than 1/200 within the scene, whatever the scale is. Captured
-//! scenes have such Gaussians, and formats with a largest scale, such as `.spz`, store them with that one.
+//! A scale may become smaller by any amount if the stored scale is still at least ten times the distance from the
+//! Gaussian's center to the far side of the scene. This distance is the distance of the center from the median position
+//! plus the scene size, which must not be 0. Along such an axis the density falls by less than 1/200 within the scene,
+//! whatever the scale is. Captured scenes have such Gaussians. Formats with a maximum scale, such as `.spz`, store the
+//! maximum for them.
 
 use std::path::Path;
 
@@ -27,13 +28,13 @@ use crate::model::{AttributeValues, Gaussians, color_from_sh, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
 const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
-/// Error of positions and scales that is allowed for every Gaussian, however small it is, as a fraction of the scene
-/// size.
+/// Lower limit of the maximum error of positions and scales, as a fraction of the scene size. An error up to this limit
+/// is allowed for every Gaussian, however small it is.
 const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
 /// Maximum error of a scale, as a fraction of its value.
 const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
-/// Ratio of a scale to the distance from the Gaussian's center to the far side of the scene, from which on the exact
-/// scale does not matter.
+/// Ratio of a stored scale to the distance from the Gaussian's center to the far side of the scene. At this ratio or
+/// above, the exact value of the scale does not matter.
 const FLAT_SCALE: f64 = 10.0;
 /// Maximum error of opacities and base colors, which are in [0, 1].
 const MAX_COLOR_ERROR: f64 = 0.02;
@@ -108,8 +109,8 @@ pub struct CodingErrors {
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
-    /// Number of Gaussians with a scale that the file stores smaller by more than the bound, because it is much larger
-    /// than the scene either way.
+    /// Number of Gaussians with a scale whose stored value is smaller by more than the usual bound. This is allowed,
+    /// because the stored scale is still much larger than the scene.
     reduced_scales: usize,
     /// Error that exceeds its allowed maximum by the largest factor; `None` if no error exceeds its maximum.
     worst: Option<Excess>,
@@ -117,7 +118,7 @@ pub struct CodingErrors {
 
 impl CodingErrors {
     /// Creates a record of coding errors that has no errors yet. `positions` holds the positions of all Gaussians of
-    /// the file. The scene size, to which position errors are compared, follows from them.
+    /// the file. They determine the scene size, on which the bounds of position and scale errors depend.
     pub fn new(positions: &AttributeValues) -> CodingErrors {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
@@ -132,8 +133,8 @@ impl CodingErrors {
         self.position
     }
 
-    /// Returns the number of Gaussians added so far with a scale that is stored smaller by more than the bound of other
-    /// scales, because it is much larger than the scene either way.
+    /// Returns the number of Gaussians added so far with a scale whose stored value is smaller by more than the usual
+    /// bound. This is allowed, because the stored scale is still much larger than the scene.
     pub fn reduced_scales(&self) -> usize {
         self.reduced_scales
     }
@@ -180,8 +181,9 @@ impl CodingErrors {
         self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
-    /// Compares `error` with its maximum `bound`. Keeps the error as the worst one if it exceeds `bound`, and by a
-    /// larger factor than all errors before. `quantity` names the attribute of Gaussian `id` for messages.
+    /// Compares `error` with its maximum `bound`. Records the error as the worst one if it exceeds `bound` by a larger
+    /// factor than every earlier error exceeds its own bound. `quantity` names the attribute of Gaussian `id` for
+    /// messages.
     fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
         let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };

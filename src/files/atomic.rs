@@ -40,7 +40,7 @@ use workspace::{SCRATCH, Workspace, user_path};
 /// - a target without a name, or in a folder that does not exist
 /// - a target that is an input, contains an input or lies inside an input, even if the path leads there only through
 ///   links; this holds for every value of `replace`
-/// - an existing target that `replace` does not allow to replace (a folder may always replace an empty folder)
+/// - an existing target that `replace` does not allow replacing (a folder may always replace an empty folder)
 /// - a file in place of a folder, or the reverse
 /// - sockets, block devices and dangling links
 ///
@@ -128,7 +128,7 @@ impl StagedFile {
     /// yet. Returns the handle through which the file is written and published.
     ///
     /// # Errors
-    /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
+    /// Fails if the target has no name, if it exists and `replace` does not allow replacing it, or if a system call
     /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
         let is_stream = destination(target)? == Destination::Stream;
@@ -168,10 +168,10 @@ pub struct StagedFiles {
 }
 
 impl StagedFiles {
-    /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
-    /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
-    /// the summary (JSON file that describes the result). `replace` says which existing files may be replaced. Returns
-    /// the handle through which the files are written and published.
+    /// Prepares to write the output file `target` and the files `companions` beside it. All of them must have passed
+    /// [`check_targets`]. The name of each companion must begin with the name of `target`. The first companion is the
+    /// summary (JSON file that describes the result). `replace` says which existing files may be replaced. Returns the
+    /// handle through which the files are written and published.
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -240,7 +240,7 @@ impl StagedFolder {
     /// Creates an empty hidden folder that will become `target`, which must have passed [`check_target`].
     ///
     /// # Errors
-    /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
+    /// Fails if the target has no name, if it exists and `replace` does not allow replacing it, or if a system call
     /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
         let workspace = output_workspace(target, TargetKind::Folder, replace)?;
@@ -254,13 +254,13 @@ impl StagedFolder {
         &self.content
     }
 
-    /// Syncs everything to disk and gives the folder its final name. Before that, adds the list of all files in the
-    /// folder to its summary (`summary.json`), if it has one.
+    /// Syncs the folder with all its files to disk and gives it its final name. Before that, adds the list of all files
+    /// in the folder to its summary (`summary.json`), if it has one.
     ///
-    /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in it
-    /// (files that its summary does not list) are moved into the new folder. If the run is killed meanwhile, either the
-    /// earlier or the new folder is complete. The foreign files are then in this folder or in the hidden workspace,
-    /// from where the next run with this output moves them.
+    /// An earlier folder of this name is moved aside and deleted after the new one is in place. Foreign files in the
+    /// earlier folder (files that its summary does not list) are moved into the new folder. If the run is killed
+    /// meanwhile, either the earlier or the new folder is complete. The foreign files are then in the complete folder
+    /// or in the hidden workspace, from where the next run with this output moves them.
     ///
     /// # Errors
     /// Fails if the summary is not a JSON object, if the target appeared meanwhile and may not be replaced, or if a
@@ -336,9 +336,9 @@ impl ScratchFolder {
     }
 }
 
-/// Returns `error` with the output path that the user gave in place of a path in a hidden workspace. For a scratch
-/// file, the error then names the folder that holds it. Only errors of system calls contain such paths; other errors
-/// are returned unchanged.
+/// Replaces a path in a hidden workspace, if `error` contains one, by a path that the user knows, and returns the
+/// error. For an output this is the output path that the user gave; for a scratch file, the folder that holds the file.
+/// Only errors of system calls contain such paths; other errors are returned unchanged.
 pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {

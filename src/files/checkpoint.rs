@@ -153,7 +153,7 @@ pub(crate) struct TensorView {
 /// Byte ranges in the pickle at which the numbers that describe a tensor are written.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct NumberRanges {
-    /// Byte range of the number of values of the storage.
+    /// Byte range of the number that states how many values the storage holds.
     pub(crate) numel: Range<usize>,
     pub(crate) offset: Range<usize>,
     pub(crate) shape: Vec<Range<usize>>,
@@ -281,8 +281,8 @@ impl Checkpoint {
         Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
     }
 
-    /// Checks that `bytes` bytes of memory may be taken for reading `what`. `place` is the place of `what` in the file,
-    /// for messages. Fails if the memory limit for reading is exceeded.
+    /// Checks that `bytes` bytes of memory may be used for reading `what`, which is at `place` in the file. Fails if
+    /// the memory limit for reading is exceeded; the error names `what` and `place`.
     pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
         self.memory.check(&self.path, place, what, bytes)
     }
@@ -292,7 +292,7 @@ impl Checkpoint {
         &self.pickle
     }
 
-    /// Builds the error that says that `found` is at `place` in the file, where `expected` should be.
+    /// Returns the error for a file in which `found` is at `place` instead of `expected`.
     pub(crate) fn wrong(&self, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(&self.path, place, expected, found)
     }
@@ -469,7 +469,7 @@ impl Checkpoint {
 pub(crate) enum CheckpointFile<'a> {
     /// Pickle that describes the objects.
     Pickle,
-    /// Storage (block of tensor values) with this key.
+    /// Storage (block of tensor values), with its key.
     Storage(&'a str),
     /// Any other file.
     Other,

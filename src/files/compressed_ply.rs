@@ -1,13 +1,14 @@
 //! Reader of `.compressed.ply` files (SuperSplat): a PLY whose Gaussians are packed into four 32-bit words each.
 //!
-//! The element `chunk` holds the ranges of 256 successive Gaussians. The element `vertex` holds, from the highest bits:
+//! A row of the element `chunk` holds the range (smallest and largest value) of each component over a chunk of 256
+//! successive Gaussians. A row of the element `vertex` holds one Gaussian. Bits are counted from the highest:
 //!
 //! | property | bits | value |
 //! |---|---|---|
-//! | `packed_position` | 11, 10, 11 | x, y, z between the smallest and the largest of the chunk |
-//! | `packed_rotation` | 2, 10, 10, 10 | component of w, x, y, z that is left out; the others from −1/√2 to 1/√2 |
-//! | `packed_scale` | 11, 10, 11 | ln s of x, y, z between the smallest and the largest of the chunk |
-//! | `packed_color` | 8, 8, 8, 8 | red, green, blue between those of the chunk, or 0 to 1 without `min_r`; opacity |
+//! | `packed_position` | 11, 10, 11 | x, y, z as fractions of their ranges in the chunk |
+//! | `packed_rotation` | 2, 10, 10, 10 | index of the omitted one of w, x, y, z; the others, from −1/√2 to 1/√2 |
+//! | `packed_scale` | 11, 10, 11 | ln s along x, y, z as fractions of their ranges in the chunk |
+//! | `packed_color` | 8, 8, 8, 8 | red, green, blue as fractions of their ranges (0 to 1 without `min_r`); opacity |
 //!
 //! The optional element `sh` holds one byte per coefficient `f_rest_*`, from −4 to 4. Source: the reader of
 //! splat-transform 3.7 of PlayCanvas.

@@ -43,7 +43,7 @@ use crate::error::Result;
 use crate::model::{Attributes, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
-/// Number of places in the file that are tested to find out whether the file is in the page cache.
+/// Number of positions in the file that are sampled to find out whether the file is in the page cache.
 const CACHE_SAMPLES: u64 = 64;
 
 impl FrameSource for Container {

@@ -100,8 +100,8 @@ impl Defects {
     }
 }
 
-/// Returns the first of `count` row indices or ids as a list for messages. `first` holds at least the first five of them,
-/// or all; further ones are not listed.
+/// Returns the first five of `count` row indices or ids as a list for messages, followed by dots if there are more.
+/// `first` holds at least the first five, or all if there are fewer.
 pub fn first_of(first: &[u32], count: usize) -> String {
     let listed: Vec<String> = first.iter().take(LISTED_ROWS).map(u32::to_string).collect();
     listed.join(", ") + if count > listed.len() { ", ..." } else { "" }

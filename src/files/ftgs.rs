@@ -106,7 +106,7 @@ pub struct Ftgs {
 }
 
 /// Defect of a row (Gaussian) with a value that is not finite: its name, whether the row is left out, and the reason.
-/// The next two constants describe zero quaternions in the same form.
+/// `ZERO_QUATERNION` and `KEPT_ZERO_QUATERNION` describe zero quaternions in the same form.
 const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
 const ZERO_QUATERNION: (&str, bool, &str) = (
     "zero quaternion",
@@ -241,8 +241,9 @@ pub fn write_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) -> Resul
     write_ftgs_with(params, clip, MIN_TIME_DEVIATION, path)
 }
 
-/// Writes a file as [`write_ftgs`] does, but with a minimum standard deviation in time of at most
-/// [`MIN_TIME_DEVIATION`] that leaves all deviations in `params` as they are.
+/// Writes a file as [`write_ftgs`] does, but so that players show every time window with the standard deviation in
+/// `params`. For this purpose the header states the smallest deviation as the minimum if it is below
+/// [`MIN_TIME_DEVIATION`].
 ///
 /// # Errors
 /// Fails if the file cannot be written.
@@ -255,7 +256,8 @@ pub fn write_exact_ftgs(params: &StoredParams, clip: &ClipTimes, path: &Path) ->
     write_ftgs_with(params, clip, if is_usual { MIN_TIME_DEVIATION } else { smallest }, path)
 }
 
-/// Writes a file whose header states `min_deviation`, the minimum standard deviation in time.
+/// Writes a file as [`write_ftgs`] does. The header states `min_deviation` as the minimum standard deviation of a time
+/// window.
 fn write_ftgs_with(params: &StoredParams, clip: &ClipTimes, min_deviation: f64, path: &Path) -> Result<()> {
     let degree = params.gaussians.sh_degree();
     let mut comments = vec![

@@ -21,7 +21,7 @@ use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::CheckedReader;
 
-/// Place for the error with which a seed (builder of a value) stops the parser, because the error type of the parser
+/// Storage for the error with which a seed (builder of a value) stops the parser. The error type of the parser itself
 /// cannot hold this error.
 #[derive(Debug, Default)]
 pub(crate) struct ParseAbort(RefCell<Option<Error>>);

@@ -7,10 +7,10 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::error::ShowPath;
 
-/// Number of leading folders that a file must have in common with the recipe that names it, so that the recipe records
-/// the file by a relative path. With fewer common folders, a relative path could reveal a folder name, so the recipe
-/// records only the last component of the path, unless the common folder is the working directory or lies below it.
-/// Example: a relative path from `/home/a/small` to `/home/b/data` would contain `b`.
+/// Number of leading folders that a file and the recipe that names it must share, so that the recipe records the file
+/// by a relative path. With fewer shared folders, the recipe records only the last component of the path, unless the
+/// common folder is the working directory or lies below it. The reason is that a relative path could reveal a folder
+/// name: a relative path from `/home/a/small` to `/home/b/data` would contain `b`.
 const MIN_SHARED_FOLDERS: usize = 2;
 
 /// Returns the last component of `path`; for `.` and paths that end in `..`, the name of the folder they stand for.

@@ -8,8 +8,8 @@ use super::json::{ParseAbort, read_from};
 use super::pickle::Pickle;
 use crate::error::Result;
 
-/// Reads a pickle, using at most `memory` bytes of memory, and formats a description of each value, to
-/// test that this does not fail. Returns the number of values, or `None` if the pickle cannot be read.
+/// Reads the pickle `bytes`, using at most `memory` bytes of memory, and describes each value as text, to test that the
+/// description does not panic. Returns the number of values, or `None` if the pickle cannot be read.
 pub fn check_pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     let pickle = Pickle::read(bytes, memory).ok()?;
     let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();

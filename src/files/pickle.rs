@@ -126,8 +126,8 @@ impl Pickle {
         }
     }
 
-    /// Returns the (key, value) pairs of node `id` whose keys are strings if it is a dict or an `OrderedDict`; `None`
-    /// for other nodes.
+    /// Returns the (key, value) pairs of node `id` if it is a dict or an `OrderedDict`; `None` for other nodes. Leaves
+    /// out pairs whose keys are not strings.
     pub(crate) fn items(&self, id: NodeId) -> Option<impl Iterator<Item = (&str, NodeId)>> {
         let named = |&(key, value): &(NodeId, NodeId)| Some((self.text(key)?, value));
         Some(self.pairs(id)?.iter().filter_map(named))

@@ -56,7 +56,8 @@ pub enum SpzVersion {
 pub struct SpzErrors {
     /// Largest error of a position, in scene units.
     pub position: f64,
-    /// Number of Gaussians with a scale above the largest one of the format that are stored with that one.
+    /// Number of Gaussians with a scale that exceeds the maximum of the format by more than the usual error bound. The
+    /// file stores the maximum instead, which is still much larger than the scene.
     pub reduced_scales: usize,
 }
 

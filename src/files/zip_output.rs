@@ -1,10 +1,10 @@
-//! Output for a zip writer that reports a failed write once, when it is closed.
+//! Output for a zip writer that reports a failed write only once, when the output is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
 /// Output for a zip writer that reports a failed write only in [`ZipOutput::close`]. After a failed write it accepts
-/// and discards all further bytes: a zip writer that is dropped after an error still writes the archive's list of files
-/// and prints any error of this write.
+/// and discards all further bytes. The reason is that a zip writer that is dropped after an error still writes the
+/// archive's list of files and prints any error of this write.
 pub(crate) struct ZipOutput<W> {
     inner: W,
     failed: Option<io::Error>,

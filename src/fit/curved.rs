@@ -47,7 +47,8 @@ impl CubicTrack {
     }
 }
 
-/// Form of the curves that are fitted.
+/// Form of the curves that are fitted to a track: kind of motion, minimum width of time windows, and maximum number of
+/// curves.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveForm {
     /// Whether positions are linear and rotations are constant in time. If not, positions are cubic and rotations are
@@ -86,22 +87,22 @@ impl CurveForm {
 const WIDTH_PER_INTERVAL: f64 = 0.75;
 /// Maximum number of iterations that distribute the optical depth among overlapping curves.
 const MAX_UPDATES: usize = 60;
-/// Limit of convergence. The iterations end once no optical depth changes by a larger fraction in one iteration. Depths
-/// below this limit do not count.
+/// Limit of convergence of the iterations that distribute the optical depth. They end once no optical depth changes by
+/// more than this fraction in one iteration. Optical depths below this value are ignored in this test.
 const CONVERGED: f64 = 1e-3;
 /// Largest opacity that is fitted, so that the optical depth −ln(1 − opacity) stays finite.
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Limit below which a frame has no part in the fit of a curve:
-/// - The fit of the opacities of overlapping curves leaves out frames at which the time window is at most this value.
-/// - The fit of the motion leaves out frames whose weight (window × opacity) is at most this value times
+/// Limit that decides which frames the fit of a curve uses:
+/// - The fit of the opacities of overlapping curves uses frames at which the time window is above this value.
+/// - The fit of the motion uses frames whose weight (window × opacity) is above this value times
 ///   [`MIN_VISIBLE_OPACITY`].
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Returns curves of the form `form` that represent `track`: the smallest tried number of curves that meets `tolerance`
-/// at every visible frame. If no tried number meets it, returns the curves with the smallest error. Adds their errors
-/// to `misfit`.
+/// Returns curves of the form `form` that represent `track`. Tries increasing numbers of curves, and returns the first
+/// curves that meet `tolerance` at every visible frame. If none do, returns the curves with the smallest error. Adds
+/// the errors of the returned curves to `misfit`.
 pub fn fit_curves(
     track: &FittedTrack,
     form: CurveForm,
@@ -208,8 +209,8 @@ fn single_window_curve(track: &FittedTrack, form: CurveForm) -> CubicTrack {
     CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// Returns `count` + 1 overlapping curves for `track`. Their centers are evenly spaced over the time from `start` to
-/// `end`, in which the Gaussian is visible.
+/// Returns `count` + 1 overlapping curves of the form `form` for `track`. The centers of their time windows are evenly
+/// spaced from the time `start` to the time `end`, between which the Gaussian is visible.
 fn overlapping_curves(track: &FittedTrack, form: CurveForm, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = WIDTH_PER_INTERVAL * apart;
@@ -296,11 +297,11 @@ fn fit_motion(
     }
 }
 
-/// Compares `curves` with `track` at all frames in which the Gaussian or the curves are visible. Returns two results:
-/// - The largest error relative to `tolerance`: 1 means just within it. The error of each curve is multiplied by its
-///   share of the optical depth, so a curve that is hardly visible at a frame need not be close to the Gaussian there.
-///   Infinite if an error is NaN.
-/// - The errors over these frames, not relative to `tolerance`.
+/// Compares `curves` with `track` at all frames in which the Gaussian or a curve is visible. Returns two results:
+/// - The largest error, divided by its tolerance in `tolerance`; at most 1 if the curves meet the tolerance. Errors
+///   that are NaN do not count. The error of each curve is multiplied by its share of the optical depth, so a curve
+///   that is hardly visible at a frame need not be close to the Gaussian there.
+/// - The errors over all these frames, in their own units.
 fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, FitError) {
     let (mut worst, mut misfit) = (0.0f64, FitError::default());
     for frame in 0..track.len() {

@@ -40,8 +40,9 @@ impl Tolerance {
     pub const COMPACT: Tolerance =
         Tolerance { position: 0.5, rotation: 0.3, log_scale: 0.2, opacity: 0.06, sh: 0.2, full_opacity: 1.0 / 3.0 };
 
-    /// Returns the factor, at most 1, by which errors of a Gaussian of opacity `opacity` are multiplied before they are
-    /// compared with the tolerances. The factor does not apply to errors of the opacity itself.
+    /// Returns the factor by which errors of a Gaussian of opacity `opacity` are multiplied before they are compared
+    /// with the tolerances. The factor is at most 1, because faint Gaussians may have larger errors. It does not apply
+    /// to errors of the opacity itself.
     fn weight(&self, opacity: f64) -> f64 {
         if opacity < self.full_opacity { opacity / self.full_opacity } else { 1.0 }
     }

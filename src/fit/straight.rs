@@ -10,7 +10,7 @@ use super::{FitError, FittedTrack, Tolerance};
 pub struct LinearPiece {
     /// Frames in which the piece represents the Gaussian.
     pub frames: Range<usize>,
-    /// Time in the middle of the piece, at which the Gaussian is at `position`.
+    /// Time in the middle of the piece. At this time the Gaussian is at `position`.
     pub at: f64,
     /// Position at the time `at`, in scene units.
     pub position: [f64; 3],
@@ -26,11 +26,11 @@ pub struct LinearPiece {
     pub sh: Vec<f32>,
 }
 
-/// Returns the pieces of `track`, in order of time, and adds their errors to `misfit`. Each piece covers a span of
-/// frames: the whole sequence, one of its halves, one half of a half and so on, that is, 2ᵏ frames from a multiple of
-/// 2ᵏ. Therefore all Gaussians together have at most twice as many different spans as there are frames. Each piece
-/// covers the largest span in which it meets `tolerance` at every frame. Frames in which the Gaussian is invisible have
-/// no piece.
+/// Divides `track` into pieces of linear motion, and adds their errors to `misfit`. Returns the pieces in order of
+/// time. Each piece covers a span of 2ᵏ frames that begins at a multiple of 2ᵏ: the whole sequence, one of its halves,
+/// one of its quarters and so on. Therefore all Gaussians together have at most twice as many different spans as there
+/// are frames. A piece covers the largest span in which it meets `tolerance` at every frame. Frames in which the
+/// Gaussian is invisible have no piece.
 pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitError) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
@@ -46,9 +46,9 @@ pub fn fit_lines(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut FitErr
     pieces
 }
 
-/// Adds the pieces of `track` for the frames `span` to `pieces`. Halves the span if one piece would differ from the
-/// track by more than `tolerance`, or if the Gaussian is invisible in a part of the span. A span has 2ᵏ frames and may
-/// extend beyond the last frame.
+/// Fits pieces of linear motion to the frames `span` of `track`, and appends them to `pieces`. Halves the span if one
+/// piece would differ from the track by more than `tolerance`, or if the Gaussian is invisible in some frames of the
+/// span. A span has 2ᵏ frames and may extend beyond the last frame of the track.
 fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_visible(frame)).count();
@@ -96,7 +96,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     }
 }
 
-/// Returns whether `piece` differs from `track` by at most `tolerance` at each of its frames.
+/// Returns whether `piece` differs from `track` by at most `tolerance` at every frame of the piece.
 fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {

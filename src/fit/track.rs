@@ -2,7 +2,7 @@
 
 use crate::model::{Gaussians, opacity};
 
-/// Opacity below which a Gaussian is not drawn (1/255). Fits ignore frames below it.
+/// Opacity below which a Gaussian is not drawn (1/255). Fits ignore the frames in which a Gaussian has a lower opacity.
 pub const MIN_VISIBLE_OPACITY: f64 = 1.0 / 255.0;
 
 /// Attributes of one Gaussian at all frames.
@@ -81,14 +81,15 @@ impl FittedTrack {
         scales[1].exp().max(1e-12)
     }
 
-    /// Returns the distance between `position` and the position at `frame`, in units of the middle scale at `frame`.
+    /// Returns the distance between `position` and the position of the Gaussian at `frame`, in units of the Gaussian's
+    /// middle scale at `frame`.
     pub fn distance_in_middle_scales(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         apart / self.middle_scale(frame)
     }
 
-    /// Returns the angle between `rotation` and the rotation at `frame`, in radians; 0 for a nearly round Gaussian,
-    /// whose log scales all differ by less than 0.1.
+    /// Returns the angle between `rotation` and the rotation of the Gaussian at `frame`, radians; 0 for a nearly round
+    /// Gaussian, whose log scales all differ by less than 0.1.
     pub fn rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         let scales = self.log_scale[frame];
         let [least, most] =

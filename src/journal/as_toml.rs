@@ -4,8 +4,8 @@ use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Wrapper that serializes a summary as TOML text. The binary format of cache entries has no optional fields, but
-/// summaries, which are made for JSON, have some. TOML can leave fields out and, unlike JSON, also stores NaN and
+/// Wrapper that serializes a summary as TOML text, for storage in a cache entry. Summaries may leave fields out, which
+/// the binary format of cache entries does not support. TOML supports this and, unlike JSON, also stores NaN and
 /// infinities.
 #[derive(Debug)]
 pub(crate) struct AsToml<T>(pub(crate) T);

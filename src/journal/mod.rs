@@ -23,23 +23,23 @@ use crate::source::{FrameSource, Reads};
 #[derive(Debug, Clone, Copy)]
 pub struct Stopwatch {
     wall: Instant,
-    /// Processor time that the process had used when this measurement started, seconds; `None` if the system does not
-    /// report it.
+    /// Processor time, in seconds, that the process had used when this stopwatch was started; `None` if the system does
+    /// not report it.
     processors: Option<f64>,
 }
 
 impl Stopwatch {
-    /// Starts a new measurement at this moment.
+    /// Starts a new stopwatch.
     pub fn start() -> Stopwatch {
         Stopwatch { wall: Instant::now(), processors: processor_seconds() }
     }
 
-    /// Returns the wall-clock time since this measurement started, seconds.
+    /// Returns the wall-clock time since this stopwatch was started, seconds.
     pub fn seconds(&self) -> f64 {
         self.wall.elapsed().as_secs_f64()
     }
 
-    /// Returns the processor time that this process used since this measurement started, summed over all processors,
+    /// Returns the processor time that this process used since this stopwatch was started, summed over all processors,
     /// seconds; `None` if the system does not report it.
     pub fn processor_seconds(&self) -> Option<f64> {
         processor_seconds().zip(self.processors).map(|(now, before)| now - before)
@@ -55,8 +55,8 @@ fn processor_seconds() -> Option<f64> {
 /// Journal: record of the stages of a run so far, or of one stage whose result is in the cache.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// Amounts that one full read takes: every frame of the input is read once. Reads of stages are reported as
-    /// multiples of them.
+    /// Amounts of data (bytes, tiles, states) that one full read of the input takes, in which every frame is read once.
+    /// The reads of a stage are reported as a multiple of these amounts.
     #[serde(skip)]
     pub whole: Reads,
     /// Records of the stages that have run, in order.
@@ -96,9 +96,9 @@ impl Journal {
         Ok(value)
     }
 
-    /// Returns the result of a stage from the cache of `scene`. If it is not there, runs the stage `name` with
-    /// `compute` like [`Journal::run_stage`] and stores the result in the cache under `key`. The stage cannot be
-    /// divided among processes.
+    /// Returns the result of the stage `name` from the cache of `scene`. If the cache has no result for `key`, runs the
+    /// stage with `compute` like [`Journal::run_stage`], and stores the result under `key`. The stage cannot be divided
+    /// among processes.
     ///
     /// # Errors
     /// Fails if `compute` fails, or if the cache cannot be read or written. If the run is limited to one shard (part of
@@ -159,8 +159,8 @@ impl Journal {
         Ok(found)
     }
 
-    /// Records the opening of the input as the stage `name`. It began at `start`, found `gaussians` Gaussians and read
-    /// the amounts `reads`.
+    /// Adds an entry for the opening of the input, as the stage `name`. The opening began at `start`, found `gaussians`
+    /// Gaussians and read the amounts `reads`.
     pub fn record_opening(&mut self, name: &'static str, start: Stopwatch, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
     }

@@ -16,10 +16,10 @@ pub struct StageRecord {
     pub gaussians_in: usize,
     /// Number of Gaussians after the stage.
     pub gaussians_out: usize,
-    /// Amounts read from the input, counted by the code that reads.
+    /// Amounts that the stage read from the input, counted by the code that reads.
     pub reads: Reads,
-    /// Amount read from the input, as a multiple of one full read (every frame once). It is measured in bytes if the
-    /// input is stored in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
+    /// Amount that the stage read from the input, as a multiple of one full read (every frame once). It is measured in
+    /// bytes if the input is stored in tiles (compressed blocks), otherwise in states (one Gaussian at one frame).
     pub full_reads: f64,
     /// Number of bytes read back from scratch files, which are not part of the input.
     pub scratch_bytes: u64,
@@ -27,9 +27,9 @@ pub struct StageRecord {
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     #[serde(rename = "kept")]
     pub from_cache: bool,
-    /// Wall-clock time, seconds.
+    /// Wall-clock time of the stage, seconds.
     pub seconds: f64,
-    /// Processor time summed over all processors, seconds; `None` if the system does not report it.
+    /// Processor time of the stage, summed over all processors, seconds; `None` if the system does not report it.
     pub processor_seconds: Option<f64>,
     /// Largest resident memory of the process from its start to the end of this stage, bytes; `None` if the system does
     /// not report it.
@@ -225,11 +225,11 @@ impl ShDegreeSummary {
 /// Estimate of a quantity: its expected value, with a lower and an upper bound.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EstimateRange {
-    /// Lower bound; smaller values are unlikely.
+    /// Lower bound of the estimated quantity; smaller values are unlikely.
     pub least: f64,
-    /// Expected value.
+    /// Expected value of the estimated quantity.
     pub likely: f64,
-    /// Upper bound; larger values are unlikely.
+    /// Upper bound of the estimated quantity; larger values are unlikely.
     pub most: f64,
 }
 

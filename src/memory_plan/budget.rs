@@ -14,7 +14,7 @@ pub(super) const PER_THREAD: u64 = 2 << 20;
 /// Amount of information about memory and time that a run sends as events before it starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Verbosity {
-    /// No information.
+    /// No information about memory and time.
     #[default]
     Nothing,
     /// Estimated time and maximum memory.

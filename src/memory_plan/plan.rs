@@ -11,14 +11,15 @@ use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::VIEWS_PER_THREAD;
 use crate::progress::{Events, Message, format_duration};
 
-/// Divisor of the memory budget: all decoded tiles of a container (values of consecutive Gaussians × frames) stay in
-/// memory if they take at most this part, 1/16, of the budget. Otherwise a tile is decoded again whenever it is needed,
-/// from stored bytes that the file system caches anyway. A larger part would thus save only decoding time, and leave
-/// less memory to other processes.
+/// Number by which the memory budget is divided to limit the memory for decoded tiles (values of consecutive Gaussians
+/// × frames) of a container. If all decoded tiles fit into this 1/16 of the budget, they stay in memory. Otherwise a
+/// tile is decoded again whenever it is needed, from stored bytes that the file system caches anyway. More memory for
+/// tiles would thus save only decoding time, and leave less memory to other processes.
 const HELD_TILES_DIVISOR: u64 = 16;
 
-/// Functions, each of which halves one limit. Halving a limit slows a run; the functions that slow it most come first.
-/// If several functions free equally much memory, the last of them is chosen.
+/// Functions, each of which halves one of the limits on what stages keep in memory at a time. Halving a limit slows a
+/// run; the functions that slow it most come first. If several functions free equally much memory, the last of them is
+/// chosen.
 const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { views_together: limits.views_together.div_ceil(2), ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
@@ -117,8 +118,9 @@ impl MemoryPlan {
         }
     }
 
-    /// Returns this plan with the permission to keep all decoded tiles of the container in memory, if they fit and take
-    /// a small part of the budget ([`HELD_TILES_DIVISOR`]). No tile is then read twice.
+    /// Returns this plan, in which decoded tiles (values of consecutive Gaussians × frames) of the container may stay
+    /// in memory if all of them fit and take only a small part of the budget ([`HELD_TILES_DIVISOR`]). No tile is then
+    /// read twice.
     fn with_held_tiles(mut self) -> MemoryPlan {
         let decoded = self.work.input.decoded;
         let fits = self.excess_bytes() == 0 && self.peak_bytes().saturating_add(decoded) <= self.budget;
@@ -133,7 +135,7 @@ impl MemoryPlan {
         if self.limits.keeps_tiles { sum.min(1.0) } else { sum }
     }
 
-    /// Returns the peak memory of the run in bytes: that of the stage that takes most.
+    /// Returns the peak memory of the run in bytes, which is the memory during the stage that takes most.
     pub fn peak_bytes(&self) -> u64 {
         self.base() + self.estimates.iter().map(|estimate| estimate.bytes(&self.work)).max().unwrap_or(0)
     }

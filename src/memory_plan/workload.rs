@@ -141,9 +141,10 @@ impl Workload {
         state_bytes(self.sh_degree, columns)
     }
 
-    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps. Their
-    /// number follows from n, the smaller of [`Limits::max_kept_frames`] and the frames per tile of the input: n + 2
-    /// frames, but no frames if n is at most 1. Attributes that do not vary in time are not counted.
+    /// Returns the memory, in bytes per Gaussian, of the frames that a reader of the attributes `columns` keeps for
+    /// later reads. Let n be the smaller of [`Limits::max_kept_frames`] and the frames per tile (stored block) of the
+    /// input. The reader keeps n + 2 frames, or none if n is at most 1. Attributes that do not vary in time are not
+    /// counted.
     pub fn kept_frames_bytes(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.max_kept_frames as u64).min(self.input.frame_block) {
             0..=1 => 0,
@@ -153,15 +154,15 @@ impl Workload {
     }
 
     /// Returns the memory that the readers of all threads take while each thread fills one block of Gaussians with
-    /// values. Includes the buffers for decoding tiles.
+    /// values. Includes the buffers for decoding tiles (stored blocks of values).
     pub fn block_buffer_memory(&self) -> MemoryPart {
         let block =
             self.largest_block(GAUSSIANS_PER_BLOCK as u64) * (self.state_bytes(Attributes::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
-    /// Returns the bytes of the buffers in which all threads decode or encode tiles. Each thread has three: for the
-    /// stored, the shuffled and the decoded bytes of the largest tile.
+    /// Returns the bytes of the buffers in which all threads decode or encode tiles (stored blocks of values). Each
+    /// thread has three buffers: for the stored, the shuffled and the decoded bytes of the largest tile.
     fn decoding(&self) -> u64 {
         let MemoryProfile { frame_block, gaussian_block, .. } = self.input;
         let gaussian_block = self.largest_block(gaussian_block);
@@ -174,9 +175,9 @@ impl Workload {
 
     /// Returns the memory of a pass over views as two lists of parts: parts that grow with the number of Gaussians, in
     /// bytes per Gaussian, and parts of fixed size, in bytes. The parts are: frames that are ready to be rendered, with
-    /// their attributes `columns`; frames being read; and views being rendered, with the results of the pass. `sums` is
-    /// the number of bytes per Gaussian of these results, which are kept once for the whole pass and once more for each
-    /// view being rendered.
+    /// their attributes `columns`; frames being read; and views being rendered, with the results of the pass. `sums`:
+    /// size of the results, in bytes per Gaussian. The results are stored once for the whole pass, and once more for
+    /// each view being rendered.
     pub fn view_pass_memory(
         &self,
         limits: &Limits,
@@ -205,7 +206,8 @@ impl Workload {
         self.tile_write_buffers(FRAME_BLOCK)
     }
 
-    /// Returns the memory of the buffers for writing a container whose tiles hold `frames` frames.
+    /// Returns the memory of the buffers for writing a container whose tiles (stored blocks of values) hold `frames`
+    /// frames.
     pub fn tile_write_buffers(&self, frames: usize) -> Vec<MemoryPart> {
         let varying = self.frames_at_most(frames as u64) * self.state_bytes(self.varying);
         let block = self.largest_block(GAUSSIAN_BLOCK as u64)
@@ -214,15 +216,15 @@ impl Workload {
     }
 
     /// Returns the memory that the zstd compressors of all threads take, at the compression level `level` and for tiles
-    /// of `frames` frames.
+    /// (stored blocks of values) of `frames` frames.
     pub fn compressor_memory(&self, level: i32, frames: usize) -> MemoryPart {
         let widest = Attributes::all().iter().map(|column| self.state_bytes(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
     /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames; below 1
-    /// if only a part is read. Tiles are read as a whole. A tile is read several times if the memory limit lets readers
-    /// keep only some of its frames.
+    /// if only a part of the input is read. A tile (stored block of Gaussians × frames) is always read as a whole. It
+    /// is read several times if the memory limit lets readers keep only some of its frames.
     pub fn full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let (all, together) = (self.frames.max(1), self.input.frame_block);
         if self.frames == 0 || together == 0 {
@@ -234,9 +236,9 @@ impl Workload {
         (frames.min(blocks) * again) as f64 / blocks as f64
     }
 
-    /// Returns the maximum number of times that the whole input is read, like [`Workload::full_reads`], but for blocks
-    /// of Gaussians with arbitrary ids. A tile may contain Gaussians of two such blocks; it is then read for each of
-    /// them.
+    /// Returns the maximum number of times that the whole input is read to get `frames` evenly spread frames, like
+    /// [`Workload::full_reads`], but for a stage that reads blocks of Gaussians with arbitrary ids. A tile (stored
+    /// block) may contain Gaussians of two such blocks; it is then read for each of them.
     pub fn scattered_full_reads(&self, frames: u64, limits: &Limits) -> f64 {
         let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
         shared * self.full_reads(frames, limits)
@@ -253,8 +255,8 @@ impl Workload {
         pace(&self.throughput) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
-    /// Returns a copy of this workload with the number of pixels for renders of only every `stride`-th pixel in each
-    /// direction.
+    /// Returns a copy of this workload for renders of only every `stride`-th pixel in each direction, with the number
+    /// of pixels of such renders.
     pub fn on_grid(&self, stride: NonZeroU32) -> Workload {
         Workload { pixels: self.pixels / u64::from(stride.get()).pow(2), ..*self }
     }
@@ -319,11 +321,12 @@ impl Throughput {
 /// per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderCost {
-    /// Seconds on one processor core per Gaussian.
+    /// Time of one view per Gaussian, in seconds on one processor core.
     gaussian: f64,
-    /// Seconds on one processor core per pixel.
+    /// Time of one view per pixel, in seconds on one processor core.
     pixel: f64,
-    /// Function that picks the ratio by which both times are multiplied, for example [`Throughput::render_time`].
+    /// Function that returns the measured ratio by which both times are multiplied, for example
+    /// [`Throughput::render_time`].
     pace: fn(&Throughput) -> f64,
 }
 

@@ -29,7 +29,7 @@ pub struct AppearanceThresholds {
 }
 
 impl AppearanceThresholds {
-    /// Creates the thresholds from those of the pass `pass` and those in `merge`, which all passes share.
+    /// Creates the thresholds of the merging pass `pass`. The thresholds that all passes share are taken from `merge`.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         AppearanceThresholds {
             d0: pass.d0,
@@ -39,8 +39,8 @@ impl AppearanceThresholds {
         }
     }
 
-    /// Returns whether `a` and `b` pass both tests. The order of `a` and `b` does not matter. The cheap comparisons run
-    /// first.
+    /// Returns whether the Gaussians `a` and `b` pass test 1 (place and size) and test 2 (color). The order of `a` and
+    /// `b` does not matter. The cheap comparisons run first.
     pub fn pass(&self, a: &Appearance, b: &Appearance) -> bool {
         (a.color - b.color).length() <= self.max_color_difference
             && cosine(a.dc, b.dc) > self.rho

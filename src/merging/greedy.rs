@@ -13,27 +13,32 @@
 
 use rayon::prelude::*;
 
-/// Number of parallel rounds after which the remaining nodes are decided sequentially. Scenes need 5 to 8 rounds. A
-/// chain of Gaussians that are ranked in their order along a line would need one round for every two Gaussians.
+/// Number of parallel rounds after which all nodes (Gaussians or merged groups) that still have no leader are assigned
+/// sequentially. Scenes need 5 to 8 rounds. A chain of Gaussians that are ranked in their order along a line would need
+/// one round for every two Gaussians.
 const MAX_ROUNDS: usize = 32;
-/// Number of undecided nodes below which it is faster to decide them sequentially than in another parallel round.
+/// Number of nodes without a leader below which it is faster to assign them sequentially than in another parallel
+/// round. A node is a Gaussian or a merged group.
 const FEW: usize = 64;
 
-/// Leader of every node, and statistics of how the leaders were found.
+/// Leader of every node (Gaussian or merged group), and statistics of how the leaders were found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
-    /// Index of the leader of every node: the node that it joined, or the node itself if it joined no other.
+    /// Index of the leader of every node (Gaussian or merged group): the node that it joined, or the node itself if it
+    /// joined no other.
     pub leader_of: Vec<u32>,
-    /// Number of nodes that joined another node, which is their leader.
+    /// Number of nodes (Gaussians or merged groups) that joined another node.
     pub joins: usize,
-    /// Number of parallel rounds in which nodes were assigned to leaders (the nodes that other nodes join).
+    /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
+    /// they join).
     pub rounds: usize,
-    /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
+    /// Whether some nodes (Gaussians or merged groups) had no leader after the last parallel round and were assigned
+    /// sequentially.
     pub sequential: bool,
 }
 
-/// Returns the rank of every node, a permutation of 0..N. Nodes are ranked by descending `size`; ties by ascending
-/// `hash`, then by index.
+/// Returns the rank of every node (Gaussian or merged group), a permutation of 0..N. Nodes are ranked by descending
+/// `size`; ties by ascending `hash`, then by index.
 ///
 /// A size that is NaN counts as the smallest; −0 equals 0.
 pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
@@ -50,12 +55,12 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
     rank
 }
 
-/// Value in `leader_of` of a node without a decision. A decided node has the index of its leader there.
+/// Value in `leader_of` of a node that has no leader yet. For all other nodes the value is the index of the leader.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Assigns every node to a leader (the node that it joins, or itself), by the sequential greedy rule of this module,
-/// and returns the assignment. `rank`: rank of every node, a permutation of 0..N. `pairs`: pairs (leader, member) that
-/// passed all tests, in any order, in which the leader has the lower rank.
+/// Assigns every node (Gaussian or merged group) to a leader (the node that it joins, or itself) by the sequential
+/// greedy rule of this module, and returns the assignment. `rank`: rank of every node, a permutation of 0..N. `pairs`:
+/// pairs (leader, member) that passed all tests, in any order, in which the leader has the lower rank.
 ///
 /// With `limit`, only the first `limit` joins are made, in the order of the leader's rank, then of the member's. The
 /// members of all later joins stay single.
@@ -85,7 +90,7 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// For every node, the nodes of lower rank that could become its leader.
+/// For every node (Gaussian or merged group), the nodes of lower rank that could become its leader.
 struct Predecessors {
     start: Vec<usize>,
     /// Pairs (possible leader, node), sorted by node, then by the rank of the possible leader.
@@ -105,8 +110,9 @@ impl Predecessors {
         Predecessors { start, pairs }
     }
 
-    /// Returns the leader of `node` (itself if it becomes a leader), or `None` if it still depends on a predecessor
-    /// that is undecided in `leader_of`. Predecessors are the nodes of lower rank that could take `node`.
+    /// Returns the leader of `node` (itself if it becomes a leader). Returns `None` if the leader depends on a
+    /// predecessor that has no leader in `leader_of` yet. Predecessors are the nodes of lower rank that could take
+    /// `node`.
     fn decide(&self, node: u32, leader_of: &[u32]) -> Option<u32> {
         let candidates = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
         for &(predecessor, _) in candidates {

@@ -10,14 +10,14 @@ pub struct MergeGroups {
 }
 
 impl MergeGroups {
-    /// Creates one group for each row in `rows`, which increase. No Gaussian is merged.
+    /// Creates one group for each Gaussian in `rows` (increasing row indices). No Gaussian is merged.
     pub fn singletons(rows: &[u32]) -> Self {
         MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
-    /// Returns the groups that result if every group g joins the group `leader_of[g]`. If `leader_of[g]` is g itself,
-    /// group g joins no other group, but others may join it. A combined group has the leader of the group that the
-    /// others joined.
+    /// Joins every group g to the group `leader_of[g]`, and returns the resulting groups. If `leader_of[g]` is g
+    /// itself, group g joins no other group, but others may join it. A combined group has the leader of the group that
+    /// the others joined.
     pub fn joined(&self, leader_of: &[u32]) -> Self {
         let mut new_index = vec![0; leader_of.len()];
         let mut leaders = Vec::new();

@@ -69,8 +69,8 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. Reads the members of all
-    /// proxies among them together, on all threads. Fails if a Gaussian cannot be read.
+    /// Opens a reader of the Gaussians with the indices `places` at the frames `wanted`. If there are proxies among
+    /// them, reads the members of all these proxies together, on all threads. Fails if a Gaussian cannot be read.
     ///
     /// Memory per Gaussian read, members of proxies included: its reader, its state at one frame, and 24 bytes.
     pub fn open_together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
@@ -178,7 +178,7 @@ struct MergedSequenceReader<'a> {
     sequence: &'a MergedSequence<'a>,
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
-    /// Attributes in `state` that do not vary with time and were already read.
+    /// Attributes that do not vary with time and were already read into `state`.
     constant_read: Attributes,
     inputs: MergedMembers,
 }

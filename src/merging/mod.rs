@@ -112,19 +112,20 @@ pub struct MergeResult {
 /// Statistics of one merging pass. Its nodes are single Gaussians and the groups that earlier passes merged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Number of nodes with more neighbors within the radius ε than the maximum. Of these neighbors only the nearest
-    /// were examined.
+    /// Number of nodes (Gaussians or merged groups) that have more neighbors within the radius ε than the allowed
+    /// maximum. Of these neighbors only the nearest were examined.
     pub truncated: usize,
     /// Number of candidate pairs: pairs that passed tests 1 (place and size) and 2 (color).
     pub candidates: usize,
     /// Number of candidate pairs that also passed test 3 (motion).
     pub passing: usize,
-    /// Number of nodes that joined another node.
+    /// Number of nodes (Gaussians or merged groups) that joined another node.
     pub joins: usize,
-    /// Number of parallel rounds in which nodes were assigned to leaders (nodes that other nodes join). Nodes that are
-    /// undecided after the last round are assigned sequentially and not counted here.
+    /// Number of parallel rounds in which nodes (Gaussians or merged groups) were assigned to leaders (the nodes that
+    /// they join). Nodes without a leader after the last round are assigned sequentially and not counted here.
     pub rounds: usize,
-    /// Whether some nodes were still undecided after the last parallel round and were decided sequentially.
+    /// Whether some nodes (Gaussians or merged groups) had no leader after the last parallel round and were assigned
+    /// sequentially.
     pub sequential: bool,
 }
 
@@ -247,7 +248,7 @@ impl<'a> MergeNodes<'a> {
         self.place.len()
     }
 
-    /// Returns the table with the state of `node`, and its row in this table.
+    /// Returns the table of states that contains `node`, and the row of the node in this table.
     fn state(&self, node: usize) -> (&Gaussians, usize) {
         let alone = self.groups.members(node).len() == 1;
         (if alone { self.survivors.states } else { self.proxies }, self.place[node] as usize)
@@ -272,7 +273,8 @@ impl<'a> MergeNodes<'a> {
         Appearance::new(states, row)
     }
 
-    /// Returns the bits of all values of `node` that tests 1 and 2 compare ([`Appearance`]), with −0 stored as 0.
+    /// Returns the bits of all values of `node` that tests 1 (place and size) and 2 (color) compare ([`Appearance`]),
+    /// with −0 stored as 0.
     fn appearance_bits(&self, node: usize) -> [u32; 13] {
         let (states, row) = self.state(node);
         let [x, y, z] = states.position.row(row);
@@ -322,10 +324,10 @@ fn each_coincident<E>(
 }
 
 /// Finds the pairs of nodes (leader, member) that pass tests 1 (place and size) and 2 (color) of `pass`, and calls
-/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit` is the unit of the
-/// recipe's lengths, in scene units. Pairs are ordered by leader in voxel order, then by distance. Each call of `take`
-/// gets at most `max_batch` pairs (at least 1), and whether the pairs are divided among several calls. Returns the
-/// number of nodes with more neighbors within the radius ε than were examined.
+/// `take` with them. The member is among the leader's nearest neighbors and ranks after it. `unit`: number of scene
+/// units in one unit of the recipe's lengths. Pairs are ordered by leader in voxel order, then by distance. Each call
+/// of `take` gets at most `max_batch` pairs (at least 1), and whether the pairs are divided among several calls.
+/// Returns the number of nodes with more neighbors within the radius ε than were examined.
 ///
 /// A node that may not merge, or has a value that is not finite, is in no pair and does not count as a neighbor.
 ///

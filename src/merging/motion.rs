@@ -74,8 +74,8 @@ pub struct MotionThresholds {
 }
 
 impl MotionThresholds {
-    /// Creates the thresholds from those in `merge`, converted to scene units. `unit` is the unit of the recipe's
-    /// lengths, in scene units.
+    /// Creates the thresholds from those in `merge`, converted to scene units. `unit`: number of scene units in one
+    /// unit of the recipe's lengths.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
@@ -164,8 +164,8 @@ impl PairMotion {
         }
     }
 
-    /// Adds the next frame. `state` gets the index of a node, and returns its position and whether it is alive (opacity
-    /// ≥ alpha_min).
+    /// Adds the next frame to the measurement. `state` gets the index of a node, and returns its position and whether
+    /// it is alive (opacity ≥ alpha_min).
     pub fn add_frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);

@@ -40,8 +40,8 @@ pub fn bytes_per_gaussian(frames_held: usize) -> usize {
 pub struct PairMeter<'a> {
     /// Source from which the trajectories are read.
     pub source: &'a dyn FrameSource,
-    /// Scan parameters. Used are `alpha_min`, the opacity from which a Gaussian is alive, and `motion`, which defines
-    /// the steps between frames that count as motion.
+    /// Scan parameters. The measurement uses `alpha_min`, the opacity from which a Gaussian is alive, and `motion`,
+    /// which defines the steps between frames that count as motion.
     pub scan: &'a recipe::ScanParams,
     /// Thresholds of test 3 (motion) of merging.
     pub gate: MotionThresholds,
@@ -52,21 +52,21 @@ pub struct PairMeter<'a> {
     pub scratch: PathBuf,
     /// Receiver of progress events.
     pub events: Events,
-    /// Trajectories in the scratch file; `None` until they are first needed.
+    /// Trajectories gathered in a scratch file; `None` until they are first needed.
     pub gathered: Option<GatheredTrajectories>,
 }
 
 /// Trajectories of Gaussians in a scratch file, in voxel order: Gaussians close in space are close in the file.
 pub struct GatheredTrajectories {
     trajectories: Trajectories,
-    /// For every place (index of a trajectory in the file), the row of its Gaussian in the list of ids.
+    /// For every index of a trajectory in the file, the row of its Gaussian in the list of ids.
     order: Vec<u32>,
-    /// For every row of the list of ids, the place of its Gaussian (index of its trajectory in the file).
+    /// For every row of the list of ids, the index of its Gaussian's trajectory in the file.
     place: Vec<u32>,
 }
 
 impl PairMeter<'_> {
-    /// Returns a copy of this meter with the same settings but without gathered trajectories.
+    /// Returns a copy of this pair meter with the same settings but without gathered trajectories.
     pub fn without_trajectories(&self) -> Self {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }

@@ -36,7 +36,7 @@ const ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 pub struct PointIndex {
     epsilon: f64,
     voxels: VoxelGrid,
-    /// Points sorted by voxel.
+    /// Indexed points, sorted by the voxel that contains them.
     points: Vec<TreePoint>,
     /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in the order of the voxels.
     trees: Vec<Tree>,

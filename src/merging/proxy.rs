@@ -61,11 +61,11 @@ impl ProxyState {
 /// Importance of Gaussians, which determines the weights of the members of a cluster.
 #[derive(Debug, Clone, Copy)]
 pub struct Importance<'a> {
-    /// Id of each row of the table of Gaussians.
+    /// Id of the Gaussian in each row of the table of Gaussians.
     pub ids: &'a [u32],
-    /// Mean contribution C of each id to a render, in pixels.
+    /// Contribution C of every Gaussian, by id: its mean contribution to a render, in pixels.
     pub coverage: &'a [f64],
-    /// Visibility Vis (share of the views in which the Gaussian is on screen) of each id.
+    /// Visibility Vis of every Gaussian, by id: fraction of the views in which the Gaussian is on screen.
     pub visibility: &'a [f64],
 }
 

@@ -33,8 +33,8 @@ pub(crate) type TrajectorySample = [f32; 4];
 /// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
-/// Maximum distance between two requested Gaussians for which one read covers both and the Gaussians between them. It
-/// is the difference of their places in the file.
+/// Maximum difference between the indices of two requested Gaussians in the file for which one read covers both
+/// Gaussians and those between them.
 const GAP: u32 = 32;
 /// Maximum number of Gaussians that one read covers.
 const RUN: u32 = 2048;
@@ -46,7 +46,7 @@ pub(crate) struct Trajectories {
     frames: usize,
     /// Number of consecutive frames that the file stores together.
     block: usize,
-    /// Range of the values in a [`TrajectorySample`] that vary with time.
+    /// Range of indices of the values in a [`TrajectorySample`] that vary with time.
     varying: Range<usize>,
 }
 
@@ -137,7 +137,7 @@ impl Trajectories {
     }
 }
 
-/// Returns which values of a [`TrajectorySample`] belong to the attributes `columns`.
+/// Returns the range of indices in a [`TrajectorySample`] of the values that belong to the attributes `columns`.
 fn value_range(columns: Attributes) -> Range<usize> {
     let start = if columns.contains(Attributes::POSITION) { 0 } else { 3 };
     start..if columns.contains(Attributes::OPACITY) { 4 } else { 3 }

@@ -62,7 +62,8 @@ impl NearestPoints {
         }
     }
 
-    /// Returns whether a point with a squared distance of `bound` or more could still be one of the nearest.
+    /// Returns whether a point with a squared distance of `bound` or more could still be one of the requested nearest
+    /// points.
     pub fn could_improve_at(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }

@@ -53,8 +53,8 @@ impl VoxelGrid {
         (0..3).filter_map(|c| morton_bits(c, voxel[c])).sum()
     }
 
-    /// Returns `rows` sorted by the Morton code of their voxel, ties by row. `at` returns the position of a row, in
-    /// scene units.
+    /// Returns the row indices `rows` sorted by the Morton code of the voxel of each row, ties by row index. `at`
+    /// returns the position of a row, in scene units.
     pub fn sort_rows(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
         let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.morton_code(at(row)), row)).collect();
         keyed.par_sort_unstable();
@@ -69,7 +69,7 @@ pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64)
 }
 
 /// Returns the voxel at `place` (a result of [`VoxelGrid::grid_coordinates`]) as its number along each axis, counted
-/// from 0. For a place outside of the grid it is the nearest voxel; a coordinate that is NaN gives the number 0.
+/// from 0. For a position outside of the grid, returns the nearest voxel; a coordinate that is NaN gives the number 0.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
     // A saturating cast maps values beyond the range of u32 to its ends, and NaN (from 0·∞) to 0.
     place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))

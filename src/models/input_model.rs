@@ -110,8 +110,8 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Returns the number of training frames if the input gives it. The last frame is one step before the end of the
-    /// time span.
+    /// Returns the number of training frames if the input gives it. The last of these frames is one frame interval
+    /// before the end of the time span.
     fn data_frames(&self) -> Option<usize> {
         None
     }

@@ -45,13 +45,14 @@ impl ModelSize {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
-    /// Formats for messages the names and bytes of all parts of the model whose size is not 0: `cloud 248, field 1000`.
+    /// Returns a text for messages with the name and the bytes of every part whose size is not 0: `cloud 248, field
+    /// 1000`.
     pub fn parts_text(&self) -> String {
         let parts = self.named_parts().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// Formats for messages the size in bytes of each part of this model, compared with the same part of `before`:
+    /// Returns a text for messages with the bytes of each part of this model, compared with the same part of `before`:
     /// `cloud 248 of 2480 (10.0%)`. A part that only one of the two models has is compared with `none`.
     pub fn format_relative_to(&self, before: &ModelSize) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {

@@ -38,8 +38,8 @@ struct StillFormat {
     ending: &'static str,
     /// Name of the format, shown to users.
     kind: &'static str,
-    /// Returns whether the path is one frame of this format: a file, or for `.sog` also a folder with the content of
-    /// one.
+    /// Returns whether the path is one frame of this format: a file, or for `.sog` also a folder with the unpacked
+    /// content of a `.sog` file.
     recognizes: fn(&FoundInput) -> bool,
     /// Reads the Gaussians of a file.
     read: fn(&Path, ReadLimit) -> Result<Gaussians>,
@@ -124,7 +124,7 @@ fn is_frame(path: &Path, ending: &str) -> bool {
     has_ending(path, ending) && !path.file_name().unwrap_or_default().as_encoded_bytes().starts_with(b".")
 }
 
-/// Opened files, decoded into PLY files in a temporary folder.
+/// Opened files of web viewers, which were decoded into PLY files in a temporary folder.
 struct StillFiles {
     /// Frames opened from the files in the folder `scratch`.
     inner: Box<dyn InputModel>,

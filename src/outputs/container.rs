@@ -18,15 +18,15 @@ use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 use crate::source::{FrameSource, Ids};
 
-/// Number of Gaussians per tile. One task of a scan reads such a block of Gaussians. The number is constant, so that
-/// the bytes of a container depend only on its values.
+/// Number of Gaussians per tile (values of one attribute that are encoded together). One task of a scan reads such a
+/// block of Gaussians. The number is constant, so that the bytes of a container depend only on its values.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Number of frames per tile in a container without error bounds. Streams with large frames are stored with fewer
-/// frames per tile.
+/// Number of frames per tile (values that are encoded together) in a container without error bounds. Streams with large
+/// frames are stored with fewer frames per tile.
 pub const FRAME_BLOCK: usize = 32;
-/// Number of frames per tile in a container with error bounds. It is larger than [`FRAME_BLOCK`], because with error
-/// bounds the first frame of a tile takes as much space as all others together, and longer tiles have fewer first
-/// frames.
+/// Number of frames per tile (values that are encoded together) in a container with error bounds. It is larger than
+/// [`FRAME_BLOCK`], because with error bounds the first frame of a tile takes as much space as all its other frames
+/// together, and longer tiles have fewer first frames.
 pub const FRAME_BLOCK_WITH_ERROR_BOUNDS: usize = 64;
 
 /// Encoding of the values in a container: compression and maximum errors.
@@ -49,7 +49,8 @@ impl Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
-    /// Returns the number of frames per tile, which is larger if there are error bounds.
+    /// Returns the number of consecutive frames whose values are encoded together (frames per tile). It is larger if
+    /// there are error bounds.
     pub fn frame_block(&self) -> usize {
         if self.bounds == ErrorBounds::default() { FRAME_BLOCK } else { FRAME_BLOCK_WITH_ERROR_BOUNDS }
     }
@@ -76,7 +77,7 @@ impl Packing {
         CacheKey::new(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
-    /// Returns the compression of the attribute `column`.
+    /// Returns the compression of the values of the attribute `column`.
     fn column(&self, column: Attributes) -> Compression {
         match (self.compression, self.bounds.max_error(column)) {
             (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
@@ -228,9 +229,10 @@ impl ContainerWriter {
         Ok(())
     }
 
-    /// Adds all Gaussians of `source` to the current frame block, at the frames `frames` of `source`. In the container
-    /// they get consecutive indices from `first` on, which is a multiple of [`GAUSSIAN_BLOCK`]. Calls `advance` with
-    /// the number of Gaussian states (Gaussians × frames) encoded since the last call.
+    /// Adds all Gaussians of `source` to the current frame block (consecutive frames), at the frames `frames` of
+    /// `source`. In the container they get consecutive indices from `first` on, which is a multiple of
+    /// [`GAUSSIAN_BLOCK`]. Calls `advance` with the number of Gaussian states (Gaussians × frames) encoded since the
+    /// last call.
     pub fn add_gaussians(
         &mut self,
         source: &dyn FrameSource,
@@ -245,10 +247,10 @@ impl ContainerWriter {
         })
     }
 
-    /// Adds the frames `frames` of `source` as the next frame block, with the time stamps `times`, like
-    /// [`ContainerWriter::append_block`]. `presence` says for each block of Gaussians how it changes in these frames.
-    /// This saves reading and encoding: of a block whose frames are all equal only the first is read and encoded, and
-    /// none if it repeats the frame block before.
+    /// Adds the frames `frames` of `source` as the next frame block (consecutive frames), with the time stamps `times`.
+    /// `presence` states for each block of Gaussians how it changes in these frames, which saves reading and encoding.
+    /// If all frames of a block of Gaussians are equal, only the first frame is read and encoded. If they also repeat
+    /// the frame block before, nothing is read or encoded.
     pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
@@ -268,8 +270,9 @@ impl ContainerWriter {
         )
     }
 
-    /// Writes `tile`, the values of column `column` for block number `gaussian_block` of Gaussians in the current frame
-    /// block. `None` means that the tile equals that of the frame block before.
+    /// Writes `tile`, the encoded values of the attribute with the index `column` for block number `gaussian_block` of
+    /// Gaussians in the current frame block. If `tile` is `None`, records that the values equal those in the frame
+    /// block before.
     fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
@@ -380,8 +383,8 @@ pub fn column_bytes(
     Ok(bytes)
 }
 
-/// Encodes the tiles of the block of Gaussians `gaussians` of `source` over the frames `frames`. Returns one tile per
-/// attribute; `None` for attributes that are not in `columns`.
+/// Encodes the values of the Gaussians `gaussians` of `source` at the frames `frames`. Returns one tile (encoded
+/// values) per attribute; `None` for attributes that are not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,

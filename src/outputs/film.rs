@@ -29,7 +29,7 @@ pub enum FilmFormat {
     Apng,
     /// Animated GIF: 256 colors per frame, delays in whole hundredths of a second.
     Gif,
-    /// Video, encoded by the program at the path of the first field.
+    /// Video. The first field is the path of the program that encodes it, the second its codec and container format.
     Encoded(PathBuf, Codec),
 }
 

@@ -69,7 +69,8 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
 /// Rounds positions, velocities, colors and opacities in `set` to the quantization grid of the file, so that the
 /// encoder accepts them. The encoder checks that each decoded value differs from the given one by at most half a
 /// quantization step, without a margin for the rounding of decoded values to f32. A value midway between two grid
-/// points could fail this check. Coordinates of a few units can lie there, and odd 8-bit colors do.
+/// points could fail this check. Coordinates of a few scene units may lie midway between two grid points, and odd 8-bit
+/// colors always do.
 fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
@@ -118,8 +119,8 @@ fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = 
     accuracy.check("a .4dgs")
 }
 
-/// Adds the piece of straight motion `piece` to `set`. `starts` has the start time of each frame, then the end of the
-/// last frame, in seconds.
+/// Appends the piece of straight motion `piece` to `set`. `starts` has the start time of each frame, then the end of
+/// the last frame, in seconds.
 fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     let to_f32 = |value: f64| value as f32;
     set.positions.extend(piece.position.map(to_f32));

@@ -1,5 +1,5 @@
-//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal: every frame whole, as
-//! textures that are compressed by LZ4.
+//! Writes a sequence as a `.gsd` file, version 1, for the plugin SplatRenderer of Unreal. Every frame is stored in full
+//! and independently of other frames, as textures that are compressed by LZ4.
 //!
 //! Layout, little-endian: "GSD1", u32 length of a JSON text, the JSON text, then for each frame u32 length and that
 //! many bytes of one LZ4 block. A block holds the textures of the table one after the other, each W × W pixels of four
@@ -158,7 +158,7 @@ impl PackedFrame {
         PackedFrame { textures, count: rows.len(), not_finite: seen.len() - rows.len(), bounds }
     }
 
-    /// Returns the entry of the frame in the JSON text. `bytes` is the length of its LZ4 block.
+    /// Returns the entry of this frame in the JSON text of the file. `bytes` is the length of the frame's LZ4 block.
     fn describe(&self, bytes: usize) -> Value {
         let side = side(self.count);
         let [low, high] = self.bounds.map(|[x, y, z]| json!({ "x": x, "y": y, "z": z }));
@@ -169,7 +169,8 @@ impl PackedFrame {
     }
 }
 
-/// Returns whether all values of the Gaussian `row` of `state` that the file stores are finite.
+/// Returns whether position, rotation, log scale and base color (SH coefficients of degree 0) of the Gaussian in row
+/// `row` of `state` are finite.
 fn is_finite(state: &Gaussians, row: usize) -> bool {
     let base = state.sh.row::<3>(row).iter().all(|x| x.is_finite());
     let [position, scale] = [state.position.row::<3>(row), state.log_scale.row::<3>(row)];
@@ -187,8 +188,8 @@ fn half_bytes(value: f64) -> [u8; 2] {
     f16::from_f64(value.clamp(-most, most)).to_le_bytes()
 }
 
-/// Returns the Morton code of the position `place` within the box from `low` to `high`. `place` is in scene units, the
-/// box in centimeters, both in Unreal's axes.
+/// Returns the Morton code of the position `place` within the box from `low` to `high`. `place` is in scene units and
+/// the box in centimeters; both are in Unreal's axes.
 fn morton(place: &[f64; 3], [low, high]: &[[f64; 3]; 2]) -> u32 {
     let most = f64::from((1u32 << MORTON_BITS) - 1);
     (0..3).fold(0, |code, axis| {

@@ -36,7 +36,7 @@ pub enum OutputKind {
     Glb,
     /// A folder with one `.sog` file per frame.
     SogSequence,
-    /// A `.gsd` file for a plugin of Unreal: all attributes of every frame.
+    /// A `.gsd` file for a plugin of Unreal: every frame in full, with colors of SH degree 0.
     Gsd,
     /// A `.ftgs.ply` file: Gaussians with linear motion, whose opacity follows a Gaussian function of time.
     Ftgs,
@@ -106,7 +106,7 @@ impl OutputKind {
         matches!(self, OutputKind::Model | OutputKind::PlySequence | OutputKind::SogSequence)
     }
 
-    /// Returns whether this kind of output stores the values of every frame. The others store a model, from which
+    /// Returns whether this kind of output stores the values of every frame. All other kinds store a model, from which
     /// frames are computed.
     pub fn stores_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)

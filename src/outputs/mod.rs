@@ -20,10 +20,9 @@ pub mod time_windows;
 mod tests {
     use crate::model::{Gaussians, opacity};
 
-    /// Finds the opacities that a player shows where Gaussian `id` of the frame state `state` is. `shown` has the
-    /// positions and opacities that the player shows at this frame. Returns the opacity of Gaussian `id`, and all
-    /// opacities in `shown` whose position is nearer to it than half its largest scale; `None` if its own opacity is
-    /// below 0.1.
+    /// Returns the opacity of Gaussian `id` of the frame state `state`, and the opacities that a player shows near it.
+    /// `shown` has the position and opacity of everything that the player shows at this frame. Near means closer to the
+    /// Gaussian than half its largest scale. Returns `None` if the opacity of the Gaussian is below 0.1.
     pub(super) fn opacities_near(state: &Gaussians, id: usize, shown: &[([f64; 3], f64)]) -> Option<(f64, Vec<f64>)> {
         let visible = opacity(state.opacity_logit.row::<1>(id)[0]);
         let at = state.position.row::<3>(id).map(f64::from);
@@ -33,9 +32,9 @@ mod tests {
         (visible >= 0.1).then(|| (visible, near.collect()))
     }
 
-    /// Returns the blended opacity 1 − Π(1 − α) of all Gaussians shown at one place, whose opacities α are `near`.
-    /// Gaussians other than the one under test may lie there and raise the result. So a test can only conclude from a
-    /// low result that the Gaussian is missing.
+    /// Returns the blended opacity 1 − Π(1 − α) of all Gaussians that are shown at one position; `near` holds their
+    /// opacities α. Gaussians other than the one under test may lie there and raise the result. So a test can only
+    /// conclude from a low result that the Gaussian is missing.
     pub(super) fn blended(near: &[f64]) -> f64 {
         1.0 - near.iter().map(|alpha| (1.0 - alpha).ln()).sum::<f64>().exp()
     }

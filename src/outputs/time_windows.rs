@@ -1,6 +1,6 @@
 //! Writes any sequence as Gaussians with linear motion, whose opacity follows a Gaussian function of time (a time
-//! window). Such lines in time windows are fitted to the trajectory of every Gaussian. Models that have this kind of
-//! motion are written without a fit.
+//! window). This module calls such a Gaussian a line. Lines are fitted to the trajectory of every Gaussian of the
+//! sequence. Models whose own Gaussians are lines are written without a fit.
 //!
 //! The time of these formats runs from 0, at the first frame, to 1, at the last. A `.tsog` can also hold single frames,
 //! and does if the fit is too inaccurate or has too many lines ([`are_frames_better`]). Memory: all lines, or the
@@ -30,14 +30,14 @@ const OPACITY_MARGIN: f64 = 1e-6;
 /// Maximum number of Gaussians in a `.tsog` of single frames, summed over all frames. The player of this format shows
 /// no more by default.
 pub const MAX_SINGLE_FRAME_GAUSSIANS: usize = 1_000_000;
-/// Maximum fraction of the visible states (Gaussians × frames, weighted by opacity) in which fitted lines may be far
-/// off ([`FitError::far_off_fraction`]). If the fraction is larger, single frames are written.
+/// Maximum fraction of the visible states (Gaussians × frames, weighted by opacity) in which fitted linear motions may
+/// be far off ([`FitError::far_off_fraction`]). If the fraction is larger, single frames are written.
 const MAX_FAR_SHARE: f64 = 0.1;
-/// Maximum number of intervals into which the trajectory of a Gaussian is divided to fit the lines of a `.tsog`. More
-/// intervals would cost many bytes, and only few Gaussians need them.
+/// Maximum number of intervals into which the trajectory of a Gaussian is divided to fit linear motions for a `.tsog`.
+/// More intervals would cost many bytes, and only few Gaussians need them.
 const COMPACT_INTERVALS: usize = 8;
-/// Approximate number of bytes of a line with its time window in a `.tsog`, as a multiple of the bytes of a Gaussian in
-/// a single frame.
+/// Approximate number of bytes of a Gaussian with linear motion and a time window in a `.tsog`, as a multiple of the
+/// bytes of a Gaussian in a single frame.
 const BYTES_RATIO: f64 = 1.5;
 
 /// Gaussians with linear motion in time windows, fitted to a sequence.
@@ -45,7 +45,7 @@ const BYTES_RATIO: f64 = 1.5;
 struct FittedWindows {
     lines: TimedGaussians,
     misfit: FitError,
-    /// Number of lines that were left out because one of their values is not finite.
+    /// Number of fitted Gaussians that were left out because one of their values is not finite.
     left_out: usize,
 }
 
@@ -74,8 +74,9 @@ pub fn write_timed(timed: &TimedGaussians, kind: OutputKind, path: &Path) -> Res
     }
 }
 
-/// Writes all frames of `source` to the file `path` in the format `kind`, as lines in time windows (linear motion with
-/// an opacity that is a Gaussian function of time). Returns notes for the user: the errors of the fit.
+/// Writes all frames of `source` to the file `path` in the format `kind`, as fitted Gaussians with linear motion and an
+/// opacity that is a Gaussian function of time. A `.tsog` is written as single frames instead if these are better.
+/// Returns notes for the user: the errors of the fit, and what was written instead.
 ///
 /// # Errors
 /// Fails if a frame cannot be read or the file cannot be written.
@@ -121,9 +122,10 @@ pub fn write_fitted_windows(
     Ok(notes)
 }
 
-/// Returns whether single frames are written instead of `lines`, whose fit has the error `misfit`. Single frames are
-/// written in two cases: if lines are far off in more than the fraction [`MAX_FAR_SHARE`] of the visible states, or if
-/// single frames, which have no fit error, take about as few bytes. They are never written if they have more than
+/// Returns whether single frames are written instead of `lines`, which are fitted Gaussians with linear motion.
+/// `misfit` is the error of the fit. Single frames are written in two cases: if `lines` are far off in more than the
+/// fraction [`MAX_FAR_SHARE`] of the visible states (one Gaussian at one frame), or if single frames, which have no fit
+/// error, take no more bytes by an estimate. They are never written if they have more than
 /// [`MAX_SINGLE_FRAME_GAUSSIANS`] Gaussians or [`MAX_FRAMES`] frames.
 fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
     let is_far_off = misfit.far_off_fraction() > MAX_FAR_SHARE;
@@ -133,7 +135,7 @@ fn are_frames_better(lines: &TimedGaussians, misfit: &FitError) -> bool {
 }
 
 /// Returns the visible Gaussians of all frames of `source`, each shown in its own frame only. `clip` maps the times of
-/// the frames to 0 to 1. Gaussians with values that are not finite are left out.
+/// the frames to the range from 0 to 1. Gaussians with values that are not finite are left out.
 fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaussians> {
     let info = source.info();
     let mut states = FrameStates::open(source, &ReadPlan::all_frames().with_max_kept_frames(1))?;
@@ -162,8 +164,8 @@ fn single_frames(source: &dyn FrameSource, clip: &ClipTimes) -> Result<TimedGaus
     Ok(TimedGaussians { params: StoredParams { gaussians, format_specific: own }, timeline, clip: *clip })
 }
 
-/// Fits lines in time windows (linear motion with an opacity that is a Gaussian function of time) to all Gaussians of
-/// `source`, for the format `kind`. Returns the lines and the error of the fit.
+/// Fits Gaussians with linear motion and an opacity that is a Gaussian function of time to all Gaussians of `source`,
+/// for the format `kind`. Returns the fitted Gaussians and the error of the fit.
 fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<FittedWindows> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
@@ -189,7 +191,8 @@ fn fit(source: &dyn FrameSource, kind: OutputKind, events: &Events) -> Result<Fi
     Ok(FittedWindows { lines: TimedGaussians { params, timeline: Timeline::Windows, clip }, misfit, left_out })
 }
 
-/// Returns whether all values of `line` are finite as f32. The width of its time window may be infinite.
+/// Returns whether all values of the fitted linear motion `line` are finite as f32. The width of its time window is not
+/// checked, because it may be infinite.
 fn is_finite(line: &CubicTrack) -> bool {
     let values = line.position.iter().flatten().chain(&line.rotation[0]).chain(&line.log_scale).copied();
     let values = values.chain([line.opacity, line.center]);
@@ -197,7 +200,7 @@ fn is_finite(line: &CubicTrack) -> bool {
     values.chain(sh).all(|value| (value as f32).is_finite())
 }
 
-/// Sets the parameters of the Gaussian `row` of `params` to those of the fitted line `line`.
+/// Sets the parameters of the Gaussian `row` of `params` to those of the fitted linear motion `line`.
 fn set_row(params: &mut StoredParams, row: usize, line: &CubicTrack) {
     let narrow = |value: f64| value as f32;
     let gaussians = &mut params.gaussians;

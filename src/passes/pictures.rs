@@ -99,10 +99,10 @@ pub struct ViewStates<'a, const S: usize> {
     pub picture: FrameView,
     /// Camera of the view.
     pub camera: &'a Camera,
-    /// Gaussians of each subject at the view's frame.
+    /// Gaussians of each subject (rendered source) at the view's frame.
     pub states: [&'a Gaussians; S],
-    /// Decoder, and features of the Gaussians at the view's frame, of each subject whose pixel colors are computed from
-    /// features; `None` for the others.
+    /// For each subject (rendered source): the decoder that computes pixel colors from features, and the features of
+    /// its Gaussians at the view's frame. `None` for a subject whose colors are not computed from features.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
@@ -152,7 +152,7 @@ impl<const S: usize> ViewStates<'_, S> {
     }
 }
 
-/// Gaussians of all subjects at one frame, in buffers that are reused for later frames.
+/// Gaussians of all subjects (rendered sources) at one frame, in buffers that are reused for later frames.
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],

@@ -135,14 +135,14 @@ fn size_by(request: &Request) -> String {
 }
 
 impl DryRunReport {
-    /// Returns the report as JSON, for programs.
+    /// Returns this report of a dry run as JSON text, for other programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// Returns the report as text for display.
+    /// Returns this report of a dry run as text for display.
     pub fn text(&self) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.

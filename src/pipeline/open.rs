@@ -205,10 +205,11 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// Sends a message about memory before a stream is received, if the user asked for one:
-/// - for the forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
-/// - for the plan ([`Verbosity::Plan`]): `most`, the number of frames that fit the memory limit, and `to_measure`, the
-///   number of frames up to which memory suffices to compute statistics while they arrive.
+/// Sends a message about memory before a stream is received. What the user asked for determines its content:
+/// - forecast ([`Verbosity::Time`]): `peak`, the maximum memory of the run, bytes;
+/// - plan ([`Verbosity::Plan`]): `most`, the maximum number of frames that fit the memory limit, and `to_measure`, the
+///   maximum number of frames for which memory suffices to compute statistics while they arrive;
+/// - neither: no message is sent.
 fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
     let text = match options.memory.tell {
         Verbosity::Time => {

@@ -58,11 +58,12 @@ impl RunPlan {
         plan
     }
 
-    /// Returns the plan of a run within the memory limit of `request`. Refinement is reduced until the plan fits: first
-    /// the values that it adds to stored parameters (parameter deltas) become constant in time, then SH coefficients
-    /// above degree 0 are not refined either, then nothing is refined. If even a run without refinement exceeds the
-    /// limit, the plan with full refinement is returned; it is refused later with an error that names the smallest
-    /// sufficient limit. The plan includes the measurement of the quality of the result if there is memory for it.
+    /// Returns the plan of a run within the memory limit of `request`. If the plan does not fit, refinement is reduced
+    /// step by step until it does. First, parameter deltas (values that refinement adds to stored parameters) become
+    /// constant in time. Then SH coefficients above degree 0 are not refined. Then nothing is refined. If even a run
+    /// without refinement exceeds the limit, the plan with full refinement is returned; it is refused later with an
+    /// error that names the smallest sufficient limit. The plan includes the measurement of the quality of the result
+    /// if there is memory for it.
     ///
     /// # Errors
     /// Fails in the cases in which [`RunPlan::new`] fails.

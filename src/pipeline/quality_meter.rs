@@ -16,7 +16,8 @@ use crate::source::FrameSource;
 
 /// Images with which renders of a compressed model are compared.
 pub(super) enum QualityReference<'a> {
-    /// Renders of the original: the stored renders, and for each view of the meter the index of its stored render.
+    /// Renders of the original model. Second field: for each view of the quality meter, the index of its render among
+    /// the stored renders.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
     Photographs(Photographs),
@@ -27,14 +28,16 @@ pub(super) enum QualityReference<'a> {
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// Views in order of frames, each with a flag that is true for a view held back from the search.
+    /// Views in order of frames. The flag of a view is true if the view is held back from the search for the smallest
+    /// model.
     pictures: Vec<(FrameView, bool)>,
     comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// Returns a meter for the views `pictures`, in order of frames. The flag of a view is true if it is held back from
-    /// the search. `comparison` holds the images with which renders are compared.
+    /// Creates a quality meter that compares models on the views `pictures`, which are in order of frames. The flag of
+    /// a view is true if the view is held back from the search for the smallest model. `comparison` holds the images
+    /// with which renders are compared.
     ///
     /// # Errors
     /// Fails if no view is held back from the search, or if every view is.
@@ -97,13 +100,15 @@ impl<'a> QualityMeter<'a> {
         Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 
-    /// Returns the number of views by which the search compares models.
+    /// Returns the number of views on which the search for the smallest model compares models. Views that are held back
+    /// from the search are not counted.
     pub(super) fn search_view_count(&self) -> usize {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
-    /// Returns the names of the views held back from the search. A name consists of frame and view number; the name of
-    /// a view from a camera between those of the scene has only the frame.
+    /// Returns the names of the views that are held back from the search for the smallest model. A name has the form
+    /// `tNNN_vNN` (frame, view number). A view from a camera between two cameras of the scene has no view number; its
+    /// name is `tNNN_between`.
     pub(super) fn held_back_names(&self) -> Vec<String> {
         let name = |picture: &FrameView| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),

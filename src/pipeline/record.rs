@@ -34,7 +34,8 @@ pub struct RunOptions {
     pub mode: PruneOrMerge,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
-    /// Number of Gaussians in the output, as an exact fraction of those in the input.
+    /// Number of Gaussians in the output divided by the number in the input. The output has exactly the resulting
+    /// number of Gaussians, rounded.
     pub target_ratio: Option<f64>,
     /// Minimum mean PSNR of renders of the output against renders of the original, dB.
     pub min_psnr: Option<f64>,

@@ -54,8 +54,8 @@ const SAME_SIZE_RATIO: f64 = 1.04;
 /// decrease of the PSNR against the original, dB; used if a minimum PSNR is requested. Second number: factor by which
 /// the loss of PSNR against photographs grows; used if a maximum loss is requested.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
-/// Surplus of quality (quality above the requested one) that is small enough to end the search. Unit: number of times
-/// that the surplus would allow the number of Gaussians to be halved.
+/// Surplus of quality (quality above the requested one) that is small enough to end the search. Unit: halvings of the
+/// number of Gaussians; with a surplus of 1, about half as many Gaussians would suffice.
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;
@@ -77,8 +77,8 @@ pub struct SearchStage {
     pictures: usize,
     /// Refinement stage, which is run at every size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// Margins of quality, dB. First: margin required for writing the deformation field in half precision; `None` if it
-    /// stays exact. Second: margin required for dropping SH degrees; `None` if all degrees stay.
+    /// PSNR margins, dB, that two reductions of the model require. First: for storing the deformation field in half
+    /// precision; `None` if the field stays exact. Second: for dropping SH degrees; `None` if all degrees stay.
     margins: [Option<f64>; 2],
 }
 
@@ -92,7 +92,7 @@ struct TriedSize {
 }
 
 impl SearchStage {
-    /// Returns the search of a run; `None` if no quality is requested.
+    /// Returns the search for the smallest model with the requested quality; `None` if no quality is requested.
     pub fn from_planning(planning: &Planning<'_>) -> Option<SearchStage> {
         let Planning { request, output, .. } = *planning;
         let Some(Goal::Quality(quality)) = &request.goal else { return None };
@@ -200,9 +200,10 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns the meter that measures the quality of models: against `photographs` (test views with their photographs)
-    /// if given, otherwise against `targets`, the stored renders of the original. In the second case `parts` states
-    /// which of the target views the search may use and which are held back from it.
+    /// Returns the meter that measures the quality of models. If `photographs` is given (test views with their
+    /// photographs), the meter compares renders with the photographs. Otherwise it compares renders with `targets`, the
+    /// stored renders of the original. `parts` then states which target views the search may use and which are held
+    /// back from it.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -233,7 +234,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the cache key, a digest of everything that the search depends on.
+    /// Returns the cache key of the result of the search: a digest of everything on which the result depends.
     fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, template: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
@@ -356,7 +357,7 @@ impl SearchStage {
         }
     }
 
-    /// Returns the limit, dB, that the search must keep to: the minimum PSNR or the maximum loss of PSNR.
+    /// Returns the quality limit, dB, that the search must satisfy: the minimum PSNR or the maximum loss of PSNR.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,

@@ -155,8 +155,8 @@ impl CountPlan {
     }
 
     /// Returns the number of Gaussians that ranking leaves, if the input has `all` Gaussians and the output is to have
-    /// `wanted`. If the run searches for the smallest model with a requested quality, ranking runs only once for all
-    /// models that are tried. Then returns the number for the smallest of these models, whatever `wanted` is.
+    /// `wanted`. A search for the smallest model with a requested quality ranks only once, for all models that it
+    /// tries. If the run searches, `wanted` is ignored and the number for the smallest of these models is returned.
     pub fn count_after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
             if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
@@ -314,7 +314,7 @@ pub struct RunState<'a> {
     /// Stages of the run, with the plan ([`CountPlan`]) of how many Gaussians remain after ranking and after
     /// refinement.
     pub stages: &'a StageList,
-    /// Journal of the run so far, for the summary.
+    /// Journal of the run so far: records of the stages, omitted work and notes. The summary is made from it.
     pub journal: Journal,
     /// Description of the input for the summary. Computed only once, because its digest reads the whole input.
     pub input: Option<InputSummary>,
@@ -335,7 +335,7 @@ pub struct RunState<'a> {
     pub template: CompressedModel,
     /// Compressed model in the state in which the last stage left it.
     pub result: CompressedModel,
-    /// Number of Gaussians of the model in [`result`](RunState::result) that are to be left after refinement.
+    /// Number of Gaussians that refinement is to leave in the model [`result`](RunState::result).
     pub refine_to: usize,
     /// Refined models after prune steps (removals of the lowest-ranked Gaussians), from which the refinement of a
     /// smaller model continues. Present only in a search for the smallest model with a requested quality.

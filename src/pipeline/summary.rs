@@ -57,7 +57,8 @@ pub struct ArchiveSummary {
     pub level: f64,
     /// Amount by which quantization lowers the PSNR against the original, dB.
     pub loss: f64,
-    /// Number of bytes of each part of the archive; `None` for an archive of frames, which has one part.
+    /// Number of bytes of each part of the archive: Gaussians, deformation field, everything else. `None` for an
+    /// archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parts: Option<ArchiveSize>,
     /// Error bound of every attribute, by name of the attribute and in its unit; `None` unless the archive stores
@@ -95,7 +96,8 @@ pub struct InputSummary {
     pub varying: Vec<String>,
     /// Number of bytes of all files of the input that a renderer opens; for a stream, number of bytes that arrived.
     pub bytes: u64,
-    /// Number of bytes of each part of the input.
+    /// Number of bytes of each part of the input: canonical Gaussians, deformation field, explicit frames, everything
+    /// else.
     pub size: ModelSize,
 }
 
@@ -129,7 +131,8 @@ impl InputSummary {
 }
 
 impl InputSummary {
-    /// Returns the description with the path reduced to its last component, for a file that may be published.
+    /// Returns this description of the input with its path reduced to the last component, for a file that may be
+    /// published.
     pub fn with_file_names_only(self) -> InputSummary {
         InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
@@ -214,7 +217,8 @@ pub struct Summary {
     pub gaussians: usize,
     /// Number of bytes of all output files that a renderer opens.
     pub output_bytes: u64,
-    /// Number of bytes of each part of the output.
+    /// Number of bytes of each part of the output: canonical Gaussians, deformation field, explicit frames, everything
+    /// else.
     pub output_size: ModelSize,
     /// Numbers of Gaussians kept and removed by scoring and selection (stages 1 and 2 of the paper).
     pub selection: SelectionCounts,
@@ -223,7 +227,7 @@ pub struct Summary {
     /// Forecast of time and memory that was made before the run, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub forecast: Option<Forecast>,
-    /// Records of all stages in order.
+    /// Records of all stages in order: numbers of Gaussians, reads, time and memory of each stage.
     pub stages: Vec<StageRecord>,
     /// Percentiles of every term of the score by which Gaussians were ranked.
     pub terms: Vec<TermSummary>,
@@ -261,7 +265,7 @@ impl Summary {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }
 
-    /// Returns the summary as JSON, for programs.
+    /// Returns this summary of a run as JSON text, for other programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
         text.push('\n');

@@ -13,7 +13,7 @@ use crate::models::ModelSize;
 use crate::outputs::kind::OutputKind;
 use crate::progress::format_duration;
 
-/// Maximum number of notes that are shown unless all details are asked for.
+/// Maximum number of notes that the text of a summary shows unless all details are requested.
 const NOTES: usize = 2;
 
 /// Minimum width, in characters, of the title of the table, which names the input and the output.
@@ -123,8 +123,9 @@ impl Summary {
         Ok(())
     }
 
-    /// Writes how the bytes of the input and of the result divide into parts, if the result has several parts. Marks
-    /// the part that takes most bytes of the result.
+    /// Writes to `out` the number of bytes of each part (Gaussians, deformation field, frames, other) of the input and
+    /// of the result. Marks a part other than the Gaussians that takes more than half of the result. Writes nothing if
+    /// the result has fewer than two parts.
     fn write_size_parts(&self, out: &mut String) -> std::fmt::Result {
         let named = |size: &ModelSize| {
             [
@@ -167,7 +168,7 @@ impl Summary {
         format!("{} PSNR{ssim} vs. original ({views})", decibels_text(psnr, 2))
     }
 
-    /// Writes the notes: with [`SummaryDetail::Most`] only the first [`NOTES`] of them.
+    /// Writes the notes of the summary to `out`. With [`SummaryDetail::Most`], writes only the first [`NOTES`] of them.
     fn write_notes(&self, out: &mut String, detail: SummaryDetail) -> std::fmt::Result {
         let shown = match detail {
             SummaryDetail::All => self.notes.len(),
@@ -182,7 +183,7 @@ impl Summary {
         }
     }
 
-    /// Writes commands that the user may want to run next.
+    /// Writes to `out` commands that the user may want to run next.
     fn write_next_steps(&self, out: &mut String) -> std::fmt::Result {
         let output = Path::new(&self.output);
         if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {

@@ -21,9 +21,10 @@ const MIN_UTILIZATION: f64 = 0.6;
 const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
-    /// Returns the forecast of a run with the sizes `work`. `needs`: estimates of its stages. `least`: estimated
-    /// core-seconds without the stages that may turn out to be unnecessary. `searches`: whether the amount of work
-    /// depends on intermediate results. `memory_bytes`: maximum memory.
+    /// Returns the forecast (expected time and memory) of a run. `work`: sizes of its input and views. `needs`:
+    /// resource estimates of its stages. `least`: estimated core-seconds without the stages that may turn out to be
+    /// unnecessary. `searches`: whether the amount of work depends on intermediate results. `memory_bytes`: maximum
+    /// memory.
     pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
@@ -61,8 +62,8 @@ impl Forecast {
         }
     }
 
-    /// Returns the forecast as text for display: a line for the time and one for the memory; with [`Verbosity::Plan`]
-    /// also the core-seconds of every stage.
+    /// Returns this forecast of a run as text for display: a line for the time and one for the memory; with
+    /// [`Verbosity::Plan`] also the core-seconds of every stage.
     pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
         let mut out = String::new();

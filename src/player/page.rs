@@ -190,8 +190,8 @@ impl ChunkFiles {
         Ok(ChunkFiles { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
-    /// Adds the chunk `bytes`, which is chunk number `chunk` of model number `model`. `since` is the position in time
-    /// of its first frame: the index of the frame divided by the number of frames shown.
+    /// Stores `bytes` as chunk (encoded group of frames) number `chunk` of model number `model`. `since` is the
+    /// position in time of the first frame of the chunk: the index of the frame divided by the number of frames shown.
     ///
     /// # Errors
     /// Fails if the scratch file cannot be written.
@@ -213,17 +213,17 @@ impl ChunkFiles {
         self.folder.path().join(name(model, chunk))
     }
 
-    /// Returns the pairs (model, chunk number) of all chunks in the order in which the page loads them. Chunks are
-    /// sorted by the position in time of their first frames, so that the chunks with the first frames of both models
-    /// load first.
+    /// Returns the pairs (model, chunk number) of all chunks (encoded groups of frames) in the order in which the page
+    /// loads them. Chunks are sorted by the position in time of their first frames, so that the chunks with the first
+    /// frames of both models load first.
     fn ordered(&self) -> Vec<(usize, usize)> {
         let mut made = self.made.clone();
         made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
         made.into_iter().map(|(_, model, chunk, _)| (model, chunk)).collect()
     }
 
-    /// Writes one HTML file to `path` that contains all chunks. `stage` describes the scene. Returns the size of the
-    /// file in bytes.
+    /// Writes the page as one HTML file to `path`, which contains all chunks (encoded groups of frames). `stage`
+    /// describes the scene. Returns the size of the file in bytes.
     ///
     /// # Errors
     /// Fails if a file cannot be read or written.

@@ -16,20 +16,21 @@ use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficie
 /// step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PlayerSteps {
-    /// Step of positions, scene units.
+    /// Quantization step of positions, scene units.
     pub position: f64,
-    /// Step of components of unit quaternions.
+    /// Quantization step of the components of unit quaternions.
     pub rotation: f64,
-    /// Step of natural logarithms of scales.
+    /// Quantization step of the natural logarithms of scales.
     pub log_scale: f64,
-    /// Step of opacities in [0, 1].
+    /// Quantization step of opacities, which are in [0, 1].
     pub opacity: f64,
-    /// Step of SH coefficients.
+    /// Quantization step of SH coefficients.
     pub sh: f64,
 }
 
-/// Binary digits of a position: the position step is 2^−14 times the scene's extent, which is first rounded down to a
-/// power of two. In a render of the whole scene on 800 pixels, positions are off by at most a fortieth of a pixel.
+/// Number of binary digits of a position. The quantization step of positions is 2^−14 times the scene's extent, which
+/// is first rounded down to a power of two. In a render of the whole scene on 800 pixels, positions are off by at most
+/// a fortieth of a pixel.
 const POSITION_BITS: i32 = 14;
 /// Largest absolute value of a log scale on the player page, as in the rasterizer; other values are clamped.
 const LOGARITHM_LIMIT: f32 = 80.0;
@@ -73,8 +74,9 @@ pub fn component_count(sh_degree: usize) -> usize {
 /// `[components, N]`. Leaves the other attributes in `points` as they are. Returns the number of Gaussians that become
 /// invisible.
 ///
-/// Quaternions are normalized and get the sign that is closer to the earlier content of `points`. A Gaussian with a
-/// value that is not finite, or too far away for the integers, gets opacity 0 and is invisible.
+/// Quaternions are normalized and get the sign that is closer to the earlier content of `points`. A Gaussian gets
+/// opacity 0, and is invisible, if one of its values is NaN or if its position is infinite or too far away for the
+/// integers.
 ///
 /// # Panics
 /// Panics if `points` has fewer than components × N values.
@@ -141,8 +143,8 @@ fn nearest(value: f64, step: f64) -> i32 {
 }
 
 /// Normalizes the quaternions `rotation` and writes them as multiples of `step` into `points`. A quaternion and its
-/// negative are the same rotation; the one closer to the earlier content of `points` is written, so that a steady
-/// rotation gives equal differences.
+/// negative are the same rotation; the one closer to the earlier content of `points` is written. Without this choice, a
+/// jump of the sign would make differences between frames large.
 fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {

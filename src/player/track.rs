@@ -58,8 +58,8 @@ pub struct PageSequence {
     pub varying: Vec<[usize; 2]>,
     /// Index of the first frame of each group, followed by the total number of frames.
     pub groups: Vec<usize>,
-    /// Largest number of Gaussians that are invisible in one frame of the page, because a value is not finite or a
-    /// position is too far away for the quantization grid.
+    /// Largest number of Gaussians that are invisible in one frame of the page, because a value is NaN or a position is
+    /// too far away for the quantization grid.
     #[serde(skip)]
     pub unseen: usize,
 }
@@ -97,7 +97,8 @@ impl PageSequence {
 }
 
 /// Returns the attributes that are encoded for every frame, given the attributes `varying` that vary with time. If any
-/// attribute varies, opacity is added, because a Gaussian that is not finite at some frames is invisible there.
+/// attribute varies, opacity is added, because a Gaussian may have values that cannot be shown at some frames, and its
+/// opacity is then 0 at these frames.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }

@@ -171,8 +171,9 @@ struct ModelView<'a> {
     degree: usize,
 }
 
-/// Encodes the frames of `model` as model number `place` of the page and adds its chunks to `chunks`. Returns the
-/// description of the model. `asked` holds the settings for this model, and `steps` the quantization steps.
+/// Encodes the frames of `model` as model number `place` of the page, and adds the encoded chunks (groups of frames) to
+/// `chunks`. Returns the description of the model for the page. `asked` holds the settings for this model, and `steps`
+/// the quantization steps.
 fn show(
     model: &dyn InputModel,
     place: usize,

@@ -118,9 +118,8 @@ fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// Returns `x`/`tau` if `tau` > 0; the quotient is at least 1 exactly if `x` reaches the threshold `tau`. With `tau` ≤
-/// 0 the quotient would not show this. Then returns infinity if `x` ≥ `tau`, so that all values that reach the
-/// threshold tie, and −infinity otherwise.
+/// Returns `x`/`tau` if `tau` > 0; the quotient is at least 1 exactly if `x` reaches the threshold `tau`. For `tau` ≤
+/// 0, returns infinity if `x` ≥ `tau`, and −infinity otherwise; all values that reach the threshold then tie.
 fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {
         x / tau

@@ -32,8 +32,9 @@ pub struct VisibilityStage {
 }
 
 impl VisibilityStage {
-    /// Returns the stage, or `None` if `recipe` does not measure the contribution C by renders. `has_cameras`: whether
-    /// the scene has cameras of its own, rather than a virtual rig (cameras placed by the program).
+    /// Returns the stage that measures contributions on rendered views, or `None` if `recipe` measures the contribution
+    /// C without renders. `has_cameras`: whether the scene has cameras of its own, rather than a virtual rig (cameras
+    /// placed by the program).
     pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<VisibilityStage> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,

@@ -18,7 +18,8 @@ const SPARSE_DIVISOR: usize = 2;
 /// Attributes of the Gaussians at one frame, and their derivatives (Jacobian) with respect to the stored parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LinearizedState {
-    /// Increasing indices of the Gaussians in `state` if `state` leaves out invisible Gaussians; `None` if it has all.
+    /// Increasing indices, in the model, of the Gaussians in `state` if `state` leaves out invisible Gaussians; `None`
+    /// if it holds all Gaussians.
     pub(super) present: Option<Vec<u32>>,
     pub(super) state: Gaussians,
     pub(super) jacobian: Jacobian,
@@ -48,8 +49,8 @@ impl LinearizedState {
         is_sparse.then(|| self.rows(&present, Some(present.clone())))
     }
 
-    /// Returns a state with only the rows `rows` of this one (a row holds the values of one Gaussian). `present`: index
-    /// of the Gaussian in each of these rows if the returned state leaves out invisible Gaussians, else `None`.
+    /// Returns a state with the values of only those Gaussians that are in the rows `rows` of this state. `present`:
+    /// index of each of these Gaussians in the model if the returned state leaves out invisible Gaussians, else `None`.
     fn rows(&self, rows: &[u32], present: Option<Vec<u32>>) -> LinearizedState {
         LinearizedState { present, state: self.state.pick(rows), jacobian: self.jacobian.pick(rows) }
     }
@@ -66,7 +67,7 @@ pub(super) struct LinearizedFrames {
     file: Spill,
     varying: Attributes,
     /// State of all Gaussians at the first frame. Attributes that do not vary with time have these values in all
-    /// frames; for the other attributes it gives the number of components and Gaussians.
+    /// frames. For attributes that vary, it gives the numbers of components and Gaussians of the other frames.
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
 }

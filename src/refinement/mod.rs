@@ -67,11 +67,11 @@ const RATE_VIEWS: usize = 16;
 /// Stage that refines the Gaussians left by pruning, with its parameters.
 #[derive(Debug, Clone)]
 pub struct RefineStage {
-    /// Attributes that are optimized.
+    /// Attributes of the Gaussians that refinement optimizes.
     pub columns: Attributes,
-    /// Maximum SH degree that is optimized.
+    /// Maximum degree of the SH coefficients that refinement optimizes.
     pub sh_degree: usize,
-    /// Loss to be minimized.
+    /// Loss that refinement minimizes.
     loss: Loss,
     /// Number of optimization steps after the last prune step; each uses one view.
     pub steps: usize,
@@ -93,9 +93,9 @@ pub struct RefineStage {
 }
 
 impl RefineStage {
-    /// Returns the stage, or `None` if `recipe` optimizes no attribute or has no steps. `target`: fraction of the
-    /// Gaussians that the user wants to keep. `cuts`: whether prune steps are possible, that is, whether the run ranks
-    /// Gaussians by renders.
+    /// Returns the refinement stage with the parameters of `recipe`, or `None` if `recipe` optimizes no attribute or
+    /// has no steps. `target`: fraction of the Gaussians that the user wants to keep. `cuts`: whether prune steps are
+    /// possible, that is, whether the run ranks Gaussians by renders.
     pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
@@ -133,7 +133,7 @@ impl RefineStage {
             .with_time_independent_deltas()
     }
 
-    /// Returns the cache key of these parameters. The input is not part of it.
+    /// Returns the cache key of the parameters of this stage. It does not depend on the input.
     pub(crate) fn key(&self) -> CacheKey {
         let step_settings = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
         CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, step_settings))
@@ -144,9 +144,9 @@ impl RefineStage {
     }
 
     /// Returns the stride n at which the training views are stored: only every n-th column and row of pixels. `pixels`:
-    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. If prune steps are
-    /// possible, they will remove most of these, so the result is [`RefineStage::stride`] for a third of `first`. It
-    /// may be larger than the stride for `first`.
+    /// number of pixels of a view. `first`: number of Gaussians with which refinement begins. With prune steps, which
+    /// remove most Gaussians, the result is the [`RefineStage::stride`] for only a third of `first`. It may be larger
+    /// than the stride for `first`.
     pub(crate) fn stored_stride(&self, pixels: u64, first: usize) -> NonZeroU32 {
         let fewer = if self.cuts { first / 3 } else { first };
         self.stride(pixels, fewer)

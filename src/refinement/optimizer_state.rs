@@ -21,11 +21,11 @@ use crate::source::{Deformation, FrameSource, ReadPlan};
 /// Settings of optimization steps: the loss and the attributes that are optimized.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StepParams {
-    /// Attributes that are optimized.
+    /// Attributes of the Gaussians that optimization steps change.
     pub(super) columns: Attributes,
-    /// Maximum SH degree that is optimized.
+    /// Maximum degree of the SH coefficients that optimization steps change.
     pub(super) sh_degree: usize,
-    /// Loss to be minimized.
+    /// Loss that optimization steps minimize.
     pub(super) loss: Loss,
 }
 
@@ -34,8 +34,8 @@ pub(super) struct StepParams {
 const FRAMES_PER_KEYFRAME: usize = 4;
 
 /// Returns the number of keyframes of the time-varying delta (values that refinement adds to each frame) for a sequence
-/// of `frames` frames: one for every [`FRAMES_PER_KEYFRAME`] frames, and at most `max_keyframes`. Returns 0 if that is 1,
-/// because a delta with a single keyframe does not vary with time.
+/// of `frames` frames: one for every [`FRAMES_PER_KEYFRAME`] frames, and at most `max_keyframes`. Returns 0 in place of
+/// 1, because a delta with a single keyframe does not vary with time.
 pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
     let keyframe_count = max_keyframes.min(frames / FRAMES_PER_KEYFRAME);
     if keyframe_count > 1 { keyframe_count } else { 0 }
@@ -66,8 +66,8 @@ pub(super) struct OptimizerState<'a> {
     /// Stored parameters without the changes (delta) that the optimizer `descent` has made. Used only if the model has
     /// a deformation field.
     stored: StoredParams,
-    /// Part of the constant delta (change of the stored parameters since the start of refinement) that `stored` and
-    /// `linearized` already include. The optimizer `descent` holds the rest.
+    /// Constant delta (change of the stored parameters since the start of refinement) that `stored` and `linearized`
+    /// already include. The total constant delta is this one plus the delta of the optimizer `descent`.
     before: ParamDelta,
     fixed: Vec<bool>,
     /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
@@ -246,7 +246,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// Returns the contents of a checkpoint, from which [`OptimizerState::resume`] continues.
+    /// Returns the state of the optimizer for a checkpoint, from which [`OptimizerState::resume`] continues.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
         let reevaluated = self.reevaluated.then_some((&self.stored, &self.before));
         let course = self.course.iter().map(Adam::checkpoint).collect();

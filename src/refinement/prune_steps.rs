@@ -10,8 +10,8 @@ use crate::journal::Journal;
 /// To try another number of Gaussians, the search starts from the smallest of these models that is large enough.
 pub struct PrunedModels<'a> {
     refinement: RefineRun<'a>,
-    /// Models between two prune steps, from the largest to the smallest. The model after the last prune step of a
-    /// request is not kept.
+    /// Models between two prune steps, from the largest to the smallest. A model that already has the requested number
+    /// of Gaussians is not stored.
     models: Vec<CompressedModel>,
 }
 

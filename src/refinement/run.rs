@@ -151,7 +151,7 @@ pub(crate) struct RefineRun<'a> {
     /// Name of the stage that runs the refinement.
     stage: &'static str,
     progress: Progress,
-    /// Cache key of the stage's parameters and of the target views. The model that is refined is not part of it.
+    /// Cache key of the stage's parameters and of the target views. It does not depend on the model that is refined.
     key: CacheKey,
 }
 
@@ -171,12 +171,13 @@ struct CheckpointTimer {
 #[derive(Serialize, Deserialize)]
 struct ResumePoint<Checkpoint, Best> {
     phase: usize,
-    /// Number of optimization steps done in this phase.
+    /// Number of optimization steps that the phase (part of refinement) had done when the checkpoint was written.
     steps: usize,
     taken: usize,
     schedule: RateSchedule,
     checkpoint: Checkpoint,
-    /// Best parameters so far, in the final steps. `None` before a prune step, because there is no validation there.
+    /// Best parameter deltas so far, if the phase is the final steps. `None` in the steps before a prune step, because
+    /// these are not validated.
     best_state: Option<Best>,
 }
 
@@ -186,9 +187,9 @@ struct ResumePoint<Checkpoint, Best> {
 struct BestState<Delta, Trajectory> {
     before: RenderQuality,
     best: RenderQuality,
-    /// Best validation quality of renders of the model with values added that are constant in time.
+    /// Best validation quality so far of renders with the constant delta alone, without time-varying values.
     constant: RenderQuality,
-    /// Part of the best change found so far that is constant in time: values to add to the stored parameters.
+    /// Constant delta (values added to the stored parameters) that has had the best validation quality so far.
     delta: Delta,
     /// Factor on the learning rates, reduced whenever the validation quality became worse.
     rate_factor: f32,
@@ -524,10 +525,10 @@ impl<'a> RefineRun<'a> {
     }
 
     /// Runs the optimization steps of the time-varying delta, which follow the `steps` steps of the constant delta.
-    /// Stores the best deltas in `best_state`. `done` is the number of steps of both deltas in the checkpoint that was
-    /// loaded; 0 without a checkpoint. If it is above `steps`, this function continues after these steps with the
-    /// learning rates `schedule`; otherwise it starts from the best constant delta. Returns false if there is nothing
-    /// to do, because no attribute may vary with time or the constant delta is good enough.
+    /// Stores the best deltas in `best_state`. `done`: number of steps of both deltas in the loaded checkpoint; 0
+    /// without one. If `done` is above `steps`, continues from the checkpoint with the learning rates `schedule`;
+    /// otherwise starts from the best constant delta. Returns false if no attribute may vary with time or the constant
+    /// delta is good enough.
     fn refine_along_time(
         &mut self,
         optimizer: &mut OptimizerState<'_>,

@@ -24,14 +24,14 @@ const VIEW_SHARES: [usize; 2] = [3, 23];
 const MAX_BYTES: u64 = 1 << 30;
 /// Minimum number of target views, even if they exceed [`MAX_BYTES`].
 const MIN_VIEWS: u64 = 96;
-/// Distance between two validation views in the list of target views: first value with at least [`MANY_VIEWS`] target
-/// views, second value with fewer.
+/// Number n for validation views: one of every n target views is a validation view. First value: with at least
+/// [`MANY_VIEWS`] target views. Second value: with fewer.
 const VALIDATION_EVERY: [usize; 2] = [16, 8];
-/// Minimum number of target views of which one in 16, not one in 8, is enough for validation.
+/// Minimum number of target views at which one of every 16, instead of one of every 8, is a validation view.
 const MANY_VIEWS: usize = 400;
 
-/// Distance between two test views in the list of target views. Only runs with a quality target have test views, which
-/// they use only for the reported quality.
+/// Number n for test views: one of every n target views is a test view. Only runs with a quality target have test
+/// views, which they use only for the reported quality.
 const TEST_EVERY: usize = 4;
 
 /// Indices of the target views, divided by the purpose of the view.
@@ -54,7 +54,7 @@ pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
 
 /// Target views: renders of the original model, in a scratch file. Their cameras are the cameras by which Gaussians are
 /// scored, new cameras between these and, if [`Scene::outside`] is not 0, new cameras outside the rig. Of a training
-/// view only the pixels of a grid are rendered; validation and test views are whole.
+/// view only the pixels of a grid are rendered; of validation and test views, all pixels are.
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Camera and frame of each target view, sorted by frame.
@@ -69,8 +69,8 @@ pub(crate) struct Targets {
 }
 
 /// Fraction of the views from new cameras that are rendered from cameras outside the rig if [`Scene::outside`] is 1.
-/// For smaller values of it the fraction is smaller in proportion. A camera is outside the rig if it sees the scene
-/// from a direction that no camera of the scene, and no path between two of them, has.
+/// For a smaller [`Scene::outside`], the fraction is smaller in proportion. A camera is outside the rig if it sees the
+/// scene from a direction that no camera of the scene, and no path between two of them, has.
 const OUTSIDE_SHARE: f64 = 0.5;
 
 /// Purpose of a target view.
@@ -195,7 +195,7 @@ impl Targets {
     }
 }
 
-/// Returns the distance between two validation views in the list of target views, which has `views` views.
+/// Returns the number n such that one of every n target views is a validation view. `views`: number of target views.
 pub(super) fn validation_every(views: usize) -> usize {
     VALIDATION_EVERY[usize::from(views < MANY_VIEWS)]
 }

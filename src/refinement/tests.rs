@@ -162,7 +162,8 @@ fn interrupted_runs_resume_to_the_same_result() {
     }
 }
 
-/// Demo scene in which each frame shows a third of the Gaussians. The third field is the opacity logit of the others.
+/// Demo scene in which each frame shows a third of the Gaussians. The third field is the opacity logit of the Gaussians
+/// that a frame does not show.
 struct ShortLives(demo_scene::DemoScene, SequenceInfo, f32);
 
 struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);

@@ -44,9 +44,9 @@ pub struct ChartAxis {
 pub struct Series {
     /// Name in the legend; a series without a name is not listed.
     pub name: String,
-    /// Points (x, y), joined in this order.
+    /// Points (x, y) of the series, in the order in which a line joins them.
     pub points: Vec<(f64, f64)>,
-    /// Whether a line joins the points.
+    /// Whether a line joins the points of the series.
     pub joined: bool,
     /// Whether the series is paired with the series before it. It then has the same color, dashed lines and hollow
     /// marks.
@@ -135,8 +135,8 @@ impl AxisScale {
         })
     }
 
-    /// Extends the range of values at its upper end, so that `room` pixels stay free after the largest value on the
-    /// axis.
+    /// Extends the range of values of this axis at its upper end, so that `room` pixels stay free after the largest
+    /// value.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);

@@ -21,8 +21,8 @@ pub(super) fn sliders(results: &[Analysis], names: &[String]) -> String {
            made brighter until it can be seen.</p>\n"
 }
 
-/// Returns the HTML of the sliders (two images of one view with a movable border) of all chosen renders except the
-/// median and the worst one.
+/// Returns the HTML of the sliders (two images of one view with a movable border) of all renders chosen for the page,
+/// except the render with the median PSNR and the worst one.
 pub(super) fn other_sliders(results: &[Analysis], names: &[String]) -> String {
     let first = &results[0].shown;
     let taken = [MEDIAN, WORST].map(|why| place_of(first, why));
@@ -50,8 +50,8 @@ struct Layer<'a> {
     note: String,
 }
 
-/// Returns the images of the chosen render with the index `place`, for a slider: original, compressed models,
-/// differences, and the photograph if there is one. `names` has the names of the compressed models.
+/// Returns the images of one slider: original, compressed models, differences, and the photograph if there is one.
+/// `place` is the index of the render among those that the page shows. `names` has the names of the compressed models.
 fn layers<'a>(results: &'a [Analysis], names: &[String], place: usize) -> Vec<Layer<'a>> {
     let image = |result: &'a Analysis, kind: &str| {
         let found = result.shown.get(place)?.images.iter().find(|image| image.0 == kind)?;
@@ -80,8 +80,8 @@ fn scores(shown: &ShownImage) -> String {
     format!("PSNR {}, SSIM {:.4}{flip}", db(shown.choice.psnr), shown.choice.ssim)
 }
 
-/// Returns the HTML of the slider for the chosen render with the index `place`, with the heading `title`. The images of
-/// a slider lie on top of one another; CSS classes select the two that are visible.
+/// Returns the HTML of one slider, with the heading `title`. `place` is the index of its render among those that the
+/// page shows. The images of a slider lie on top of one another; CSS classes select the two that are visible.
 fn slider(results: &[Analysis], names: &[String], place: usize, title: &str) -> String {
     let shown = &results[0].shown[place];
     let layers = layers(results, names, place);

@@ -91,8 +91,8 @@ fn absent(text: &str) -> String {
     format!("<p class=\"note\">{text}</p>\n")
 }
 
-/// Returns the HTML of tables with all quality measures, the render times, and the parts of the size of the compressed
-/// model `name`, whose data is `result`.
+/// Returns HTML tables of all quality measures, render times and parts of the size of one compressed model. `name` is
+/// the name of the model, `result` its data.
 fn numbers(result: &ResultData, name: &str) -> String {
     let found = &result.evaluation;
     let mut out = format!(

@@ -60,15 +60,15 @@ struct FailureSums {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// The scene has no Gaussian of this kind.
+    /// Verdict if the scene has no Gaussian of the kind that the failure mode concerns.
     Absent,
-    /// The scene has Gaussians of this kind, but their share of every render is too small to be judged.
+    /// Verdict if the scene has Gaussians of the kind, but their share of every render is too small to be judged.
     Unseen,
-    /// No Gaussian of this kind was dropped or merged, or almost none.
+    /// Verdict if almost no Gaussian of the kind was dropped or merged, measured by their contribution to renders.
     Untouched,
-    /// Where Gaussians of this kind are visible, the error is imperceptible or not much larger than elsewhere.
+    /// Verdict if the error where Gaussians of the kind are visible is imperceptible or not much larger than elsewhere.
     Passed,
-    /// Where Gaussians of this kind are visible, the error is perceptible and much larger than elsewhere.
+    /// Verdict if the error where Gaussians of the kind are visible is perceptible and much larger than elsewhere.
     Flagged,
 }
 
@@ -78,9 +78,9 @@ pub struct WorstPlace {
     /// Index of the render in [`crate::evaluation::results::Evaluation::views`].
     #[serde(skip)]
     pub place: usize,
-    /// Frame of the sequence.
+    /// Index of the frame that the render shows.
     pub frame: usize,
-    /// View number.
+    /// Number of the view that the render shows.
     pub view: u32,
     /// PSNR of this render where the kind of Gaussian is visible, dB.
     pub psnr: f64,
@@ -96,7 +96,7 @@ pub struct FailureMode {
     pub kind_description: String,
     /// Verdict on the failure mode.
     pub verdict: Verdict,
-    /// Number of Gaussians of this kind in the original.
+    /// Number of Gaussians in the original of the kind that this failure mode concerns.
     pub gaussians: usize,
     /// Number of Gaussians of this kind that were dropped; `None` without an index map (file that maps input to output
     /// Gaussians).
@@ -109,18 +109,18 @@ pub struct FailureMode {
     /// Fraction of this kind's contribution to renders that belongs to Gaussians that were dropped or merged; `None`
     /// without an index map (file that maps input to output Gaussians).
     pub coverage_lost: Option<f64>,
-    /// Share of this kind in all pixels of all compared renders, from 0 to 1.
+    /// Share of this kind of Gaussian in all pixels of all compared renders, from 0 to 1.
     #[serde(rename = "shown")]
     pub pixel_share: f64,
-    /// PSNR where the kind is visible, with each pixel weighted by the share of the kind, dB; `None` if the kind is
-    /// nowhere visible.
+    /// PSNR where this kind of Gaussian is visible, with each pixel weighted by the share of the kind, dB; `None` if
+    /// the kind is nowhere visible.
     #[serde(rename = "psnr_there")]
     pub psnr_on_kind: Option<f64>,
-    /// PSNR where other Gaussians are visible, with each pixel weighted by the share that does not belong to the kind,
-    /// dB; `None` if no pixel has such a share.
+    /// PSNR where other kinds of Gaussian are visible, dB. Each pixel is weighted by the share that does not belong to
+    /// the kind of this failure mode. `None` if no pixel has such a share.
     pub psnr_elsewhere: Option<f64>,
-    /// Lost fraction of the original's brightness gradients where the kind is visible; negative if the compressed model
-    /// exaggerates the gradients. `None` if the original has no gradients there.
+    /// Lost fraction of the original's brightness gradients where this kind of Gaussian is visible; negative if the
+    /// compressed model exaggerates the gradients. `None` if the original has no gradients there.
     pub detail_lost: Option<f64>,
     /// Render in which the failure mode is worst; `None` if the kind cannot be judged in any render.
     pub worst: Option<WorstPlace>,
@@ -202,10 +202,10 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Measures the errors of renders where Gaussians of the kind `kind` are visible. Returns the measurements and the
-/// [`Verdict`] whether these errors are perceptible and much larger than elsewhere. `members` has the counts and the
-/// contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the frame and the view
-/// of each render.
+/// Measures the errors of renders where Gaussians of the kind `kind` are visible. Returns the measurements and a
+/// [`Verdict`], which states whether these errors are perceptible and much larger than elsewhere. `members` has the
+/// counts and the contribution of the Gaussians of this kind, `seen` has the error sums of all renders, `names` the
+/// frame and the view of each render.
 pub fn assess_failure_mode(
     kind: GaussianKind,
     members: KindTotals,

@@ -39,9 +39,9 @@ pub const JPEG_QUALITY: u8 = 80;
 pub struct FilmPanel {
     /// Reasons for the choice of this view, such as "worst render".
     pub why: Vec<String>,
-    /// View number.
+    /// Number of the animated view.
     pub view: u32,
-    /// Frame whose camera is used for all frames, if the camera of the view moves.
+    /// Index of the frame whose camera is used for all frames, if the camera of the view moves.
     pub camera_of_frame: usize,
     /// Numbers of the frames that the animation shows, in order.
     pub frames: Vec<usize>,

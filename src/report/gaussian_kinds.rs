@@ -23,8 +23,8 @@ pub const MIN_FAST_MOTION: f64 = 2e-3;
 /// Minimum relative change over time of the distances between a Gaussian and its neighbors that counts as non-rigid
 /// motion. The change is a root mean square over time, and at least half of the neighbors must reach it.
 pub const MIN_NON_RIGID_CHANGE: f64 = 0.05;
-/// Minimum divisor for relative changes of a distance between neighbors, as a fraction of the scene extent. Neighbors
-/// that are closer than this may change places invisibly.
+/// Minimum divisor for relative changes of the distance between two neighbors, as a fraction of the scene extent.
+/// Without it, small motions of very close neighbors, which are invisible, would give large relative changes.
 const NEAREST: f64 = 1e-3;
 /// Number of nearest neighbors of a Gaussian to which distances are measured over time.
 pub const NEIGHBORS: usize = 8;

@@ -15,8 +15,8 @@ use crate::statistics::score::{ScoredQuantity, Scores};
 
 /// Maximum number of bins of a histogram.
 const BINS: usize = 40;
-/// Lower edge of the first bin, as a fraction of the largest value. Smaller positive values are counted in the first
-/// bin.
+/// Minimum of the lower edge of the first bin, as a fraction of the largest value. Smaller positive values are counted
+/// in the first bin.
 const DEEPEST: f64 = 1e-8;
 
 /// One value for each fate of Gaussians: kept, merged, dropped.
@@ -149,8 +149,8 @@ impl Histogram {
     }
 }
 
-/// Returns a CSV table of all histograms: one line per bin, and one line per score for the values that are not
-/// positive.
+/// Returns a CSV table of all histograms: one line per bin, and one line per score for the values that are not positive
+/// or not finite.
 pub fn csv(histograms: &[Histogram]) -> String {
     let mut rows = Vec::new();
     for Histogram { name, edges, bins, zero, .. } in histograms {

@@ -20,7 +20,7 @@ pub(super) fn escape(text: &str) -> String {
     out
 }
 
-/// Returns the last component of a path.
+/// Returns the last component of `path`, or `path` itself if that component is empty.
 pub(super) fn file_name(path: &str) -> &str {
     let name = last_component(path);
     if name.is_empty() { path } else { name }

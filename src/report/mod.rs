@@ -132,8 +132,8 @@ pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     Ok(report)
 }
 
-/// Compares the compressed model that `options` name with the original. The page will show the renders `wanted`; if it
-/// is `None`, renders are chosen here. `render_time` requests that render times are measured.
+/// Compares the compressed model that `options` name with the original. `wanted` lists the renders that the page will
+/// show; if it is `None`, this function chooses them. `render_time` requests that render times are measured.
 fn analyze(options: &EvaluateOptions, wanted: Option<&[ChosenRender]>, render_time: bool) -> Result<Analysis> {
     let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
@@ -298,9 +298,9 @@ fn members(rows: &StatisticRows, traits: &[KindFlags], fates: Option<&[Fate]>) -
     })
 }
 
-/// Renders again the views of `choices` and the views in which failure modes are worst. Returns the images of
-/// `choices`, and for each failure mode in `modes` with a worst place the images of this place. `traits` has the kinds
-/// of every Gaussian.
+/// Renders again the views of `choices`, and the view in which each failure mode of `modes` is worst. Returns the
+/// images of `choices`, and for each failure mode the images of its worst place. Failure modes without a worst place
+/// have no images. `traits` has the kinds of every Gaussian.
 fn show_again(
     side: &ModelPair,
     choices: &[ChosenRender],

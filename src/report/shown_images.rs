@@ -27,7 +27,7 @@ pub const MAX_RENDERS_PER_PAGE: usize = 4;
 /// Maximum number of pixels of a shown image; larger renders are scaled down. Images of trained scenes take about 2
 /// bytes per pixel in base64.
 pub const MAX_PIXELS: u64 = 160_000;
-/// Minimum fraction of the values of a difference image that must not exceed 1 after the image is brightened.
+/// Minimum fraction of the values of a brightened difference image that must not exceed 1.
 const UNCLIPPED: f64 = 0.999;
 /// Maximum factor by which difference images are brightened. At 64, a difference of 1/255 becomes a quarter of the
 /// range.
@@ -41,9 +41,9 @@ pub struct ChosenRender {
     /// Index of the render in [`Evaluation::views`].
     #[serde(skip)]
     pub place: usize,
-    /// Frame of the sequence.
+    /// Index of the frame that the render shows.
     pub frame: usize,
-    /// View number.
+    /// Number of the view that the render shows.
     pub view: u32,
     /// PSNR of the compressed model's render against the original's, dB.
     pub psnr: f64,

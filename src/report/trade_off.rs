@@ -108,8 +108,8 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     charts
 }
 
-/// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For comparison
-/// it also has the result of the same method without refinement at the same number of Gaussians.
+/// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For
+/// comparison, the chart also has a mark for the same method without refinement, at the same number of Gaussians.
 fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);

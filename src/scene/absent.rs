@@ -47,7 +47,7 @@ impl Absent {
 /// values) invisible.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// Rows, in the data that `reader` returns, of the Gaussians to make invisible.
+    /// Indices of the Gaussians to make invisible, in the arrays that `reader` fills.
     rows: Vec<usize>,
 }
 

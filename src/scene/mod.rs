@@ -44,8 +44,8 @@ pub struct Scene {
     /// Views at each frame: from the cameras of the chosen split and, if these were added, from cameras outside the rig
     /// (in directions from which no camera of the rig sees the scene).
     pub schedule: ViewSchedule,
-    /// How far outside the directions of the rig's cameras the quality of renders counts, from 0 to 1 (`reach` of
-    /// [`Scene::add_outside_views`]); 0: not at all.
+    /// Weight of the quality of renders from outside the directions of the rig's cameras, from 0 (not considered) to 1.
+    /// It is the argument `reach` of [`Scene::add_outside_views`]; 0 if no such views were added.
     pub outside: f64,
     /// Whether the views show the whole scene: cameras were given or found, or were placed all around a scene of one
     /// frame. Otherwise the cameras are a virtual rig, which may see only what is in front of it, such as the outside

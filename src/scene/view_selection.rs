@@ -97,9 +97,10 @@ pub fn select_frames(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
 /// Returns at most `most` of the views `pictures`, spread evenly over frames and view numbers. `pictures` must be
 /// sorted by frame, then view.
 ///
-/// The views are picked at equal distances from the list of all views. Before that, the part of the list for the n-th
-/// frame is shifted cyclically, by the fractional part of n times the golden ratio (as a fraction of its length).
-/// Without the shift, the picks would meet the same view numbers again and again.
+/// The views are picked at equal distances from a list of all views, which is ordered by frame. Before that, the views
+/// of each frame are shifted cyclically among themselves. For the n-th frame, the shift is the fractional part of n
+/// times the golden ratio, as a fraction of the number of its views. Without the shift, the same view numbers would be
+/// picked again and again.
 pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (pictures.len(), most.max(1));
     if count <= most {

@@ -191,10 +191,10 @@ fn turned_about(camera: &Camera, focus: DVec3, turn: DQuat) -> Camera {
 
 impl Scene {
     /// Adds views from cameras outside the rig to the views of every frame (`self.schedule`), so that Gaussians that
-    /// only these views show are kept and refined. `reach`, from 0 to 1, states how far outside the rig the quality of
-    /// renders counts. Angles from the mean direction of the rig grow by a factor of up to 1 + `reach`. Every frame
-    /// gets `reach` times as many views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera
-    /// outside the rig can be found (see [`cameras_outside`]).
+    /// only these views show are kept and refined. `reach`, from 0 to 1, states how much such views count. Angles from
+    /// the mean direction of the rig grow by a factor of up to 1 + `reach`. Every frame gets `reach` times as many
+    /// views outside the rig as it has inside. Adds no views if `reach` is 0 or if no camera outside the rig can be
+    /// found (see [`cameras_outside`]).
     pub fn add_outside_views(&mut self, reach: f64) {
         if reach == 0.0 {
             return;

@@ -5,18 +5,18 @@
 use crate::model::{AnomalyFlags, AttributeValues, StatisticRows};
 use crate::recipe::Anisotropy;
 
-/// Smallest scale for the logarithmic form of E, as a fraction of the scene extent; smaller scales are raised to it.
-/// How flat a disc is beyond this is not visible in renders.
+/// Minimum scale in the logarithmic form of the anisotropy E, as a fraction of the scene extent. Smaller scales are
+/// raised to it, because renders do not show how much flatter a disc is.
 const SCALE_FLOOR: f64 = 1e-7;
 
-/// Largest logarithm of a ratio of scales: e⁷⁰⁰ ≈ 1e304 is close to the largest f64.
+/// Upper limit of the logarithm of a ratio of scales: e⁷⁰⁰ ≈ 1e304 is close to the largest f64.
 const MAX_LOG_RATIO: f64 = 700.0;
 
 /// Fills the anisotropy `rows.e` from `log_scale` (`[3, N]`, natural logs of the scales in scene units).
 ///
 /// [`Anisotropy::Ratio`]: s_max / s_min (the paper, section 3.2.1). [`Anisotropy::Log`]: ln(s_max / s_mid), where both
-/// scales are raised to at least 1e-7 of `extent` (scene units). A row whose scales are not finite is flagged; every
-/// flagged row gets 0.
+/// scales are raised to at least 1e-7 of `extent` (scene units). A Gaussian whose scales are not finite gets the flag
+/// [`AnomalyFlags::NON_FINITE`]. Every Gaussian with this flag gets the anisotropy 0.
 ///
 /// # Panics
 /// Panics if `rows` and `log_scale` differ in the number of Gaussians.

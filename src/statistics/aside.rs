@@ -20,7 +20,7 @@ pub(crate) enum StatisticsRows {
     Spilled(SpilledRows),
 }
 
-/// Rows in an unnamed temporary file, which is deleted when this value is dropped.
+/// Statistics of all Gaussians in an unnamed temporary file, which is deleted when this value is dropped.
 pub(crate) struct SpilledRows {
     file: Spill,
     count: usize,
@@ -63,7 +63,7 @@ impl StatisticsRows {
         Ok(StatisticsRows::Spilled(SpilledRows { file, count: rows.len(), columns }))
     }
 
-    /// Returns all rows; reads them if they are in the temporary file.
+    /// Returns the statistics of all Gaussians. Reads them if they are in the temporary file.
     pub(crate) fn rows(&self) -> Result<Cow<'_, StatisticRows>> {
         match self {
             StatisticsRows::Memory(rows) => Ok(Cow::Borrowed(rows)),
@@ -112,7 +112,8 @@ impl SpilledRows {
         self.values(&self.columns[..index])
     }
 
-    /// Reads one value per Gaussian. The values lie in the file after the values of the statistics `before`.
+    /// Reads the values of one statistic, or the flags, for all Gaussians. `before` lists the statistics whose values
+    /// precede them in the file.
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
         let start = before.iter().map(|statistic| statistic.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];

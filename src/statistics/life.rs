@@ -3,7 +3,8 @@
 
 use std::mem::size_of;
 
-/// Sums over the frames so far from which the life spans and opacity variances of a block of Gaussians follow.
+/// Running sums over the frames added so far. The life spans and opacity variances of a block of Gaussians are computed
+/// from these sums.
 ///
 /// A Gaussian is alive in the frames in which its opacity α is at least a threshold. The variance of α over these n
 /// frames is V = s₂/n − (s₁/n)². Here s₁ and s₂ are the sums of α − α₁ and (α − α₁)² over these frames, and α₁ is the
@@ -64,8 +65,8 @@ impl LifeSpans {
         self.alive
     }
 
-    /// Adds the repeated frames that were counted so far to the number of frames in which each Gaussian is alive
-    /// (opacity ≥ alpha_min). Must be called before results are read.
+    /// Adds the frames that [`LifeSpans::repeat_frame`] has counted to the number of frames in which each Gaussian is
+    /// alive (opacity ≥ alpha_min). Must be called before results are read.
     #[inline(always)]
     pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {

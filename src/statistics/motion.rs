@@ -29,16 +29,17 @@ const ALIVE_BEFORE: u8 = 2;
 /// Bit in the history of a Gaussian: it was alive (opacity ≥ alpha_min) in some frame before the previous one.
 const BORN_BEFORE: u8 = 4;
 
-/// Sums over the frames so far from which the trajectory magnitude D and the curvature κ of a block of Gaussians
-/// follow.
+/// Running sums over the frames added so far. The trajectory magnitude D and the curvature κ of a block of Gaussians
+/// are computed from these sums.
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Number of the latest frames whose opacities equal those of the frame before them, so that the same Gaussians are
-    /// alive (opacity ≥ alpha_min). `steps`, `turns` and `history` do not count these frames yet. Used only by
+    /// Number of frames after the first that repeat the opacities of the first frame and are not counted in `steps`,
+    /// `turns` and `history` yet. In these frames the same Gaussians are alive (opacity ≥ alpha_min). Used only by
     /// `MotionParams::Runs`.
     steady: u32,
-    /// Positions in the previous frame, x(t−1); `before` holds those one frame earlier, x(t−2). Shape `[3, len]` each.
+    /// Positions in the previous frame, x(t−1). The field `before` holds the positions one frame earlier, x(t−2). Shape
+    /// `[3, len]` each.
     previous: AttributeValues,
     before: AttributeValues,
     sum_step2: Vec<f64>,
@@ -100,8 +101,9 @@ impl MotionSums {
         self.frames += 1;
     }
 
-    /// Adds a frame by the definition `Runs` of motion, in which only steps between consecutive frames of the life span
-    /// count. `EVEN` states that the last two time steps have the mean duration, so that no division is needed;
+    /// Adds a frame with the positions `position` and the opacities `opacity`, by the definition `Runs` of motion: only
+    /// steps between consecutive frames in which the Gaussian is alive count. `steps` holds the durations of the last
+    /// two time steps, divided by the mean duration. `EVEN` states that both are 1, so that no division is needed;
     /// divisions would take longer than the rest of the loop.
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
@@ -131,8 +133,8 @@ impl MotionSums {
     }
 
     /// Does the same as [`MotionSums::add_frame_of_runs`] for a frame whose opacities equal the opacities of all
-    /// earlier frames. Which steps and turns count is then known without reading the history, so half as much memory is
-    /// accessed (`cargo bench --bench scan`).
+    /// earlier frames. The steps and turns that count are then known without reading the history, so half as much
+    /// memory is accessed (`cargo bench --bench scan`).
     #[inline(always)]
     fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
@@ -147,9 +149,9 @@ impl MotionSums {
         }
     }
 
-    /// Adds the frames with unchanged opacities that were counted so far to the numbers of steps and turns of each
-    /// Gaussian. Sets the sums of steps and turns of Gaussians that are not alive (opacity ≥ alpha_min) to 0. Must be
-    /// called before results are read.
+    /// Counts the frames with unchanged opacities (`steady`) in the numbers of steps and turns of each Gaussian that is
+    /// alive (opacity ≥ alpha_min). Sets the sums of steps and turns of the other Gaussians to 0. Must be called before
+    /// results are read.
     #[inline(always)]
     pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
@@ -191,17 +193,18 @@ impl MotionSums {
         }
     }
 
-    /// Returns the trajectory magnitude D of every Gaussian, in scene units per frame; 0 if none of its steps from
-    /// frame to frame counts. The table of this module shows which steps count. `life` holds the number of frames in
-    /// which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by it.
+    /// Returns the trajectory magnitude D of every Gaussian: the root mean square of its steps from frame to frame, in
+    /// scene units per frame. The table of this module defines which steps count; D is 0 if none does. `life` holds the
+    /// number of frames in which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by it.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
-    /// Returns the curvature κ of every Gaussian, in scene units per frame²; 0 if no turn (second difference of its
-    /// positions) counts. The table of this module shows which turns count. `life` holds the number of frames in which
-    /// each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by `life` − 2.
+    /// Returns the curvature κ of every Gaussian: the mean length of its turns (second differences of its positions),
+    /// in scene units per frame². The table of this module defines which turns count; κ is 0 if none does. `life` holds
+    /// the number of frames in which each Gaussian is alive (opacity ≥ alpha_min); the definition `Literal` divides by
+    /// `life` − 2.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()
@@ -247,10 +250,11 @@ fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// Returns two values: the square of the last step, and the length of the turn (second difference of the positions)
-/// about the previous frame. Both are scaled to time steps of the mean duration. `now`, `previous` and `before` are the
-/// positions in the current frame and in the two frames before it. `step` and `step_before` are the durations of the
-/// last two time steps, divided by the mean duration. With fewer than three frames the values are meaningless.
+/// Returns two values: the squared length of the last step (change of position), and the length of the turn (second
+/// difference of the positions) about the previous frame. Both are scaled to time steps of the mean duration. `now`,
+/// `previous` and `before` are the positions in the current frame and in the two frames before it. `step` and
+/// `step_before` are the durations of the last two time steps, divided by the mean duration. With fewer than three
+/// frames the values are meaningless.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);

@@ -27,9 +27,10 @@ pub fn ulp(x: f32) -> f64 {
     2f64.powi(exponent.max(1) - 127 - 23)
 }
 
-/// Sets every trajectory magnitude D below 2 ulp and curvature κ below 4 ulp of `largest_coordinate` to exactly 0,
-/// flags these rows, and returns how many values of D and of κ were set to 0. `largest_coordinate` is the largest
-/// |coordinate| of the whole scene, at least 0. Values that are 0 already are neither flagged nor counted.
+/// Sets every trajectory magnitude D below 2 ulp and every curvature κ below 4 ulp of `largest_coordinate` to exactly
+/// 0, and sets a flag in each row that changes. Returns how many values of D and of κ were set to 0.
+/// `largest_coordinate` is the largest |coordinate| of the whole scene, at least 0. Values that are 0 already are
+/// neither flagged nor counted.
 pub fn snap_noise_to_zero(rows: &mut StatisticRows, largest_coordinate: f32) -> SnapCounts {
     let ulp = ulp(largest_coordinate);
     SnapCounts {

@@ -37,9 +37,9 @@ pub struct ScanResult {
 /// of Gaussians are processed in parallel, or by the stages of a pipeline if the source is slow to read
 /// ([`FrameSource::ahead`]).
 ///
-/// Memory: a row per Gaussian (twice while blocks are joined), and 4 bytes per frame. Per thread: the accumulators of
-/// one block of Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its attributes at one frame, and its reader
-/// (two readers in a pipeline).
+/// Memory: one row of statistics per Gaussian (twice while blocks are joined), and 4 bytes per frame. Per thread: the
+/// accumulators of one block of Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its attributes at one
+/// frame, and its reader (two readers in a pipeline).
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -99,8 +99,9 @@ impl ScanResult {
     }
 }
 
-/// Joins consecutive blocks of Gaussians, each given by its rows and its largest coordinate, into one result.
-/// `alive_per_frame` holds the number of Gaussians alive (opacity ≥ alpha_min) in each frame.
+/// Joins the results of consecutive blocks of Gaussians: the statistics (one row per Gaussian) and the largest
+/// |coordinate| of each block. `alive_per_frame` holds the number of Gaussians alive (opacity ≥ alpha_min) in each
+/// frame.
 fn joined(blocks: impl IntoIterator<Item = (StatisticRows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
     let mut rows = StatisticRows::default();
     let mut largest_coordinate = 0.0f32;
@@ -190,11 +191,11 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
-    /// Scene of which only the positions vary in time. It records what its readers read.
+    /// Test scene of which only the positions vary in time. Records the frame and the attributes of every read.
     struct RecordingScene {
         scene: DemoScene,
         info: SequenceInfo,
-        /// Frame and attributes of each read.
+        /// Frame index and requested attributes of every read, in the order of the reads.
         reads: Mutex<Vec<(usize, Attributes)>>,
     }
 

@@ -44,7 +44,8 @@ pub struct FootprintPlanes<'a> {
     pub opacity: &'a [f64],
 }
 
-/// Sums over the (frame, view) pairs so far, one per Gaussian of the [`FootprintPlanes`].
+/// Running sums over (frame, view) pairs for a block of Gaussians. Entry i of each array belongs to Gaussian i of the
+/// [`FootprintPlanes`].
 #[derive(Debug)]
 pub struct CoverageSums<'a> {
     /// Sum of covered pixels times opacity, as a multiple of 2^−exponent px ([`CoverageScale::exponent`]).
@@ -91,7 +92,7 @@ fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageSc
     project_planes(view, planes, scale, sums);
 }
 
-/// Camera parameters in the form that the inner loop uses.
+/// Camera parameters in the form that the inner loop of the projection uses.
 struct ScanView {
     rotation: [[f64; 3]; 3],
     translation: [f64; 3],

@@ -42,9 +42,9 @@ impl BlockState {
         }
     }
 
-    /// Takes over the attributes `changed` of the next frame, `gaussians`, and flags non-finite values and zero
-    /// quaternions in them. The axes (rotation times scales) are needed only for projection.
-    /// [`BlockState::update_axes`] computes them later.
+    /// Updates the block to the next frame, in which its attributes are `gaussians`. Computes and checks only the
+    /// attributes `changed`: sets flags for non-finite values and zero quaternions. The axes (rotation times scales)
+    /// are needed only for projection, so [`BlockState::update_axes`] computes them later.
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
@@ -95,8 +95,8 @@ impl BlockState {
         }
     }
 
-    /// Computes the axes (rotation times scales) of the Gaussians `chunk` again if they are outdated. `gaussians` holds
-    /// the attributes at the current frame.
+    /// Recomputes the axes (rotation times scales) of the Gaussians `chunk` if they are outdated. `gaussians` holds the
+    /// attributes at the current frame.
     pub(super) fn update_axes(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
         if !std::mem::take(&mut self.axes_outdated[chunk.start / CHUNK]) {
             return;

@@ -14,7 +14,7 @@ fn recipe(motion: MotionParams) -> ScanParams {
     ScanParams { motion, ..Recipe::preset("default").unwrap().scan }
 }
 
-/// Returns number `k` of a pseudo-random sequence of numbers in [0, 1) that follows from `seed`.
+/// Returns the `k`-th number, in [0, 1), of the pseudo-random sequence with the seed `seed`.
 fn random(seed: u64, k: u64) -> f64 {
     (hash_id(hash_id(seed) ^ k) >> 11) as f64 / 2f64.powi(53)
 }
@@ -90,7 +90,8 @@ fn scan(frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> Blo
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
-/// Scans one Gaussian at x(t) with opacity α(t), without cameras.
+/// Scans one Gaussian and returns its statistics. At frame t it has the x coordinate `x(t)` and the opacity
+/// `opacity(t)`. No camera sees it.
 fn scan_one(
     frames: usize,
     x: impl Fn(usize) -> f32,

@@ -7,8 +7,8 @@ use crate::model::{AttributeValues, Gaussians, SH_C0};
 /// Largest magnitude of the natural log of a scale. Larger ones are clamped to this value, so that squares of scales
 /// stay finite in f32.
 const MAX_LOG_SCALE: f32 = 30.0;
-/// Difference in size of two Gaussians, as a natural log of the ratio, that adds 1 to the cost of linking them. The
-/// next three constants are the corresponding differences in shape, opacity and color.
+/// Units in which two Gaussians are compared: a difference of one unit in size, shape, opacity or color adds 1 to the
+/// cost of linking them. The difference in size is the natural log of the ratio of the sizes.
 const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
@@ -28,7 +28,7 @@ pub(super) struct ComparedAppearance {
     pub(super) size: f32,
     pub(super) ln_size: f32,
     /// Shape: covariance divided by its trace, as xx, yy, zz, and √2 times xy, xz, yz. With the factor √2, the squared
-    /// distance of two shapes equals that of the two 3×3 matrices.
+    /// distance of two shapes equals the squared distance of the two 3×3 matrices.
     shape: [f32; 6],
     opacity: f32,
     /// Base color (without view dependence): red, green, blue; 0 to 1 is the range of a screen.

@@ -4,7 +4,7 @@ use super::appearance::ComparedAppearance;
 use super::links::Links;
 use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Largest accepted fraction of a frame's links that is expected to be wrong.
+/// Maximum fraction of a frame's links that may be wrong, as an expected value. Doubtful links are removed down to it.
 pub(super) const MAX_WRONG: f64 = 0.005;
 /// Cost that is added to the numerator and to the denominator of each ratio of link costs. As a result, two costs that
 /// differ by less than this count as equal.

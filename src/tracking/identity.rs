@@ -5,8 +5,8 @@ use crate::model::Gaussians;
 
 /// Maximum number of Gaussians that are compared for a pair of frames.
 const MAX_COMPARED: usize = 4096;
-/// Largest median difference between Gaussians at the same index with which two frames count as being in the same
-/// order, as a fraction of the median difference between unrelated Gaussians.
+/// Threshold of the test whether two frames have the same order of Gaussians: the maximum median difference between
+/// Gaussians at the same index, as a fraction of the median difference between unrelated Gaussians.
 const MAX_PART_OF_UNRELATED: f64 = 0.5;
 /// Minimum number of Gaussians for the test. Frames with fewer count as being in the same order.
 const MIN_GAUSSIANS: usize = 16;
@@ -15,22 +15,24 @@ const MIN_GAUSSIANS: usize = 16;
 /// (`ComparedAppearance::difference`).
 const NEGLIGIBLE: f64 = 1e-3;
 
-/// Differences between the Gaussians of two frames at the same index, and between unrelated ones. All are medians.
+/// Median differences between the Gaussians of two frames: once between the Gaussians at the same index, and once
+/// between unrelated Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrderDifference {
-    /// Distance between the positions of Gaussians at the same index, in units of the smaller Gaussian's size.
+    /// Median distance between the positions of Gaussians at the same index, in units of the smaller Gaussian's size.
     pub position_difference: f64,
-    /// Distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the second), in
-    /// units of the smaller Gaussian's size.
+    /// Median distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the
+    /// second), in units of the smaller Gaussian's size.
     pub apart: f64,
-    /// Difference in appearance between Gaussians at the same index: sum of the squared differences in size, shape,
-    /// opacity and base color, each divided by the difference that adds 1 to the cost of a link.
+    /// Median difference in appearance between Gaussians at the same index: sum of the squared differences in size,
+    /// shape, opacity and base color, each divided by the difference that adds 1 to the cost of a link.
     pub appearance_difference: f64,
-    /// Difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of the
-    /// first frame and i + N/2 of the second).
+    /// Median difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of
+    /// the first frame and i + N/2 of the second).
     pub unrelated_pairs: f64,
-    /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is
-    /// at most half of `apart`, and `appearance_difference` is at most half of `unrelated_pairs`.
+    /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is at most half of
+    /// `apart` or no more than rounding, and `appearance_difference` is at most half of `unrelated_pairs` or no more
+    /// than rounding. Always true for fewer than 16 Gaussians.
     pub is_common: bool,
 }
 

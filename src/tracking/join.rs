@@ -145,8 +145,9 @@ impl Joiner {
 }
 
 impl JoinedTracks {
-    /// Updates the pairs by a frame whose open tracks are `tracks`: removes pairs that no longer satisfy the rule, and
-    /// marks pairs whose earlier track has ended.
+    /// Updates the pairs by a frame whose open tracks are `tracks`. Removes pairs that no longer satisfy the rule, and
+    /// marks pairs whose earlier track has ended. If the later track of a pair has ended first, removes the pair, and
+    /// joins its tracks if they were close.
     fn update_pairs(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);
         let rule = self.rule;
@@ -234,8 +235,9 @@ impl JoinedTracks {
     }
 }
 
-/// Returns the cost of joining two tracks by `rule`, from the appearances of both; the tracks may be joined if it is at
-/// most 1. Opacity does not count. Infinite if one Gaussian is more than √2 times as large as the other.
+/// Returns the cost of joining two tracks by `rule`, computed from the appearances of both. The tracks may be joined if
+/// the cost is at most 1. Opacity does not count. Returns infinity if one Gaussian is more than √2 times as large as
+/// the other.
 fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MAX_LN_SIZE_RATIO {
         return f32::INFINITY;
@@ -243,9 +245,10 @@ fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     a.distance_cost(b, rule.reach, rule.strictness)
 }
 
-/// Blends the Gaussians in the rows `rows` of `state` and writes the result to row `rows[0]`. The opacity becomes 1 −
-/// Π(1 − αᵢ); all other attributes become means weighted by the opacities αᵢ. Before averaging, quaternions get the
-/// sign closest to that of the first row. Does nothing if the opacities sum to 0 or are not finite.
+/// Blends the Gaussians with the indices `rows` of `state` and writes the result to Gaussian `rows[0]`. The opacity
+/// becomes 1 − Π(1 − αᵢ); all other attributes become means weighted by the opacities αᵢ. Before averaging, each
+/// quaternion gets the sign that brings it closest to the quaternion of Gaussian `rows[0]`. Does nothing if the
+/// opacities sum to 0 or are not finite.
 pub fn blend_rows(state: &mut Gaussians, rows: &[usize]) {
     let first = rows[0];
     let alpha = |&i: &usize| 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());

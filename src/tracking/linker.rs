@@ -18,7 +18,8 @@ pub const MAX_GAP_FRAMES: u32 = 3;
 /// the factor by which the difference in appearance is multiplied. The Gaussian passes the test if the cost is at most
 /// 1.
 const SUCCESSION: (f32, f32) = (0.25, 1.0);
-/// Minimum number of Gaussians of a frame for the detection of cuts (frames that show something else).
+/// Minimum number of Gaussians of a frame for the detection of cuts (frames whose content is unrelated to the frame
+/// before).
 const MIN_FOR_CUT: usize = 16;
 
 /// Linker of the Gaussians of successive frames into tracks. It takes the frames one by one in time order.
@@ -40,7 +41,7 @@ pub struct FrameLinks {
     pub linked: usize,
     /// Number of Gaussians whose link to a track was dropped because it was probably wrong. They begin new tracks.
     pub doubtful: usize,
-    /// Whether this frame is a cut: it shows something else than the previous frame, so that all tracks end before it.
+    /// Whether this frame is a cut: its content is unrelated to the previous frame, so all tracks end before it.
     pub is_cut: bool,
 }
 
@@ -126,9 +127,9 @@ impl Linker {
         track_numbers
     }
 
-    /// Returns the indices in `tracks` of the tracks whose place another Gaussian has taken. `links` leaves such a
-    /// track without a Gaussian for the first time, although a similar Gaussian is at the track's expected position.
-    /// `appearances` has the Gaussians of the frame.
+    /// Returns the indices in `tracks` of the tracks that have been succeeded: another Gaussian has taken the place of
+    /// the track's Gaussian. `links` leaves such a track without a Gaussian for the first time, although a similar
+    /// Gaussian is at the track's expected position. `appearances` holds the appearances of all Gaussians of the frame.
     fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
         let is_newly_missing =
             |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;

@@ -37,8 +37,8 @@
 //!    have a cost of at most C; ¼ is the assumed probability that the track's own Gaussian is absent. The least certain
 //!    links are dropped and their Gaussians begin new tracks, until at most one of 200 remaining links is expected to
 //!    be wrong ([`FrameLinks::doubtful`]).
-//! 5. *Cuts.* If fewer than a quarter of the Gaussians are linked, of at least 16, everything has moved at once. This
-//!    is a cut, at which all tracks end.
+//! 5. *Cuts.* Of this frame and the previous one, take the smaller number of Gaussians. If it is at least 16, and fewer
+//!    than a quarter of it are linked, everything has moved at once. This is a cut, at which all tracks end.
 //! 6. *Joined tracks* ([`Joiner`]). Two tracks may be parts of one Gaussian that fades out as one and fades in as the
 //!    other. A track that begins is paired with the four earlier tracks of least cost
 //!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A, where A excludes opacity. The cost must be at most 1, the sizes must
@@ -46,9 +46,10 @@
 //!    (*alike*), and r = q = 1 (*close*). A track that began because its link was doubtful (rule 4) is only paired with
 //!    close tracks. Both tracks of a pair may be present together in four frames, in each of which the rule must hold,
 //!    plus one more for each earlier frame in which one of them was missing. When the earlier track of the cheapest
-//!    pair has ended, the later track is joined to it. Joins are made in the order of cost, each end and each beginning
-//!    once. A later track that ends while the earlier one continues was a part of it if they were close. Tracks of one
-//!    joined track that are present together are [blended](blend_rows).
+//!    pair has ended, the later track is joined to it. Joins are made in the order of cost. Each track is joined to
+//!    at most one earlier track, and at most one later track is joined to it. A later track that ends while the earlier
+//!    one continues was a part of it if they were close. Tracks of one joined track that are present together are
+//!    [blended](blend_rows).
 //!
 //! Tracks are numbered in the order of their births, and within a frame in its order. A Gaussian with a NaN is never
 //! compared: it continues a track only as an exact repeat. Colors are compared without the higher SH degrees, which

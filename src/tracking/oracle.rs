@@ -72,8 +72,8 @@ pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
     }
 }
 
-/// Returns the difference in size, shape and color between two Gaussians: the part of A in the module documentation
-/// without opacity.
+/// Returns the difference in size, shape and color between two Gaussians: A in the formulas of the module
+/// documentation, without the term for opacity.
 fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
     let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();

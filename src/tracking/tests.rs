@@ -25,8 +25,8 @@ impl UniformNumbers {
     }
 }
 
-/// Returns `count` Gaussians in a cube of side 1. Their scales vary around half the side of a cube that holds about
-/// `crowd` of these Gaussians.
+/// Returns `count` random Gaussians in a cube of side 1. Their scales vary around a size such that a cube of twice this
+/// size holds about `crowd` Gaussians.
 fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;
@@ -40,8 +40,8 @@ fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     state
 }
 
-/// Returns the Gaussians of `cloud` as they are `t` frames later. Each half of the Gaussians moves on a circle, and
-/// every coordinate jitters by up to `noise` times the size of the Gaussian.
+/// Returns the Gaussians of `cloud` as they are `t` frames later. Gaussians with even and with odd indices move on
+/// circles in opposite directions. Every coordinate jitters by up to `noise` times the size of the Gaussian.
 fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = cloud.clone();
     for i in 0..cloud.len() {
@@ -266,9 +266,9 @@ fn kept_order_is_told_from_shuffled_order() {
     assert!(compare_order(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).is_common);
 }
 
-/// Returns frames of `cloud`, with the index of each Gaussian. Gaussians are alive for `shortest` to `shortest` + 4
-/// frames at a time, and fade over `overlap` of these frames. Colors vary by `tint` between these periods. After one
-/// period in seven there is a gap.
+/// Returns frames of `cloud`, with the index of each Gaussian. Each Gaussian is visible in periods of `shortest` to
+/// `shortest` + 4 frames. After a period it fades out over `overlap` frames, while the next period fades in. Colors
+/// vary by `tint` between periods. After one period in seven there is a gap.
 fn fading_frames(
     cloud: &Gaussians,
     frames: usize,

@@ -5,8 +5,8 @@ use super::grid::CellGrid;
 
 /// Maximum number of Gaussians that are considered as the continuation of a track.
 pub(super) const MAX_CANDIDATES: usize = 4;
-/// Maximum amount that the speed of a track adds to the unit of distance in the cost of its links, as a multiple of the
-/// size of its Gaussian.
+/// Limit on how much the speed of a track enlarges the unit of distance in the cost of its links, as a multiple of the
+/// size of the track's Gaussian.
 const MAX_SPEED_UNITS: f32 = 3.0;
 /// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;

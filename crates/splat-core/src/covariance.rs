@@ -6,9 +6,10 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Smallest eigenvalue of a covariance, in squared scene units. It corresponds to a scale of 1e-7 scene units.
+/// Lower limit of the eigenvalues of a covariance, in squared scene units; smaller eigenvalues are raised to it. It
+/// corresponds to a scale of 1e-7 scene units.
 const MIN_EIGENVALUE: f64 = 1e-14;
-/// Maximum number of Jacobi sweeps, each of which rotates away the three off-diagonal entries of a matrix once.
+/// Maximum number of Jacobi sweeps. A sweep sets each of the three off-diagonal entries of a matrix to zero once.
 /// Convergence is quadratic; 6 to 8 sweeps suffice from any start.
 const MAX_SWEEPS: usize = 12;
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 pub use gseq::{ShowPath, printable, quoted};
 
-/// Result of an operation that fails with [`Error`].
+/// Result whose error type is [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
 /// Failure of any operation of the library.

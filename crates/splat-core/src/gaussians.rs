@@ -164,8 +164,8 @@ impl Gaussians {
         }
     }
 
-    /// Replaces the Gaussians from index `first` on by those of `block`. Ignores SH coefficients of `block` above the
-    /// SH degree of `self`.
+    /// Copies all Gaussians of `block` over the Gaussians of `self` from index `first` on. Ignores SH coefficients of
+    /// `block` above the SH degree of `self`.
     ///
     /// # Panics
     /// Panics if `self` ends before the last Gaussian of `block` is copied.

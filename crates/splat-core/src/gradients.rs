@@ -5,10 +5,10 @@ use std::ops::Range;
 use super::{AttributeValues, Attributes, Gaussians};
 
 /// Derivatives ∂L/∂value of a loss L with respect to the stored values of N Gaussians, in the layout of [`Gaussians`].
-/// Each derivative is an f32 sum to which parts are added.
+/// Each derivative is a sum in f32, to which terms are added one after the other.
 ///
-/// The caller chooses the attributes to differentiate; the SH degree may be lower than that of the Gaussians. The other
-/// values take neither memory nor time. Memory: 4 bytes per differentiated value.
+/// The caller chooses the attributes to differentiate; the SH degree may be lower than that of the Gaussians. Values
+/// that are not differentiated take neither memory nor time. Memory: 4 bytes per differentiated value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     len: usize,
@@ -127,11 +127,11 @@ impl<'a> GradientSpan<'a> {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
-    /// Adds `parts` to the derivatives for one component of a single attribute. The first part belongs to Gaussian
-    /// `first`, the next to the following Gaussian, and so on.
+    /// Adds one value of `parts` to the derivative of each Gaussian from index `first` on, in the order of the
+    /// Gaussians. The derivative is with respect to component `component` of the single attribute `column`.
     ///
-    /// Does nothing if the attribute or component is not differentiated. Skips a part that is not finite or whose
-    /// addition would overflow f32. Ignores parts for Gaussians beyond the span.
+    /// Does nothing if the attribute or component is not differentiated. Skips a value that is not finite or whose
+    /// addition would overflow f32. Ignores values for Gaussians beyond the span.
     ///
     /// # Panics
     /// Panics if `first` lies before the span, or more than one index after its last Gaussian.

@@ -2,8 +2,9 @@
 
 use super::{AttributeValues, Attributes, Gaussians, Gradients};
 
-/// Derivatives ∂state/∂stored of N Gaussians at one frame, where the state is the attributes at that frame. Each
-/// attribute of the state depends only on the stored values of the same attribute.
+/// Derivatives ∂state/∂stored of N Gaussians at one frame, where the state is the attributes at that frame, and stored
+/// are the attributes in the model file. Each attribute of the state depends only on the stored values of the same
+/// attribute.
 ///
 /// The derivative of an attribute of w components has one of three forms. Without planes, it is the identity: state and
 /// stored values change by the same amount. With one plane, each Gaussian has one factor for all components. With w²
@@ -23,28 +24,31 @@ impl Jacobian {
     /// for each other attribute.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
-    /// Returns the derivative ∂state/∂stored of the single attribute `which`. It has no planes (width 0) if it is the
-    /// identity.
+    /// Returns the derivative of the single attribute `which` at the frame with respect to its stored values. The
+    /// derivative has no planes (width 0) if it is the identity.
     pub fn column(&self, which: Attributes) -> &AttributeValues {
         &self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivative ∂state/∂stored of the single attribute `which` for writing.
+    /// Returns the derivative of the single attribute `which` at the frame with respect to its stored values, for
+    /// writing.
     pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         &mut self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivative ∂state/∂stored of each attribute, in the order of [`Attributes::all`].
+    /// Returns the derivative of each attribute at the frame with respect to its stored values, in the order of
+    /// [`Attributes::all`].
     pub fn columns(&self) -> &[AttributeValues; 5] {
         &self.columns
     }
 
-    /// Returns the derivative ∂state/∂stored of each attribute for writing, in the order of [`Attributes::all`].
+    /// Returns the derivative of each attribute at the frame with respect to its stored values, for writing, in the
+    /// order of [`Attributes::all`].
     pub fn columns_mut(&mut self) -> &mut [AttributeValues; 5] {
         &mut self.columns
     }
 
-    /// Returns the derivatives ∂state/∂stored of the Gaussians with the indices `rows`, in the order of `rows`.
+    /// Returns a copy of the derivatives of the Gaussians with the indices `rows`, in the order of `rows`.
     pub fn pick(&self, rows: &[u32]) -> Jacobian {
         let picked =
             |column: &AttributeValues| if column.width() > 0 { column.pick(rows) } else { AttributeValues::default() };
@@ -73,7 +77,8 @@ impl Jacobian {
         whole
     }
 
-    /// Adds to `state` its first-order change if the stored values change by `change`: ∂state/∂stored · `change`.
+    /// Adds to the attributes `state` at the frame their first-order change, ∂state/∂stored · `change`. `change` is the
+    /// change of the stored attributes.
     ///
     /// Skips attributes for which `change` is empty. If `change` has a lower SH degree than `state`, the higher SH
     /// coefficients stay unchanged.
@@ -101,8 +106,8 @@ impl Jacobian {
         }
     }
 
-    /// Converts `gradients` in place from ∂L/∂state to ∂L/∂stored of a loss L, for the differentiated attributes, by
-    /// multiplication with this Jacobian. Results that are not finite become 0.
+    /// Converts `gradients` in place by the chain rule: from derivatives of a loss with respect to the attributes at
+    /// the frame to derivatives with respect to the stored attributes. Results that are not finite become 0.
     pub fn pull_back(&self, gradients: &mut Gradients) {
         for which in gradients.columns().iter() {
             let (factors, gradient) = (self.column(which), gradients.column_mut(which));

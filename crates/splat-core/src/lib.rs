@@ -57,7 +57,7 @@ pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Magnitude of the logit that stands for an infinite one: the opacity 1 / (1 + e^∓100) is 1, or at most 4e-44.
+/// Magnitude of the finite logit that replaces an infinite one. Its opacity, 1 / (1 + e^∓100), is 1 or at most 4e-44.
 pub const INFINITE_LOGIT: f32 = 100.0;
 
 /// Returns `logit` with an infinite value replaced by ±[`INFINITE_LOGIT`]; NaN and finite values are unchanged.

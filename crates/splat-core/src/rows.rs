@@ -190,7 +190,7 @@ pub struct StatisticRows {
     /// Fraction of (frame, view) pairs in which the opacity of the Gaussian reaches a threshold and the Gaussian
     /// touches the image.
     pub vis: Vec<f64>,
-    /// Anomalies that the pass over all frames found.
+    /// Anomalies of each Gaussian that the pass over all frames found.
     pub flags: Vec<AnomalyFlags>,
 }
 

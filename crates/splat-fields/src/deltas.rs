@@ -1,5 +1,5 @@
-//! Application of the deltas and masks that a deformation field computes to stored attributes (raw values): state =
-//! raw·mask + delta, its inverse, and its derivative.
+//! Combination of stored attributes (raw values) with the deltas and masks that a deformation field computes: state =
+//! raw·mask + delta. Also computes the inverse and the derivative of this formula.
 
 use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
@@ -10,7 +10,7 @@ use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 /// raw ⊗ delta. The state of an inactive attribute is raw, without a mask.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Deltas {
-    /// Deltas in the encoding of the stored attributes. Only those of the `active` attributes are valid.
+    /// Deltas in the encoding of the stored attributes. Only the deltas of the `active` attributes are valid.
     pub delta: Gaussians,
     /// Mask (factor on the stored attributes) of each Gaussian; `None` if every mask is 1.
     pub mask: Option<Vec<f32>>,
@@ -147,8 +147,8 @@ pub(super) fn finite(x: f32) -> f32 {
     if x.is_finite() { x } else { 0.0 }
 }
 
-/// Returns the derivative of a value with respect to the quaternion `a`, from its derivative `by_unit` with respect to
-/// the normalized product `a` ⊗ `b`. Returns 0 if the product is zero.
+/// Applies the chain rule to the normalized quaternion product u = `a` ⊗ `b` / ‖`a` ⊗ `b`‖. Returns the derivative of a
+/// value with respect to `a`; `by_unit` is its derivative with respect to u. Returns 0 if the product is zero.
 fn unit_product_gradient(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
     let whole = product(a, b);
     let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();

@@ -21,8 +21,8 @@ use super::voxel::VoxelMask;
 /// Options of a trained field that change its evaluation and cannot be inferred from the shapes of its tensors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldConfig {
-    /// Attributes that the field changes, because the option that turns their head (output MLP) off (`no_dx`, `no_ds`,
-    /// `no_dr`, `no_do`, `no_dshs`) is false.
+    /// Attributes that the field changes. In training, one option per attribute turns its head (output MLP) off:
+    /// `no_dx`, `no_ds`, `no_dr`, `no_do` or `no_dshs`. This set contains the attributes whose option is false.
     pub deformed_attributes: Attributes,
     /// Whether an additional head (output MLP) computes a mask, a factor on the stored attributes of each Gaussian. If
     /// true, `empty_voxel` is ignored.
@@ -72,7 +72,7 @@ pub struct Field {
     pub(super) mask: Mask,
 }
 
-/// Results of the first part of evaluating a field, which does not depend on time, for one block of Gaussians.
+/// Intermediate results of a field for one block of Gaussians. They do not depend on time and are used for every frame.
 #[derive(Debug, Clone)]
 pub struct PreparedPositions {
     rows: usize,

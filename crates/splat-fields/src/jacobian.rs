@@ -173,8 +173,9 @@ impl JacobianGroup {
         sums
     }
 
-    /// Converts `gradient` from the derivatives with respect to the outputs of `head` to those with respect to the
-    /// features, by passing backward through head and trunk.
+    /// Converts `gradient` from derivatives with respect to the outputs of `head` to derivatives with respect to the
+    /// features, by a backward pass through the head (MLP of the position) and the trunk (MLP shared by all
+    /// attributes).
     #[inline(always)]
     fn backward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
         let JacobianGroup { trunk, hidden, gradient, spare, .. } = self;

@@ -67,8 +67,8 @@ pub struct EncodedPositions {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute stays empty if the
-/// network has no head for it, or until [`Network::motion`] is asked for it.
+/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute is empty if the
+/// network has no head for it, or until [`Network::motion`] computes it.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
     /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and
@@ -347,8 +347,8 @@ impl Network {
         now
     }
 
-    /// Computes the derivatives of the position outputs with respect to the position into `out`, by one forward pass
-    /// and one backward pass per output.
+    /// Computes into `out` the derivatives of the position outputs with respect to the position. Makes one forward pass
+    /// for all outputs, and one backward pass for each output.
     #[inline(always)]
     fn differentiate<const FMA: bool>(&self, encoded: &EncodedPositions, time: f32, out: &mut AttributeValues) {
         let encoded_time = self.encode_time::<FMA>(time);

@@ -58,8 +58,8 @@ impl<'a> BilinearPatch<'a> {
     }
 
     /// Returns three lists of [`CHANNEL_CHUNK`] channels, from channel `first` on: the bilinearly interpolated values,
-    /// their derivatives along the first axis of the plane, and those along its second axis. Derivatives are with
-    /// respect to normalized coordinates.
+    /// their derivatives along the first axis of the plane, and their derivatives along its second axis. Derivatives
+    /// are with respect to normalized coordinates.
     #[inline(always)]
     fn sample_with_slopes(&self, first: usize) -> [[f32; CHANNEL_CHUNK]; 3] {
         let [ll, hl] = [channel_chunk(self.corners[0], first), channel_chunk(self.corners[1], first)];

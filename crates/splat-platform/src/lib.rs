@@ -189,8 +189,8 @@ pub struct MemoryLimits {
 /// size or more.
 pub const UNLIMITED_BYTES: u64 = 1 << 62;
 
-/// Message that the process writes to standard error before it ends because a file that it had mapped to memory was
-/// truncated. It consists of `before`, the path of the file, and `after`.
+/// Message to standard error for a file that was truncated while it was mapped to memory. The process writes it and
+/// then ends. The message consists of `before`, the path of the file, and `after`.
 #[derive(Debug, Clone, Copy)]
 pub struct TruncatedMapMessage {
     /// Text before the path of the file.

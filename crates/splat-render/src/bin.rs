@@ -18,7 +18,7 @@ const PREFETCHED: usize = 64;
 /// Lists of the splats of each tile, nearest splat first.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Bins {
-    /// Sort keys of all splats, sorted. The upper half of a key holds the depth, as bits that sort like the number. The
+    /// Sort keys of all splats, sorted. The upper half of a key holds the depth, as an integer with the same order. The
     /// lower half holds the index of the splat.
     keys: Vec<u64>,
     /// Buffer that the sort reuses; its content has no meaning.
@@ -26,7 +26,7 @@ pub(super) struct Bins {
     /// Number of tiles per row.
     tiles_across: usize,
     /// For each tile, the number of (splat, tile) pairs up to and including this tile, over the whole render. The pairs
-    /// of a tile begin where those of the previous tile end.
+    /// of a tile begin where the pairs of the previous tile end.
     ends: Vec<usize>,
     /// First tile that [`Bins::next_strip`] has not returned yet.
     next_tile: usize,
@@ -34,8 +34,8 @@ pub(super) struct Bins {
     strip: Range<usize>,
     /// Splat of every (splat, tile) pair of the strip, tile after tile.
     pairs: Vec<u32>,
-    /// For each tile of the strip, the index in `pairs` at which the next splat of the tile is written. One more entry
-    /// after those of the tiles holds the number of all pairs.
+    /// For each tile of the strip, the index in `pairs` at which the next splat of the tile is written. An additional
+    /// last entry holds the number of all pairs.
     next_slots: Vec<u32>,
 }
 
@@ -81,7 +81,7 @@ impl Bins {
     ///
     /// A strip consists of as many whole rows of tiles as possible with at most `max_pairs` pairs in total. If a single
     /// row has more pairs, the strip is a part of this row. If a single tile has more pairs, the strip is this tile.
-    /// `splats` must be those given to [`Bins::begin`].
+    /// `splats` must be the splats that [`Bins::begin`] sorted.
     pub(super) fn next_strip(&mut self, splats: &Splats, max_pairs: usize) -> Option<Range<usize>> {
         if self.is_last_strip() {
             return None;
@@ -122,9 +122,9 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Returns the longest beginning of the non-empty range `tiles` that has at most `max_pairs` (splat, tile) pairs in
-    /// total and ends at the end of a row of tiles or of `tiles`. If the first row alone has more pairs, the result
-    /// ends within this row. The result has at least one tile.
+    /// Returns the longest range that starts with the first of the non-empty `tiles`, has at most `max_pairs` (splat,
+    /// tile) pairs in total, and ends at the end of a row of tiles or of `tiles`. If the first row alone has more
+    /// pairs, the range ends within this row. It has at least one tile.
     fn first_part(&self, tiles: Range<usize>, max_pairs: usize) -> Range<usize> {
         let Range { start: first, end: last } = tiles;
         let before = self.start(first);
@@ -134,8 +134,8 @@ impl Bins {
         first..if whole_rows > first && end < last { whole_rows } else { end }
     }
 
-    /// Splits `tiles` into parts with at most `max_pairs` (splat, tile) pairs each. A tile with more pairs is a part of
-    /// its own.
+    /// Splits `tiles` into consecutive ranges with at most `max_pairs` (splat, tile) pairs each. A tile with more pairs
+    /// is a range of its own.
     pub(super) fn parts(&self, mut tiles: Range<usize>, max_pairs: usize) -> impl Iterator<Item = Range<usize>> {
         std::iter::from_fn(move || {
             let part = (!tiles.is_empty()).then(|| self.first_part(tiles.clone(), max_pairs))?;
@@ -170,7 +170,7 @@ impl Bins {
         self.pairs(y * self.tiles_across + x.start..y * self.tiles_across + x.end)
     }
 
-    /// Returns the number of (splat, tile) pairs before those of `tile`, over the whole render.
+    /// Returns the number of (splat, tile) pairs of all tiles before `tile`, over the whole render.
     fn start(&self, tile: usize) -> usize {
         tile.checked_sub(1).map_or(0, |before| self.ends[before])
     }
@@ -204,8 +204,8 @@ fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     }
 }
 
-/// Returns bits that, as integers, have the same order as the f32 values. Negative depths occur, because rounding far
-/// from the origin can give a visible Gaussian a negative f32 depth.
+/// Maps `x` to an integer so that larger numbers have larger integers. Negative depths occur, because rounding far from
+/// the origin can give a visible Gaussian a negative f32 depth.
 fn ordered_bits(x: f32) -> u32 {
     let bits = x.to_bits();
     if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }

@@ -72,8 +72,8 @@ impl SampledPixels {
         (0..self.across.div_ceil(LANES)).map(|half| rows << (half * SIDE)).sum()
     }
 
-    /// Returns the transmittance of each pixel before any splat is blended: 1 for pixels of the render, and a negative
-    /// value for the others, which marks them as ended.
+    /// Returns the transmittance of each pixel of the tile before any splat is blended. It is 1 for pixels of the
+    /// render. Pixels of the tile outside the render get a negative value, which marks them as ended.
     fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let lanes = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
@@ -117,9 +117,9 @@ pub(super) trait BlendSink {
     /// Whether a splat is blended in all groups of pixels with even index before the groups with odd index. Has an
     /// effect only if a vector holds a single group.
     const SPLITS_EVEN_ODD: bool = false;
-    /// Swaps the sums over even groups and the sums over odd groups in an accumulator that keeps them apart, and
-    /// returns the accumulator. The following groups are then added to the other sums. Called twice per splat: after
-    /// the groups with even index, and after the groups with odd index.
+    /// Swaps the two sums of an accumulator that keeps one sum over even groups of pixels and one over odd groups, and
+    /// returns the accumulator. The following groups are then added to the other sum. Called twice per splat: after the
+    /// groups with even index, and after the groups with odd index.
     ///
     /// Returns `accumulator` unchanged if a vector holds more than one group of eight pixels. The default
     /// implementation, for accumulators without such sums, always returns it unchanged.

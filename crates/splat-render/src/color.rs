@@ -44,7 +44,7 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
     }
 }
 
-/// Returns the number of SH coefficients per color channel that are used: those of all complete degrees up to 3.
+/// Returns how many SH coefficients per color channel are evaluated: the coefficients of all complete degrees up to 3.
 pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
     let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
     (0..=MAX_SH_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
@@ -91,8 +91,8 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     ]
 }
 
-/// Returns the derivatives with respect to x, y and z of the polynomials that are the SH basis functions (see
-/// [`basis`]).
+/// Returns the derivatives of the SH basis functions Y_k (see [`basis`]) with respect to x, y and z. The functions are
+/// differentiated as polynomials in x, y and z.
 #[inline(always)]
 pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);

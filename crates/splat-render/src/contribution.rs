@@ -1,4 +1,4 @@
-//! Visible contribution of every Gaussian to renders: how much of the pixels it makes up.
+//! Visible contribution of every Gaussian to renders: its weight alpha · transmittance, summed over pixels.
 
 use serde::{Deserialize, Serialize};
 

@@ -91,7 +91,7 @@ impl CameraTerms {
 /// − shear·dy)² − falloff_y·dy²`. The exponent is the quadratic form of the inverse 2-D covariance, written as squares,
 /// so it is never positive and loses no digits.
 ///
-/// Aligned to a cache line, because splats are read in an order other than that in memory.
+/// Aligned to a cache line, because splats are not read in the order in which they are stored.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Splat {
@@ -149,8 +149,8 @@ impl TileRect {
     }
 }
 
-/// Footprints (splats) of the visible Gaussians of a range, by increasing index. Entry i of both lists belongs to the
-/// same Gaussian.
+/// Footprints (splats) of visible Gaussians in the order of their indices, and the tiles that each splat can change.
+/// Entry i of both lists belongs to the same Gaussian.
 #[derive(Debug, Default)]
 pub(super) struct Splats {
     pub(super) splats: Vec<Splat>,
@@ -164,7 +164,7 @@ impl Splats {
         self.rects.clear();
     }
 
-    /// Appends the splats of `next`. Their Gaussians must have higher indices than those of the splats here.
+    /// Appends the splats of `next`, whose Gaussians must have higher indices than all Gaussians of the present splats.
     pub(super) fn append(&mut self, mut next: Splats) {
         self.splats.append(&mut next.splats);
         self.rects.append(&mut next.rects);

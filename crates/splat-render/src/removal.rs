@@ -51,8 +51,9 @@ impl RemovalError {
         self.sum.is_empty()
     }
 
-    /// Returns the indices of the `count` Gaussians to keep, in increasing order: first those for which `fixed` is
-    /// true, then those with the largest removal error. Of equal errors, the lower index is preferred.
+    /// Selects `count` Gaussians to keep, and returns their indices in increasing order. Selects first the Gaussians
+    /// for which `fixed` is true, then the Gaussians with the largest removal error. Of equal errors, the lower index
+    /// is preferred.
     pub fn top_by_error(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
         let mut ids: Vec<u32> = (0..self.len() as u32).collect();
         // A stable sort keeps ties in index order.
@@ -90,8 +91,8 @@ impl RemovalError {
 /// Receiver of weights (alpha · transmittance of each splat) that computes the removal error of every splat of a tile
 /// while the tile is blended.
 pub(super) struct RemovalSink<'a> {
-    /// Colors of the pixels, by channel, minus the parts of all splats that have been blended so far: the color behind
-    /// them times the transmittance.
+    /// Colors of the pixels, by channel, minus weight times color of all splats that have been blended so far. This is
+    /// the color behind these splats times the transmittance.
     pub(super) behind: [TilePlane; 3],
     /// Floor of the color difference, see [`RemovalError::contrast_floor`].
     pub(super) contrast_floor: f32,

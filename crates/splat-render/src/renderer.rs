@@ -235,7 +235,8 @@ impl Renderer {
         }
     }
 
-    /// Projects the Gaussians to splats and sorts these by depth. Computes colors only if `colored`.
+    /// Projects the Gaussians to splats, which this renderer keeps, and sorts the splats by depth. Computes colors only
+    /// if `colored`.
     pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
         let count = gaussians.len();
         self.splats.clear();

@@ -38,7 +38,7 @@ fn decode_frames(decoder: &mut TileDecoder, plane: usize, frames: impl Iterator<
         .collect()
 }
 
-/// Returns a decoder of `values`, which are filtered with prediction order `order` but not compressed.
+/// Returns a decoder that has loaded `values`, frames of `plane` values each, filtered with prediction order `order`.
 fn loaded(values: &[u32], plane: usize, order: u8) -> TileDecoder {
     let shuffled = filter(values, plane, order);
     TileDecoder { order, shuffled, recent: [vec![0; plane], vec![0; plane]], ..TileDecoder::default() }

@@ -11,7 +11,8 @@ use crate::error::Result;
 use crate::layout::TileId;
 use crate::record::TileRecord;
 
-/// Frames of one tile, decoded one at a time, fastest in increasing order; see [`Reader::load`].
+/// Frames of one tile (one column for a block of Gaussians and frames), decoded one at a time, fastest in increasing
+/// order; see [`Reader::load`].
 ///
 /// Memory: a compressed tile takes 4 bytes per value of all its frames and 8 bytes per value of one frame. A raw tile
 /// (plain f32) takes no memory; if it is read in place from the memory map, the pages that were read count as memory
@@ -46,10 +47,9 @@ pub struct TouchedPages {
 }
 
 impl Reader {
-    /// Loads the tile `at` into `frames`, which then returns its frames. Decompresses a compressed tile; checks the
-    /// checksum of a raw tile (plain f32) if this was not done before. `buffer` is used while loading and holds no
-    /// values of the tile afterwards. Fails if there is no such tile, if its bytes are damaged, or if they cannot be
-    /// read.
+    /// Loads the tile `at` into `frames`, from which its frames can then be read. Decompresses a compressed tile.
+    /// Checks the checksum of a raw tile (plain f32) if no earlier call has checked it. `buffer` is used only while
+    /// loading. Fails if there is no such tile, if its bytes are damaged, or if they cannot be read.
     ///
     /// If `touched` is given, stored bytes are read in place from the memory map, under the conditions of
     /// [`Reader::tile`]. Their range is added to `touched`, so that [`Reader::release`] can release their pages: those
@@ -182,8 +182,8 @@ impl Reader {
         self.file.release(merged);
     }
 
-    /// Returns the loaded tile, and the index of its frame `frame` among its stored frames. This is `frame`, but 0 if
-    /// all frames are equal, because only one is stored then.
+    /// Returns the loaded tile, and the index of its frame `frame` among its stored frames. The index is `frame`, or 0
+    /// if all frames are equal, because only one is stored then.
     fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
         let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
         assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
@@ -240,7 +240,7 @@ impl TouchedPages {
         self.bytes += std::mem::take(&mut other.bytes);
     }
 
-    /// Adds the range of the stored bytes of a tile.
+    /// Adds the range of file bytes in which the tile of the record `tile` is stored.
     fn add(&mut self, tile: &TileRecord) {
         self.bytes += u64::from(tile.stored_bytes);
         self.ranges.push(tile.offset..tile.offset + u64::from(tile.stored_bytes));

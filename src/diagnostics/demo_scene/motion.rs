@@ -136,18 +136,18 @@ impl DemoGaussian {
 pub(super) struct GaussianRandom(pub(super) u64);
 
 impl GaussianRandom {
-    /// Returns random number `channel` of the Gaussian, in [0, 1).
+    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [0, 1).
     pub(super) fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
         (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
     }
 
-    /// Returns random number `channel` of the Gaussian, in [−1, 1).
+    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [−1, 1).
     pub(super) fn signed(self, channel: u64) -> f64 {
         2.0 * self.unit(channel) - 1.0
     }
 
-    /// Returns random number `channel` of the Gaussian, in [`low`, `high`].
+    /// Returns the pseudo-random number of the Gaussian with the index `channel`, in [`low`, `high`].
     pub(super) fn between(self, channel: u64, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit(channel)
     }

@@ -213,9 +213,9 @@ fn sky(k: usize, n: usize) -> SurfacePoint {
 }
 
 fn ground(k: usize, n: usize) -> SurfacePoint {
-    /// Exponent p of the distance from the center, `HORIZON` · u^p, where u is spread evenly over [0, 1]. With p = 0.5
-    /// the Gaussians are spread evenly over the ground; a larger exponent places fewer and larger Gaussians far from
-    /// the center.
+    /// Exponent p in the distance of a Gaussian from the center of the ground, `HORIZON` · u^p, where u is spread
+    /// evenly over [0, 1]. With p = 0.5 the Gaussians are spread evenly over the ground; a larger exponent places fewer
+    /// and larger Gaussians far from the center.
     const DENSITY: f64 = 0.8;
     let DVec2 { x: turn, y: part } = spread(k);
     let radius = HORIZON * part.powf(DENSITY);
@@ -365,7 +365,7 @@ struct Limb {
     joint: DVec3,
     swing: f64,
     rgb: [f64; 3],
-    /// Share of this part in the Gaussians of the figure, in hundredths.
+    /// Share of this limb in the Gaussians of the figure, in hundredths.
     share: usize,
 }
 

@@ -75,8 +75,8 @@ impl Judge {
 }
 
 impl JudgedQuality {
-    /// Computes the quality from the PSNR of each view, in dB: the root mean square error, from the mean of the squared
-    /// errors of the views, and the mean PSNR. All views must have the same number of pixels.
+    /// Computes the quality over all views (root mean square error and mean PSNR) from the PSNR of each view, in dB.
+    /// The squared error of a view follows from its PSNR. All views must have the same number of pixels.
     pub(super) fn from_psnr(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;

@@ -84,7 +84,8 @@ impl Knob {
         }
     }
 
-    /// Returns the reason, as text for the user, why a scene or recipe can have no settings for this knob.
+    /// Returns the reason why this knob was not measured, as text for the user: something that the scene or the recipe
+    /// lacks. Each knob has only one possible reason.
     fn needs(self) -> &'static str {
         match self {
             Knob::Sums => "sums over frames need three frames",
@@ -106,8 +107,8 @@ pub struct PrecisionOptions {
     pub input: InputOptions,
     /// Recipe from which every setting is derived, by changing one parameter.
     pub recipe: Recipe,
-    /// Knobs (parameters, or groups of parameters) to vary. `None`: every knob; for a large model every knob whose
-    /// settings can be compared without running the whole compression.
+    /// Knobs (parameters, or groups of parameters) to vary. `None`: every knob, but for a large model only the knobs
+    /// whose settings can be compared without running the whole compression.
     pub knobs: Option<Vec<Knob>>,
     /// Number or fraction of Gaussians that every setting keeps.
     pub target: Target,
@@ -339,9 +340,10 @@ fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     thinned
 }
 
-/// Returns the bytes of memory of a schedule that [`thin_frames`] makes for at most `most` frames. The schedule has two
-/// entries for each frame that keeps its views: one for this frame, and one for the frames without views that follow.
-/// Returns 0 if `thin_frames` makes no new schedule, because the input has at most `most` frames.
+/// Returns the bytes of memory of the schedule (list of views per frame) that [`thin_frames`] makes for at most `most`
+/// frames. This schedule has two entries for each frame that keeps its views: one for this frame, and one for the
+/// frames without views that follow. Returns 0 if `thin_frames` makes no new schedule, because the input has at most
+/// `most` frames.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }

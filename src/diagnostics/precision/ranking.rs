@@ -40,8 +40,8 @@ struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
-    /// Errors by name, without the errors of the kept Gaussians against those of the finest setting. [`Bench::curve`]
-    /// adds these.
+    /// Errors by name. [`Bench::curve`] adds the errors that compare the kept Gaussians with the Gaussians that the
+    /// finest setting keeps.
     errors: BTreeMap<String, f64>,
     kept: Vec<u32>,
 }
@@ -249,9 +249,9 @@ impl Bench<'_> {
         })
     }
 
-    /// Compares the Gaussians that each ranking in `tried` keeps with those that the last ranking keeps, which is the
-    /// finest setting, and adds the errors. Returns the rankings as the curve of the parameter `name`. `against`:
-    /// description of the finest setting. `own`: value of the parameter in the recipe. `expected`: orders of
+    /// Returns the rankings `tried` as the curve of the parameter `name`. The last ranking is that of the finest
+    /// setting. Adds the errors of each ranking: its kept Gaussians are compared with those of the last ranking.
+    /// `against`: description of the finest setting. `own`: value of the parameter in the recipe. `expected`: orders of
     /// convergence that theory predicts, by name of the error.
     fn curve(
         &self,
@@ -296,8 +296,8 @@ fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized. The
-/// correct percentiles are those in `exact`. Leaves out the percentiles of the combined scores (static and dynamic):
+/// Returns the largest relative error of the percentiles P1 and P99 by which the terms of `scores` are normalized.
+/// `exact` has the correct percentiles. Leaves out the percentiles of the combined scores (static and dynamic):
 /// `scores` and `exact` have different combined scores, so their percentiles are not comparable.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);

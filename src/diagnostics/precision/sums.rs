@@ -158,8 +158,8 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the index of the frame at place `k` of a sequence that plays `count` frames forward and backward again and
-/// again. With three frames, the sequence is 0, 1, 2, 1, 0, 1, 2 …. `count` must be at least 2.
+/// Returns the index of the frame at position `k`, from 0, of a sequence that plays `count` frames forward and backward
+/// again and again. With three frames, the sequence is 0, 1, 2, 1, 0, 1, 2 …. `count` must be at least 2.
 fn ping_pong_index(k: usize, count: usize) -> usize {
     let turn = 2 * (count - 1);
     let at = k % turn;

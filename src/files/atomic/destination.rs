@@ -95,7 +95,8 @@ fn leads_through_system_link(target: &Path) -> bool {
 /// there.
 ///
 /// # Errors
-/// Fails with [`Error::Usage`] if the existing one has another kind or `replace` does not allow to replace it.
+/// Fails with [`Error::Usage`] if a file would replace a folder or a folder would replace a file, or if `replace` does
+/// not allow replacing what exists.
 pub(super) fn check_replace(target: &Path, kind: TargetKind, replace: Replace) -> Result<()> {
     let shown = target.shown();
     let found = destination(target)?;

@@ -82,10 +82,10 @@ pub(super) struct Journal {
     pub(super) files: Vec<(String, OsString)>,
 }
 
-/// Repairs and removes the hidden folders that killed runs left beside `target`: those of outputs with this name and
-/// those of scratch files.
+/// Repairs and removes the hidden folders (workspaces) that killed runs left beside `target`. These are the workspaces
+/// of outputs with the name of `target`, and the workspaces of scratch files.
 ///
-/// Never fails. A hidden folder that cannot be repaired stays and causes a warning.
+/// Never fails. A workspace that cannot be repaired stays and causes a warning.
 pub(super) fn clean_up(target: &Path) {
     let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -107,8 +107,8 @@ pub(super) fn clean_up(target: &Path) {
     }
 }
 
-/// Removes hidden folders of killed runs from `folder` if the name of the output that they were written for ends with
-/// `ending`.
+/// Removes the hidden folders (workspaces) that killed runs left in `folder`, if the names of their outputs end with
+/// `ending`. A workspace that holds an interrupted move of a result stays.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
     let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
@@ -122,8 +122,8 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
 
 /// Completes or reverts interrupted moves of results to the name of `target`. The caller holds the [`PublishLock`].
 ///
-/// `supersedes`: the caller is about to move its own result to this name. An interrupted move that cannot be completed
-/// is then discarded, so that no later run completes it and thereby overwrites the caller's result.
+/// `supersedes` is true if the caller is about to move its own result to this name. An interrupted move that cannot be
+/// completed is then discarded, so that no later run completes it and thereby overwrites the caller's result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
     let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -155,13 +155,13 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     }
 }
 
-/// Completes or reverts an interrupted move of a result from the workspace `folder`, which lies in the folder `parent`,
-/// to `target`. The caller holds the [`PublishLock`].
+/// Completes or reverts an interrupted move of a result to `target`. The result lies in the workspace `folder`, which
+/// is a subfolder of `parent`. The caller holds the [`PublishLock`].
 ///
-/// Files listed in a journal get their final names. If the earlier result folder was moved aside, it gets its name back
-/// if that name is free. Otherwise the new folder is already in place, and entries that are not listed in the earlier
-/// folder's summary are moved into it. If they cannot be moved, for example because a folder belongs to another user,
-/// the earlier folder is kept beside the result under a visible name.
+/// Files listed in a journal get their final names. An earlier result folder that was moved aside gets its name back if
+/// that name is free. Otherwise the new folder is already in place, and entries that the summary of the earlier folder
+/// does not list are moved into the new folder. If they cannot be moved, for example because a folder belongs to
+/// another user, the earlier folder is kept beside the result under a visible name.
 pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let (_, name) = split_target(target)?;
     if folder.has(JOURNAL) {

@@ -23,12 +23,12 @@ pub const SUMMARY_FILE: &str = "summary.json";
 /// are not summaries of this program and are not read.
 const MAX_SUMMARY: u64 = 16 << 20;
 
-/// Content of a summary as far as it concerns the ownership of files.
+/// Files that belong to a result, according to the summary of the result.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
-    /// There is no summary with a list of files, or the summary is one of another program.
+    /// There is no summary with a list of files, or another program wrote the summary.
     Unknown,
-    /// The summary was written by this program and lists the files of its result, which are contained here.
+    /// This program wrote the summary, which lists these files of the result by their paths relative to the summary.
     Listed(BTreeSet<String>),
 }
 
@@ -41,15 +41,15 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads from the summary at `path`, which may be a link, which files belong to the result. Returns
-    /// [`Owner::Unknown`] if the file cannot be read or is not a summary of this program with a list of files.
+    /// Reads the summary at `path`, which may be a link, and returns the list of the files that belong to the result.
+    /// Returns [`Owner::Unknown`] if the file cannot be read or is not a summary of this program with a list of files.
     pub(super) fn read(path: &Path) -> Owner {
         // Open without waiting: a plain open of a FIFO would wait until another program opens it for writing.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
-    /// Reads from the open summary `file` which files belong to the result. Returns [`Owner::Unknown`] if `file` cannot
-    /// be read or is not a summary of this program with a list of files.
+    /// Reads the open summary `file` and returns the list of the files that belong to the result. Returns
+    /// [`Owner::Unknown`] if `file` cannot be read or is not a summary of this program with a list of files.
     pub(super) fn read_file(mut file: File) -> Owner {
         if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;
@@ -100,8 +100,9 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     Ok(files)
 }
 
-/// Moves foreign entries, which are not listed in the summary of the earlier result `old`, into the folder `new` of the
-/// new result. An entry whose name exists in `new` gets `.kept` appended to its name.
+/// Moves the foreign entries of `old`, the folder of an earlier result, into `new`, the folder of the new result.
+/// Foreign entries are files and folders that the summary in `old` does not list. An entry whose name exists in `new`
+/// gets `.kept` appended to its name.
 ///
 /// Entries that cannot be moved stay in `old`, and the first failure is returned. The function may be called again
 /// after an interruption at any point: every entry is always in exactly one of the two folders.
@@ -120,12 +121,12 @@ pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result
     result
 }
 
-/// Appends the paths of foreign entries in `folder` to `out`. `folder` is the subfolder `inside` of an earlier result
-/// whose files are `listed`; `new` is the folder of the new result.
+/// Appends the paths of the foreign entries in `folder` to `out`. `folder` is the subfolder `inside` of an earlier
+/// result, and the paths are relative to this result. `listed` holds the files of the earlier result; `new` is the
+/// folder of the new result.
 ///
 /// Foreign entries are files that are not in `listed`, and folders that contain no file in `listed` and do not exist in
-/// `new`. Paths are relative to the earlier result. Folders that cannot be read are skipped; the first such failure is
-/// returned at the end.
+/// `new`. Subfolders that cannot be read are skipped; the first such failure is returned at the end.
 fn find_foreign(
     folder: &FolderHandle,
     new: &Path,
@@ -155,8 +156,8 @@ fn find_foreign(
     result
 }
 
-/// Returns an unused path for `relative` below `folder`. Appends `.kept` to the name of a component if an existing
-/// entry is in the way.
+/// Returns a path below `folder` at which nothing exists: the path `relative`, in which `.kept` is appended to every
+/// component that an existing entry blocks.
 fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();

@@ -20,7 +20,7 @@ use crate::error::{Error, Result, ShowPath};
 /// renames, the next run with this output completes the set.
 ///
 /// # Errors
-/// Fails if a file that `replace` does not allow to replace appeared meanwhile, or if a system call fails.
+/// Fails if a file appeared meanwhile at a target and `replace` does not allow replacing it, or if a system call fails.
 pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let Some((_, target)) = files.last() else { return Ok(()) };
     let lock = PublishLock::acquire(target)?;
@@ -69,8 +69,8 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
 /// the replacement.
 ///
 /// # Errors
-/// Fails if an entry that `replace` does not allow to replace appeared meanwhile, or if a system call fails. The target
-/// is then unchanged. A failure after the rename is only a warning.
+/// Fails if an entry appeared meanwhile at `target` and `replace` does not allow replacing it, or if a system call
+/// fails. The target is then unchanged. A failure after the rename is only a warning.
 pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Replace) -> Result<()> {
     let lock = PublishLock::acquire(target)?;
     repair(target, true);

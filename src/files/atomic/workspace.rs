@@ -23,8 +23,8 @@ use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_
 use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Part of the name of the workspace (hidden folder) of a scratch file. For other files this part is the name of the
-/// output, but a scratch file belongs to no output.
+/// Name that takes the place of the output name in the name of a workspace (hidden folder) for a scratch file, because
+/// a scratch file belongs to no output.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
 /// Ending of the names of workspaces (hidden folders in which outputs are written).
 const ENDING: &str = ".splatsieve-tmp";
@@ -37,7 +37,7 @@ pub(super) const CONTENT: &str = "content";
 /// Name, in the workspace, of an earlier output folder that is being replaced. Files in it that its summary does not
 /// list are moved into the new output folder.
 pub(super) const REPLACED: &str = "replaced";
-/// Name, in the workspace, that a file or folder gets when it only has to be deleted.
+/// Name, in the workspace, that a file or folder gets when it is no longer needed and is deleted with the workspace.
 pub(super) const DISCARDED: &str = "discarded";
 /// Name, in the workspace, of the journal: the list of files of one result that get their final names together.
 pub(super) const JOURNAL: &str = "journal";
@@ -46,7 +46,8 @@ pub(super) const JOURNAL: &str = "journal";
 const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
 /// Paths of the workspaces (hidden output folders) of this process, with the identity of each folder. A thread that
-/// moves a result to its final name holds the guard, so that a signal is handled either before or after the move.
+/// moves a result to its final name holds the lock of this table, so that a signal is handled either before or after
+/// the move.
 static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
 /// Locks the table of the hidden output folders (workspaces) of this process and returns it: the identity of each
@@ -56,7 +57,8 @@ pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIde
     LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Hidden folder in which the output for one target is written. Dropping this value removes the folder.
+/// Hidden folder in which one output is written. Dropping this value removes the folder, unless the folder holds an
+/// interrupted move of a result.
 #[derive(Debug)]
 pub(super) struct Workspace {
     pub(super) folder: PathBuf,
@@ -158,8 +160,8 @@ pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }
 
-/// Returns whether `entry` is the folder name of a workspace for an output called `name`: that name, followed by a
-/// random part.
+/// Returns whether `entry` is the folder name of a workspace for an output called `name`. Such a folder name has the
+/// form `.NAME.RANDOM.splatsieve-tmp`, where NAME is `name`.
 pub(super) fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
     let rest = entry.as_encoded_bytes().strip_prefix(b".").and_then(|rest| rest.strip_prefix(name.as_encoded_bytes()));
     let random = rest.and_then(|rest| rest.strip_prefix(b".")?.strip_suffix(ENDING.as_bytes()));
@@ -205,8 +207,8 @@ pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// Guard that keeps this process from giving outputs their final names and from removing outputs; see
-/// [`remove_unfinished`].
+/// Guard that keeps all threads of this process from creating, publishing and removing outputs as long as it exists;
+/// see [`remove_unfinished`].
 #[must_use = "runs go on as soon as this is dropped"]
 pub struct ExitGuard(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
@@ -237,7 +239,7 @@ pub fn remove_unfinished() -> ExitGuard {
 }
 
 /// Creates and locks the lock file in the new folder `folder` and writes the marker line. Returns `None` if another run
-/// took the folder for one of a killed run and is removing it.
+/// mistook the folder for a leftover of a killed run and is removing it.
 fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),

@@ -44,7 +44,8 @@ pub(super) struct ListedImage {
 pub(super) struct Assembly {
     rig: Rig,
     memory_counter: MemoryCounter,
-    /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, under its values.
+    /// Hash table for finding an equal camera: the index in `rig.cameras` of each camera, hashed by the camera's
+    /// values.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
     /// (Camera index, split) pairs for which an image without a time has been added.
@@ -217,8 +218,8 @@ pub(super) struct MemoryCounter {
 }
 
 impl MemoryCounter {
-    /// Adds `bytes`, a number of bytes that will be allocated, to the counted memory. Messages name the file `path`,
-    /// the `place` in it, and `what` the memory is for.
+    /// Counts `bytes` of memory that are about to be allocated. For the error message, `path` is the file, `place` the
+    /// position in the file, and `what` the purpose of the memory.
     ///
     /// # Errors
     /// Fails if the memory limit for reading would be exceeded.

@@ -36,15 +36,15 @@ pub(super) fn find(sparse: &Path) -> Option<(PathBuf, u32)> {
     number(root).map(|number| (root.to_owned(), number))
 }
 
-/// Returns the number of folders `colmap_K` with consecutive numbers K, from K = `first` on, in the folder that
-/// contains `root`.
+/// Returns the number of folders `colmap_K` with consecutive numbers K = `first`, `first` + 1, … The folder `root` is
+/// the first of them, and the others lie beside it.
 pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
 /// Returns the images of `frames` frames, each with the cameras of the first frame. `images` are the images of the
-/// first frame. Its folder `root` is called `colmap_K`, where the number K is `first`; the folders of the next frames
-/// have the next numbers. The first image of each frame is a test image.
+/// first frame, whose folder `root` is called `colmap_K` with K = `first`. The folder of each later frame has the next
+/// number. The first image of each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
     images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),

@@ -65,7 +65,7 @@ fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = List
     (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| listed_image(frame, view)))
 }
 
-/// Builds the camera of row `index` from the values `row` of that row.
+/// Builds a camera from `row`, the 17 values of the row with index `index` in the array in `file`.
 fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions) -> Result<Camera> {
     let wrong = |expected: String, found: String| Error::input(file, format!("row {index}"), expected, found);
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);

@@ -30,7 +30,8 @@ pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
     ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(SmallValue::List(..))))
 }
 
-/// Reads `file`. If `with_others` is set, also reads the other one of `train_meta.json` and `test_meta.json` beside it.
+/// Reads `file`. If `with_others` is set, also reads the other one of `train_meta.json` and `test_meta.json`, if it
+/// exists beside `file`.
 ///
 /// # Errors
 /// Fails if a value is missing, has the wrong length or is not a valid camera, or if the files have different numbers

@@ -22,8 +22,8 @@ const TABLE_ENTRY_BYTES: u64 = 3 * 40 + 32;
 /// Source of the times of images.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum TimesSource {
-    /// Default of the format. COLMAP: the numbers in the image names, if all names have one. Other formats: the times
-    /// in the camera file.
+    /// Default source, which depends on the file format. COLMAP: the numbers in the image names, if all names have one.
+    /// Other formats: the times in the camera file.
     #[default]
     Own,
     /// The numbers in image names; every name must have one.

@@ -67,8 +67,8 @@ fn split_of(file: &Path) -> Split {
     }
 }
 
-/// Returns the existing files of the other splits (train, val, test) beside `file`; none if `file` is not named like a
-/// file of these splits.
+/// Returns the files of the other splits that exist beside `file`. Returns no files if `file` is not called
+/// `transforms_train.json`, `transforms_val.json` or `transforms_test.json`.
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));

@@ -63,9 +63,8 @@ const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 ///
 /// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
 /// of the weight lie. `weights` holds the visible area of each Gaussian: opacity times the product of its two larger
-/// scales. Weights above the 99th percentile are set to that percentile. Because of the weights, floaters, which are
-/// many and thin, count little; because of the limit of the weights, a backdrop of few huge Gaussians does not
-/// dominate.
+/// scales. Weights above the 99th percentile are set to that percentile. The weights make floaters, which are many
+/// and thin, count little. The limit of the weights keeps a backdrop of few huge Gaussians from dominating.
 pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     let mut all: Vec<(DVec3, f64)> = positions
         .iter()

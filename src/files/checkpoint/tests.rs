@@ -105,7 +105,8 @@ fn every_float_type_is_converted_to_f32() {
     }
 }
 
-/// The bytes are the start of a file that `torch.save(…, _use_new_zipfile_serialization=False)` writes.
+/// Checks the error for a file in the format before PyTorch 1.6. The test bytes are the start of a file that
+/// `torch.save(…, _use_new_zipfile_serialization=False)` writes.
 #[test]
 fn files_of_old_pytorch_are_refused_with_the_way_out() {
     let start = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.";

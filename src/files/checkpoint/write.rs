@@ -28,7 +28,7 @@ const ALIGNMENT: u16 = 64;
 pub(crate) struct GaussianRows {
     /// Tensor in the original checkpoint.
     pub(crate) tensor: TensorView,
-    /// Indices of the rows of the result whose values change, increasing.
+    /// Indices, among the rows that are written, of the rows whose values change; increasing.
     pub(crate) changed: Vec<u32>,
     /// New values of the changed rows, `[changed, elements of a row]`, last index fastest. If empty, the new values are
     /// zeros.
@@ -38,7 +38,7 @@ pub(crate) struct GaussianRows {
 /// Part of a rewritten storage (block of tensor values) that holds one tensor.
 struct StoragePart<'a> {
     tensor: &'a TensorView,
-    /// Changes to the rows of the tensor; `None` if the tensor is copied whole.
+    /// Changes to the rows of the tensor; `None` if all rows are copied unchanged.
     rows: Option<&'a GaussianRows>,
     shape: Vec<usize>,
     stride: Vec<usize>,
@@ -46,7 +46,8 @@ struct StoragePart<'a> {
     len: usize,
 }
 
-/// Writes `checkpoint` to `path`, keeping only the rows `kept` (increasing) of the tensors `rows`.
+/// Writes a copy of `checkpoint` to `path` in which each tensor in `rows` keeps only the rows with the indices `kept`
+/// (increasing), with the changes given in `rows`.
 ///
 /// # Errors
 /// Fails if a tensor has elements outside its storage, if two tensors share one shape or stride object in the pickle
@@ -123,8 +124,8 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 
 impl<'a> StoragePart<'a> {
     /// Creates the part of a rewritten storage (block of tensor values) that holds `tensor`, and computes the shape and
-    /// strides of this part. It has `kept` rows, or all rows of the tensor if `rows` is `None`. `offset` is the index
-    /// of its first element in the rewritten storage.
+    /// strides of this part. The part has `kept` rows, or all rows of the tensor if `rows` is `None`. `offset` is the
+    /// index of the part's first element in the rewritten storage.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {

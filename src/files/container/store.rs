@@ -156,7 +156,7 @@ impl Container {
     /// block, then by Gaussian block. `index` is the index of the tile's attribute in [`Container::places`]. An
     /// attribute that does not vary over time has tiles in only one frame block, so `frame_block` is ignored for it.
     ///
-    /// For the number of all tiles, the caller passes the number of attributes as `index`, and 0 for both blocks.
+    /// Returns the number of all tiles if `index` is the number of attributes and both blocks are 0.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };

@@ -62,8 +62,8 @@ impl FrameValues {
 /// - 4 × width × frames kept, where width is the number of components. The frames kept are the frames of one frame
 ///   block that the read plan lists, but at most the number given by [`ReadPlan::with_max_kept_frames`].
 /// - 8 × width in addition, if a whole frame block is kept.
-/// - For raw (uncompressed) tiles that are read whole, instead: the same amount of mapped memory if a whole frame block
-///   may be kept, else none.
+/// - Raw (uncompressed) tiles that are read whole take mapped memory instead. It has the same size if a whole frame
+///   block may be kept, and is 0 otherwise.
 ///
 /// No memory is used if only one frame is kept, for columns that do not vary, and for tiles that the container keeps in
 /// memory.

@@ -204,9 +204,9 @@ fn expected_length(header: &StreamHeader) -> String {
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 
-/// Describes `length`, the wrong length of a frame in bytes, for messages: as the length of another number of Gaussians
-/// if it is a multiple of the length of one Gaussian, else as impossible. `header` determines the length of one
-/// Gaussian.
+/// Describes `length`, the wrong length of a frame in bytes, for messages. If `length` is a multiple of the length of
+/// one Gaussian, names the number of Gaussians that have this length, else says that no number of Gaussians has it.
+/// `header` determines the length of one Gaussian.
 fn found_length(header: &StreamHeader, length: u64) -> String {
     let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
     if length.checked_rem(per_gaussian) == Some(0) {

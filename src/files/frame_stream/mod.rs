@@ -75,7 +75,8 @@ impl<R: Read> FrameStream<R> {
         &self.header
     }
 
-    /// Returns the attributes that are constant over all frames. The varying attributes in it are empty.
+    /// Returns the attributes that are constant over all frames. In the returned value, the varying attributes are
+    /// empty.
     pub fn constant_attributes(&self) -> &Gaussians {
         &self.constant
     }
@@ -217,7 +218,7 @@ impl<R: Read> CountingReader<R> {
     }
 }
 
-/// Returns the text that names a byte of the stream, and its frame if there is one, in messages.
+/// Returns the text by which messages name the position `byte` in the stream, and the frame, if there is one.
 fn place(byte: u64, frame: Option<u32>) -> String {
     frame.map_or(format!("byte {byte}"), |frame| format!("frame {frame}, byte {byte}"))
 }

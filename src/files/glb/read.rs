@@ -231,8 +231,8 @@ fn has_transform(node: &Value) -> bool {
 }
 
 /// Returns the values of the attribute `name`, which must have the glTF type `kind`, such as `VEC3`. `index` is the
-/// index of their accessor in the JSON text `document`; the values lie in the chunk `binary`. Fails if the accessor
-/// does not exist, has another type, or leaves the chunk.
+/// index of the attribute's accessor in the JSON text `document`; the values lie in the chunk `binary`. Fails if the
+/// accessor does not exist, has another type, or extends beyond the chunk.
 fn accessor<'a>(
     document: &Value,
     binary: &'a [u8],

@@ -173,7 +173,7 @@ fn check_finite(state: &Gaussians, path: &Path) -> Result<()> {
     Err(Error::usage(format!("{}: {what} of Gaussian {id} is not finite, which a .glb cannot store", path.shown())))
 }
 
-/// Returns a position of a PLY in the axes of glTF: x and y change their signs.
+/// Converts a position from the axes of a PLY to the axes of glTF: changes the signs of x and y.
 fn reversed([x, y, z]: [f32; 3]) -> [f32; 3] {
     [-x, -y, z]
 }
@@ -191,7 +191,7 @@ fn bounds(state: &Gaussians) -> [[f32; 3]; 2] {
     if state.is_empty() { [[0.0; 3]; 2] } else { [mins, maxs] }
 }
 
-/// Returns the linear light of an sRGB value, both in [0, 1] (IEC 61966-2-1).
+/// Converts an sRGB value to linear light, both in [0, 1] (IEC 61966-2-1).
 fn linear(value: f64) -> f64 {
     if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }

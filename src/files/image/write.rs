@@ -79,8 +79,8 @@ fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     writer.finish().map_err(png_error_to_io)
 }
 
-/// Converts an error of the PNG encoder. An I/O error inside it is passed on unchanged, so that callers can recognize a
-/// full disk.
+/// Converts an error of the PNG encoder to an I/O error. If the encoder failed with an I/O error, returns that error
+/// unchanged, so that callers can recognize a full disk.
 pub(crate) fn png_error_to_io(error: png::EncodingError) -> io::Error {
     match error {
         png::EncodingError::IoError(error) => error,

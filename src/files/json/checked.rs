@@ -26,8 +26,8 @@ enum Token {
     Word,
 }
 
-/// Reader that passes on UTF-8 text. Fails for other bytes, and for strings, numbers or nesting depths that exceed
-/// their limits.
+/// Reader that passes on the text of a JSON file to the parser. Fails for bytes that are not UTF-8, and for strings,
+/// numbers or nesting depths that exceed their limits.
 #[derive(Debug)]
 pub(super) struct CheckedReader<R> {
     file: R,
@@ -128,22 +128,23 @@ impl<R: Read> CheckedReader<R> {
         }
     }
 
-    /// Stores `error`, which concerns the byte at index `at` of the buffer. If the parser has already taken all bytes
-    /// before this byte, returns an I/O error, which stops the parser. Otherwise returns `Ok`: a later read returns the
-    /// I/O error, after the parser has taken these bytes.
+    /// Stores `error`, which concerns the byte at index `at` of the buffer, so that the parser stops before this byte.
+    /// Returns an I/O error if the parser has already taken all bytes before it. Otherwise returns `Ok`: the parser
+    /// takes these bytes first, and a later read returns the I/O error.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
-        // Otherwise pass on the bytes before it first: they may contain an earlier error that the parser reports.
+        // If there are bytes before the invalid one, pass them on first: they may contain an earlier error that the
+        // parser reports.
         match at > self.taken {
             true => Ok(()),
             false => Err(ErrorKind::InvalidData.into()),
         }
     }
 
-    /// Checks the bytes of the buffer that were read but not checked yet: they must be UTF-8 text, and its strings,
-    /// numbers and nesting must not exceed their limits. At the first byte that is wrong, checking ends and
-    /// [`CheckedReader::refuse`] handles the error. An incomplete character at the end remains unchecked until more
-    /// bytes are read; if `is_end`, no more bytes will follow, and it is an error.
+    /// Checks the bytes of the buffer that were read but not checked yet. They must be UTF-8 text, and the strings,
+    /// numbers and nesting in them must not exceed their limits. Stops at the first invalid byte and passes the error
+    /// to [`CheckedReader::refuse`]. An incomplete character at the end remains unchecked until more bytes are read. If
+    /// `is_end`, no more bytes will follow, so the incomplete character is an error.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {

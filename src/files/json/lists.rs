@@ -19,8 +19,8 @@ pub(crate) struct JsonPlace {
     /// Index of the element in the list. If the key of the list occurs several times, the index restarts at 0 for each
     /// list; only the last list is valid.
     pub(crate) index: usize,
-    /// For nested lists, the index of the element in the inner list. `None` in two cases: at the end of an inner list
-    /// (the value is then an empty list), and for an element that is not a list (the value is then this element).
+    /// Index of the element in the inner list, if the lists are nested. `None` at the end of an inner list (the value
+    /// is then an empty list), and for an element that is not a list (the value is then this element).
     pub(crate) inner: Option<usize>,
 }
 
@@ -31,7 +31,7 @@ pub(crate) struct ListSelection<'a> {
     pub(crate) keys: &'a [&'a str],
     /// Whether the elements of the lists are lists themselves, whose elements are to be read.
     pub(crate) nested: bool,
-    /// Keys that are kept of each element.
+    /// Keys that are always kept of each element.
     pub(crate) wanted: &'a [&'a str],
 }
 
@@ -189,8 +189,8 @@ impl<'de> Visitor<'de> for List<'_, '_> {
 }
 
 /// Visitor of a list element that should be a list itself. Passes each element of this inner list to the callback
-/// `each`. Its value is then an empty list, because the callback has received all elements. If the list element is not
-/// a list, the value is this element or a description of it.
+/// `each`, then returns an empty list, because the callback has received all elements. If the list element is not a
+/// list, returns this element or a description of it.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,

@@ -30,10 +30,10 @@ pub(crate) enum GaussianAxis {
     Second,
 }
 
-/// Writes a copy of `template` to `path` that keeps only the Gaussians `kept`; `axis` returns, for an array, the axis
-/// whose index is the Gaussian. `change` may change the values of the kept Gaussians: it receives the name of the
-/// array, the frame and the values at this frame, and returns the indices of the Gaussians that it changed. The values
-/// of all others keep their bytes.
+/// Writes a copy of the archive `template` to `path` that keeps only the Gaussians `kept`. `axis` receives an array and
+/// returns the axis of the array whose index is the Gaussian. `change` receives the name of an array, a frame and the
+/// values of the kept Gaussians at this frame. It may change these values, and returns the indices of the Gaussians
+/// that it changed. The values of all other Gaussians keep their bytes.
 ///
 /// # Errors
 /// Fails if an array cannot be decoded, if `change` fails, or if the file cannot be written.

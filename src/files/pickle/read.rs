@@ -300,8 +300,8 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Returns the stack index at which the top `count` values begin. Fails unless the innermost open container has at
-    /// least one more value on the stack, below these values.
+    /// Returns the stack index at which the top `count` values begin. Fails if the innermost open container has no
+    /// further value on the stack below these values.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }

@@ -164,7 +164,7 @@ fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Err
 }
 
 /// Converts the number `word` to binary form, in the type `scalar`, and appends it to `out`. Returns `None` if `word`
-/// is not such a number.
+/// is not a number of this type.
 fn push_number(out: &mut Vec<u8>, word: &[u8], scalar: Scalar) -> Option<()> {
     let word = std::str::from_utf8(word).ok()?;
     match scalar {

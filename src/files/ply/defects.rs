@@ -36,8 +36,8 @@ impl Ply {
         })
     }
 
-    /// Reads all rows once, and returns notes for the user: those of [`Ply::header_notes`], and the numbers of rows with
-    /// a zero quaternion, an infinite opacity logit, or other values that are not finite.
+    /// Reads all rows once. Returns notes for the user: those of [`Ply::header_notes`], and the numbers of rows with a
+    /// zero quaternion, an infinite opacity logit, or other values that are not finite.
     ///
     /// # Errors
     /// Fails if the file was truncated since it was opened.
@@ -52,8 +52,8 @@ impl Ply {
         Ok(found.notes())
     }
 
-    /// Returns the notes of [`Ply::notes`] without reading the rows again. `whole` has all attributes of all rows, as
-    /// the file was read.
+    /// Returns the notes of [`Ply::notes`] without reading the rows again. `whole` holds all attributes of all rows, as
+    /// read from this file.
     pub(crate) fn notes_with(&self, whole: &Gaussians) -> Vec<String> {
         let mut found = RowDefects::new(self);
         found.add(0, whole);

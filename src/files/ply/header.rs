@@ -122,7 +122,8 @@ pub(crate) struct Element {
 pub(crate) struct PlyHeader {
     pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
-    /// Names of the elements that are left out: those with a list property, and those after one of them that has rows.
+    /// Names of the elements that are not read: elements with a list property, and all elements after a list element
+    /// that has rows.
     pub(crate) skipped: Vec<String>,
     /// Texts of the `comment` lines of the header, in order.
     pub(crate) comments: Vec<String>,
@@ -137,8 +138,8 @@ impl PlyHeader {
     ///
     /// # Errors
     /// Fails if the file is not a PLY, if the header has no `end_header` or more than 1 MiB, if a line, type or count
-    /// is invalid, if the rows of Gaussians or rows before them have list properties (these rows have no fixed size), or
-    /// if a name is used twice. The error names the line.
+    /// is invalid, or if a name is used twice. Also fails if the rows of Gaussians or rows before them have list
+    /// properties, because such rows have no fixed size. The error names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<PlyHeader> {
         let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MAX_HEADER_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
@@ -279,8 +280,9 @@ fn missing_end(path: &Path, length: usize) -> Error {
     Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again")
 }
 
-/// Checks that the rows of the last of `elements`, which has the list property `name`, may be skipped: they are none, or
-/// come after the rows of Gaussians. The error names the file `path` and the place that `place` returns.
+/// Checks that the rows of the last of `elements`, which has the list property `name`, may be skipped. This is the case
+/// if there are no such rows, or if they come after the rows of Gaussians. The error names the file `path` and the
+/// place that `place` returns.
 fn check_list(path: &Path, place: impl Fn() -> String, elements: &[Element], name: &str) -> Result<()> {
     let is_skippable = |element: &Element, before: &[Element]| {
         element.name != "vertex" && (element.count == 0 || before.iter().any(|element| element.name == "vertex"))
@@ -301,8 +303,8 @@ fn check_list(path: &Path, place: impl Fn() -> String, elements: &[Element], nam
     }
 }
 
-/// Splits `elements` into those whose rows can be found, and the names of the others: elements with lists, and all
-/// elements after one of them that has rows.
+/// Splits `elements` into the elements whose rows can be found, and the names of all other elements. Rows of elements
+/// with a list property cannot be found, nor can rows of elements after a list element that has rows.
 fn without_lists(elements: Vec<Element>) -> (Vec<Element>, Vec<String>) {
     let first = elements.iter().position(|element| element.has_lists && element.count > 0).unwrap_or(elements.len());
     let (mut found, mut skipped) = (Vec::new(), Vec::new());

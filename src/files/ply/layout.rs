@@ -9,10 +9,10 @@ use super::header::{Element, Property};
 use crate::error::{Error, Result};
 use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 
-/// Natural log of the ratio between the thickness given to a surfel and its smaller axis: a thousandth. (A surfel is a
-/// flat Gaussian of 2DGS, without `scale_2`.) The thickness is relative, so that results do not depend on the unit of
-/// the scene. It is thin enough to vanish under the rasterizer's dilation of 0.3 px², and thick enough to give a valid
-/// f32 covariance.
+/// Natural logarithm of the thickness that is given to a surfel, as a fraction of its smaller axis: 1/1000. (A surfel
+/// is a flat Gaussian of 2DGS, without `scale_2`.) The thickness is relative, so that results do not depend on the unit
+/// of the scene. It is thin enough to vanish under the rasterizer's dilation of 0.3 px², and thick enough to give a
+/// valid f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
 /// Largest SH degree that a file may have.

@@ -49,7 +49,7 @@ pub struct PlyOptions {
     pub scratch: PathBuf,
     /// Maximum memory in bytes for reading a whole file.
     pub memory: ReadLimit,
-    /// Receiver of progress events while frames are linked.
+    /// Receiver of progress events while Gaussians are linked (matched) from frame to frame.
     pub events: Events,
 }
 
@@ -82,7 +82,7 @@ pub struct Ply {
     body: PlyBody,
     /// Byte range of the rows of the element `vertex` in the body.
     rows: Range<usize>,
-    /// Offset in the body of the end of the bytes that writers copy.
+    /// End of the bytes that writers copy, as an offset in the body.
     end: usize,
     count: usize,
     memory: ReadLimit,
@@ -370,8 +370,8 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file, and the end of the last
-/// element that is not skipped. Fails if the body has fewer bytes (`available`) than its header declares.
+/// Returns the byte range of the rows of the element `vertex` in the binary body of a PLY file, and the offset at which
+/// the last element that is not skipped ends. Fails if the body has fewer bytes (`available`) than its header declares.
 fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<(Range<usize>, usize)> {
     let mut end = 0u64;
     let mut rows = 0..0;

@@ -14,10 +14,10 @@ pub struct Codebook {
 
 impl Codebook {
     /// Chooses entries for `values`. If there are at most 256 different values, they are the entries. Otherwise half of
-    /// the entries are spread evenly over the range, and the other half are denser where values are denser (as the cube
-    /// root of their density, which is best for the mean squared error: P. F. Panter and W. Dite, "Quantization
-    /// Distortion in Pulse-Count Modulation with Nonuniform Spacing of Levels", 1951). No value is further from its
-    /// entry than 1/200 of the range.
+    /// the entries are spread evenly over the range. The other half are denser where values are denser: their density
+    /// is proportional to the cube root of the density of the values, which is best for the mean squared error (P. F.
+    /// Panter and W. Dite, "Quantization Distortion in Pulse-Count Modulation with Nonuniform Spacing of Levels",
+    /// 1951). No value is further from its entry than 1/200 of the range.
     ///
     /// Values that are not finite are ignored; without finite values, all entries are 0.
     pub fn fit<I: Iterator<Item = f32>>(values: impl Fn() -> I) -> Codebook {
@@ -34,7 +34,8 @@ impl Codebook {
             (bin.count, bin.min, bin.max) = (bin.count + 1, bin.min.min(value), bin.max.max(value));
         }
         let total: f64 = bins.iter().map(|bin| (bin.count as f64).cbrt()).sum();
-        // Both shares of a value grow from 0 to 1 over the range: that of its place, and that of the values below it.
+        // Two numbers grow from 0 to 1 over the range: the position of a bin, and the weight of all values below it.
+        // Their mean determines the entry.
         let (mut cells, mut below) = (vec![None; ENTRIES], 0.0);
         for (at, bin) in bins.iter().enumerate().filter(|(_, bin)| bin.count > 0) {
             let weight = (bin.count as f64).cbrt() / total;

@@ -1,5 +1,5 @@
-//! Attributes of Gaussians as images of bytes: pixel i, row by row from the top, belongs to the Gaussian at place i of
-//! the file.
+//! Attributes of Gaussians as images of bytes: pixel i, row by row from the top, belongs to Gaussian number i of the
+//! file.
 
 use rayon::prelude::*;
 
@@ -104,9 +104,9 @@ pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     keys.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Returns two images of size `size`, of the low and of the high bytes of 16-bit numbers. `codes` returns the three
-/// numbers (x, y, z) of the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`: x, y and z are red,
-/// green and blue.
+/// Returns two images of size `size`: one of the low bytes and one of the high bytes of 16-bit numbers. `codes` returns
+/// the three numbers (x, y, z) of the Gaussian with a given index. Pixel i holds the Gaussian `order[i]`: x, y and z
+/// are red, green and blue.
 pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u16; 3]) -> [RgbaImage; 2] {
     [0, 1].map(|byte| {
         size.image(order, |row| {
@@ -116,8 +116,8 @@ pub fn encode_16_bit(size: ImageSize, order: &[u32], codes: impl Fn(usize) -> [u
     })
 }
 
-/// Returns the three 16-bit numbers whose low bytes are red, green and blue of the pixel `low`, and whose high bytes
-/// are those of `high`.
+/// Returns three 16-bit numbers, for red, green and blue. The pixel `low` holds their low bytes and the pixel `high`
+/// their high bytes.
 pub fn decode_16_bit(low: [u8; 4], high: [u8; 4]) -> [u16; 3] {
     [0, 1, 2].map(|c| u16::from_le_bytes([low[c], high[c]]))
 }

@@ -26,8 +26,9 @@ pub struct Palette {
 }
 
 impl Palette {
-    /// Chooses a palette of at most `max_entries` entries for `count` Gaussians. `vector` appends the vector of a
-    /// Gaussian, of `width` components, to a list. Two Gaussians with equal vectors may share an entry.
+    /// Chooses a palette of at most `max_entries` entries for `count` Gaussians. `vector` receives the index of a
+    /// Gaussian and appends the vector of this Gaussian, of `width` components, to a list. If there can be as many
+    /// entries as Gaussians, each Gaussian gets its own entry. Otherwise Gaussians with equal vectors share an entry.
     pub fn fit(
         count: usize,
         width: usize,
@@ -112,7 +113,7 @@ fn shares(sizes: &[usize], entries: usize) -> Vec<usize> {
 }
 
 /// Returns `k` centroids of `vectors` (`width` components each) by Lloyd's k-means. A centroid that loses all its
-/// vectors keeps its place.
+/// vectors is left unchanged.
 fn k_means(vectors: &[f32], width: usize, k: usize) -> Vec<f32> {
     let count = vectors.len() / width;
     let row = |i: usize| &vectors[i * width..][..width];
@@ -166,7 +167,7 @@ fn nearest(vector: &[f32], centroids: &[f32], width: usize) -> u32 {
 mod tests {
     use super::*;
 
-    /// Returns component `c` of the vector of row `row`: one of 20 clusters with a little noise.
+    /// Returns component `c` of test vector number `row`. The vectors form 20 clusters with a little noise.
     fn component(row: usize, c: usize) -> f32 {
         let cluster = (row * 7919) % 20;
         let noise = ((row * 31 + c * 17) % 101) as f32 / 101.0 - 0.5;

@@ -111,7 +111,7 @@ pub(crate) fn decode(meta: &Meta, files: &mut Files, path: &Path, memory: ReadLi
     Ok(gaussians)
 }
 
-/// Place from which the files of a `.sog` archive are read: the archive, or a folder with the same files.
+/// Source of the files of a `.sog` archive: the archive itself, or a folder with the same files.
 pub(crate) enum Files {
     Archive(ZipArchive<BufReader<File>>),
     Folder(PathBuf),

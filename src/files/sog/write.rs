@@ -25,7 +25,7 @@ use crate::model::{Gaussians, color_from_sh, opacity};
 
 /// Largest magnitude of ln s that is stored: beyond, a Gaussian is smaller than any pixel or larger than any scene.
 const MAX_LOG_SCALE: f32 = 20.0;
-/// Number of palette entries for the smallest files.
+/// Maximum number of palette entries of a file with fewer than 2048 Gaussians.
 const LEAST_PALETTE: usize = 1024;
 
 /// Errors of a written file: differences between the Gaussians and the values in the file.

@@ -126,9 +126,9 @@ mod tests {
         }
     }
 
-    /// Writes a file to `folder` and opens it. The file has one row (Gaussian) for each function in `edits`: the words
-    /// of a row without defects ([`sound`]), which the function then changes. A function can thus set half-precision
-    /// values that [`encode_words`] never stores, such as NaN.
+    /// Writes a `.splatv` file to `folder` and opens it. Each function in `edits` makes one row (Gaussian) of the file:
+    /// it receives the words of a row without defects ([`sound`]) and changes them. A function can thus set
+    /// half-precision values that [`encode_words`] never stores, such as NaN.
     fn file(folder: &std::path::Path, edits: &[fn(&mut [u32; WORDS_PER_GAUSSIAN])]) -> Splatv {
         let path = folder.join("rows.splatv");
         let rows: Vec<[u32; WORDS_PER_GAUSSIAN]> = edits

@@ -34,8 +34,8 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
     read_state_dict_with_note(path, memory).map(|(tensors, _)| tensors)
 }
 
-/// Reads tensors like [`read_state_dict`]. Also returns a note for the user if all names of tensors have a prefix in the
-/// file that is left out.
+/// Reads tensors like [`read_state_dict`]. If all names of tensors in the file begin with the prefix of a wrapper of
+/// the model, which is left out, also returns a note about it for the user.
 ///
 /// # Errors
 /// Fails like [`read_state_dict`].
@@ -110,14 +110,14 @@ struct StateDict {
     checkpoint: Checkpoint,
     /// Tensors by their names without `prefix`.
     tensors: BTreeMap<String, TensorView>,
-    /// Prefix that all names have in the file and that belongs to a wrapper of the model; empty if there is none.
+    /// Prefix of all names in the file, which a wrapper of the model added; empty if there is none.
     prefix: String,
 }
 
-/// Prefixes of the names of all tensors that `torch.nn.DataParallel` and `torch.compile` add.
+/// Prefixes that `torch.nn.DataParallel` and `torch.compile` add to the names of all tensors.
 const WRAPPERS: [&str; 2] = ["module.", "_orig_mod."];
 
-/// Returns whether there are tensors, and the names of all of them begin with `prefix` and are longer.
+/// Returns whether there is at least one tensor, and every name begins with `prefix` and is longer than `prefix`.
 fn all_begin_with(tensors: &BTreeMap<String, TensorView>, prefix: &str) -> bool {
     !tensors.is_empty() && tensors.keys().all(|name| name.len() > prefix.len() && name.starts_with(prefix))
 }
@@ -206,8 +206,8 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
-    /// Adds the tensors at and below node `id`, which is the child with the key `part` of the node called `name`;
-    /// `depth` is the depth of that node.
+    /// Adds the tensors at and below node `id`. This node is the child with the key `part` of the node that is called
+    /// `name` and has the depth `depth` in the object tree.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {

@@ -139,9 +139,9 @@ fn windows_and_velocities_are_within_half_a_step() {
     assert!(all.iter().copied().eq(0..COUNT as u32), "{all:?}");
 }
 
-/// Returns the last part of the JSON pointer to the value for `axis` in a bound of a value range in `meta.json`.
-/// `member` is the first part of the pointer. The bounds for velocities, whose pointers begin with `/temporal`, are
-/// nested in one more list than other bounds.
+/// Returns the last part of the JSON pointer to one value of a value range in `meta.json`: the minimum or maximum for
+/// axis `axis`. `member` is the first part of the pointer. Ranges of velocities, whose pointers begin with `/temporal`,
+/// are nested in one more list than other ranges.
 fn index(member: &str, axis: usize) -> String {
     if member.starts_with("/temporal") { format!("/0/{axis}") } else { format!("/{axis}") }
 }

@@ -15,15 +15,15 @@ use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::source::FrameSource;
 
-/// Quantization step of all values: 2^-16.
+/// Number k = −128 of the quantization step 2^(k/8) = 2^-16, which is used for all values.
 const STEP: i32 = -8 * 16;
 
-/// Returns the states of all frames.
+/// Returns the states of all Gaussians of `source`, one entry per frame.
 fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
     (0..source.info().times.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
 }
 
-/// Returns steps of 2^-16 for all values of `content`.
+/// Returns quantization steps of 2^-16 for all values of `content`.
 pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
     let step = |name: &String| (name.clone(), TensorSteps { step: STEP, channels: Vec::new() });
     QuantizationSteps {
@@ -33,9 +33,10 @@ pub(super) fn fine_steps(content: &ArchiveContent) -> QuantizationSteps {
     }
 }
 
-/// Encodes the compressed model `reduction` of `model` as an archive with steps of 2^-16, restores it, and returns the
-/// kind of the restored output. Checks that every Gaussian of every frame differs by at most `tolerance` from the
-/// frames of the compressed model (see [`values`]), and that the archive opens as an input with the same frames.
+/// Checks that an archive of the compressed model `reduction` of `model` restores this model, and returns the kind of
+/// the restored output. The archive has quantization steps of 2^-16. Every restored Gaussian of every frame must differ
+/// by at most `tolerance` from the compressed model (see [`values`]). The archive must also open as an input, with the
+/// same frames as the restored model.
 ///
 /// # Panics
 /// Panics if a check fails.
@@ -81,8 +82,9 @@ pub(in crate::models) fn check_round_trip(
     kind
 }
 
-/// Returns what renders of Gaussian `i` depend on: position, opacity, SH coefficients, and its covariance as a fraction
-/// of the largest entry. Several rotations and scales may have almost the same covariance.
+/// Returns the values of Gaussian `i` on which its renders depend: position, opacity, SH coefficients, and covariance
+/// divided by its largest entry. Rotation and scales are compared through the covariance, because different rotations
+/// and scales may have almost the same covariance.
 fn values(state: &Gaussians, i: usize) -> Vec<f64> {
     let [w, x, y, z] = state.rotation.row(i).map(f64::from);
     let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
@@ -96,7 +98,7 @@ fn values(state: &Gaussians, i: usize) -> Vec<f64> {
     values
 }
 
-/// Returns the ending of the names of files of this kind.
+/// Returns the file name extension of outputs of the kind `kind`, without a dot at the start.
 fn extension(kind: OutputKind) -> &'static str {
     match kind {
         OutputKind::Splatv => "splatv",

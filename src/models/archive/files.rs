@@ -1,5 +1,5 @@
-//! Named parts of an archive (`.gsz`) that are not entropy coded, among them the parts of a PLY file besides its
-//! attributes.
+//! Parts of an archive (`.gsz`) that are stored without entropy coding, such as the bytes of a PLY file that belong to
+//! no attribute of a Gaussian.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -49,7 +49,7 @@ pub(crate) fn add_cloud(content: &mut ArchiveContent, template: &Ply, rows: impl
     Ok(())
 }
 
-/// Writes the PLY file that `content` describes to the path `to`. The content was read from the archive at `path`.
+/// Writes the PLY file that `content` describes to the path `to`. `content` was read from the archive at `path`.
 pub(super) fn write_cloud(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
     let part = |name: &str| {
         let missing = || Error::input(path, "blobs", format!("a part named {name}"), "none");

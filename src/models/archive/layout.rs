@@ -1,9 +1,9 @@
 //! Layout of the files of a model in an archive: which bytes of each file are values that the archive stores quantized,
 //! and which are stored as they are.
 //!
-//! The layout is the part [`LAYOUT`] of the archive, as JSON. The bytes of file k that are no values are the part
-//! `file.k`. Everything read from an archive is checked before it is used: paths stay inside the output folder, and the
-//! restored files have at most [`MAX_GROWTH`] times the bytes of the decoded archive.
+//! The layout is stored as JSON in the archive part [`LAYOUT`]. The archive part `file.k` holds the bytes of file k
+//! that are no values. Everything read from an archive is checked before it is used: paths stay inside the output
+//! folder, and the restored files have at most [`MAX_GROWTH`] times the bytes of the decoded archive, plus 1 MiB.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -21,89 +21,89 @@ use crate::model::{Attributes, sh_coefficients};
 
 /// Name of the archive part with the layout.
 pub(super) const LAYOUT: &str = "layout";
-/// Maximum size of all restored files, as a multiple of the bytes of the decoded archive. Training checkpoints hold two
-/// optimizer values per parameter, which an archive does not store.
+/// Maximum size of all restored files, as a multiple of the bytes of the decoded archive. The files may be larger than
+/// the archive, because training checkpoints hold two optimizer values per parameter, which an archive does not store.
 const MAX_GROWTH: u64 = 4;
 /// Number of bytes that the restored files may have in addition to [`MAX_GROWTH`] times the decoded archive.
 const BASE_BYTES: u64 = 1 << 20;
-/// Maximum length in bytes of the layout. That of a model with one row of values per frame has about 100 bytes per
-/// frame.
+/// Maximum length in bytes of the layout. The layout of a model with one row of values per frame takes about 100 bytes
+/// per frame.
 const MAX_LAYOUT_BYTES: usize = 4 << 20;
 /// Maximum length in bytes of a path in an archive.
 const MAX_PATH: usize = 256;
-/// Names, without the part after the first period, that Windows reserves for devices.
+/// File names that Windows reserves for devices, also if a period and any text follow.
 const DEVICES: [&str; 4] = ["con", "prn", "aux", "nul"];
-/// Names of devices of Windows that end in a digit.
+/// Beginnings of file names that Windows reserves for devices if a digit follows, such as `com1`.
 const NUMBERED_DEVICES: [&str; 2] = ["com", "lpt"];
-/// Bits of a half-precision number per octave (doubling) of its value.
+/// Increase of the bits of a half-precision number, read as an integer, if the number doubles (one octave).
 const BITS_PER_OCTAVE: f32 = 1024.0;
 
-/// Files of a model and the places of values in them.
+/// Layout of a model in an archive: the files of the model, and which bytes of each file are values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Layout {
-    /// Whether the model is a folder; otherwise it is the only file.
+    /// Whether the model is a folder; `false` if the model is a single file.
     pub(super) folder: bool,
     pub(super) files: Vec<FileLayout>,
 }
 
-/// File of a model.
+/// Path of one file of a model, and the parts of the file that the archive stores as values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct FileLayout {
-    /// Path relative to the model folder, with `/` between names; the name of the file if it is the only one.
+    /// Path of the file relative to the model folder, with `/` between names. For a model of a single file: its name.
     pub(super) path: String,
     /// Parts of the file that hold values, in order and without overlap.
     pub(super) spans: Vec<Span>,
 }
 
 impl FileLayout {
-    /// Returns whether the file is at `path` on a file system that ignores case.
+    /// Returns whether `path` is the path of this file on a file system that ignores case.
     pub(super) fn has_path(&self, path: &str) -> bool {
         self.path.eq_ignore_ascii_case(path)
     }
 }
 
-/// Part of a file that holds values.
+/// Contiguous part of a file that consists of values, or of bytes that are restored as zeros.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Span {
-    /// Offset in the file, in bytes.
+    /// Offset of this part from the start of the file, in bytes.
     pub(super) at: u64,
     pub(super) of: Values,
 }
 
-/// Values of a [`Span`].
+/// Content of a [`Span`], which is a contiguous part of a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Values {
-    /// One row per Gaussian, in the order of the archive; each row consists of the given fields.
+    /// Rows of the given fields, one row per Gaussian in the order of the archive.
     Rows(Vec<Field>),
     /// All values of the tensor with this name, as f32.
     Tensor(String),
-    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
+    /// Given number of bytes that the archive does not store and that are restored as zeros.
     Zeros(u64),
 }
 
-/// Field of a row. The number in a variant is the index of a plane, or a number of bytes. A plane is one scalar
-/// component of all Gaussians. Planes are counted through the components of position, rotation, log scale, opacity
-/// logit and SH coefficients, and then through those of all columns.
+/// Field of a row of a file; each row holds the values of one Gaussian. The number in a variant is a number of bytes,
+/// or the index of a plane. A plane is one scalar component of all Gaussians. The planes of position, rotation, log
+/// scale, opacity logit and SH coefficients come first, in this order. The planes of the columns, which hold all other
+/// values of Gaussians, follow.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Field {
-    /// Value of the plane with this index, as f32.
+    /// Value of the plane (scalar component of all Gaussians) with this index, as f32.
     F32(usize),
-    /// Value of the plane with this index, converted to half precision.
+    /// Value of the plane (scalar component of all Gaussians) with this index, converted to half precision.
     Half(usize),
-    /// Nonnegative half-precision number whose bits are 1024 times the value of the plane with this index, which is
-    /// about its binary logarithm.
+    /// Nonnegative half-precision number whose bits are 1024 times the value of the plane (scalar component of all
+    /// Gaussians) with this index. The value in the plane is thus about the binary logarithm of the number plus 15.
     Octaves(usize),
-    /// Byte that is 255 times the value of the plane with this index.
+    /// Byte that is 255 times the value of the plane (scalar component of all Gaussians) with this index.
     Byte(usize),
-    /// Bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::beside`]); the number of these
-    /// bytes.
+    /// Given number of bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::beside`]).
     Bytes(usize),
-    /// Bytes that are not stored and are restored as zeros; the number of these bytes.
+    /// Given number of bytes that the archive does not store and that are restored as zeros.
     Zeros(usize),
 }
 
@@ -132,7 +132,7 @@ impl Field {
         }
     }
 
-    /// Encodes `value` into the bytes `stored` of the field.
+    /// Encodes `value` as this field, and writes the result to `stored`, the bytes of the field in a row.
     fn encode(self, value: f32, stored: &mut [u8]) {
         let limit = f16::MAX.to_f32();
         match self {
@@ -167,7 +167,8 @@ pub(super) fn first_plane(attribute: Attributes) -> usize {
     }
 }
 
-/// Returns the values of the plane with number `plane`; `None` if there is no such plane.
+/// Returns the values of the plane (scalar component of all Gaussians) with index `plane` in the archive content
+/// `content`; `None` if there is no such plane.
 fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
     let cloud = &content.cloud;
     let all = Attributes::all();
@@ -187,8 +188,8 @@ fn values_of(content: &ArchiveContent, plane: usize) -> Option<&[f32]> {
     None
 }
 
-/// Returns the name under which an archive stores the remaining bytes of file `k`: all its bytes except the values that
-/// the archive holds as planes and tensors.
+/// Returns the name of the archive part with the remaining bytes of file `k`: all its bytes except the values that the
+/// archive holds as planes and tensors.
 pub(super) fn rest_name(k: usize) -> String {
     format!("file.{k}")
 }
@@ -198,14 +199,15 @@ fn is_plain_char(c: char) -> bool {
     c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | ' ' | '+')
 }
 
-/// Returns `path` with `_` in place of characters that paths in an archive may not have; `None` if that does not make
-/// it a path of plain names ([`is_plain`]).
+/// Returns `path` with `_` in place of each character that paths in an archive may not have. Returns `None` if an
+/// archive may not have the resulting path either ([`is_plain`]).
 pub(super) fn plain_path(path: &str) -> Option<String> {
     let plain: String = path.chars().map(|c| if c == '/' || is_plain_char(c) { c } else { '_' }).collect();
     is_plain(&plain).then_some(plain)
 }
 
-/// Returns whether `path` is a relative path of plain names, so that it stays inside a folder on every system.
+/// Returns whether an archive may have the path `path`: a relative path of plain names, which stays inside its folder
+/// on every operating system.
 fn is_plain(path: &str) -> bool {
     let is_plain_name = |name: &str| {
         let stem = name.split('.').next().unwrap_or_default().to_ascii_lowercase();
@@ -222,13 +224,14 @@ fn is_plain(path: &str) -> bool {
     path.len() <= MAX_PATH && path.split('/').all(is_plain_name)
 }
 
-/// Returns an error about the layout in the archive at `path`.
+/// Returns the error for a damaged layout in the archive at `path`.
 fn damaged(path: &Path, expected: &str, found: impl Into<String>) -> Error {
     Error::input(path, LAYOUT, expected, found.into()).hint("the archive is damaged; copy it again")
 }
 
 impl Layout {
-    /// Reads the layout of the archive at `path` from its content; `None` if it holds a model without a layout.
+    /// Reads the layout of a model's files from `content`, the content of the archive at `path`. Returns `None` if the
+    /// archive holds a model without a layout.
     ///
     /// # Errors
     /// Fails if the layout is malformed.
@@ -256,8 +259,8 @@ impl Layout {
         Ok(Some(layout))
     }
 
-    /// Writes the files of the model into the folder `folder`. Returns the path of the model: the folder itself, or
-    /// the only file in it. `path` is the path of the archive, for messages.
+    /// Writes the files of the model in `content` into the folder `folder`. Returns the path of the model: the folder
+    /// itself, or the only file in it. `path` is the path of the archive, for messages.
     ///
     /// # Errors
     /// Fails if the content does not match the layout or a write fails.
@@ -268,7 +271,8 @@ impl Layout {
         Ok(name)
     }
 
-    /// Writes the model to `to`, a folder or, if the model is a single file, a file.
+    /// Writes the model in `content` to `to`: a folder, or a file if the model is a single file. `path` is the path of
+    /// the archive, for messages.
     ///
     /// # Errors
     /// Fails if the content does not match the layout or a write fails.
@@ -288,7 +292,8 @@ impl Layout {
         Ok(())
     }
 
-    /// Fails if the restored files would be far larger than the decoded archive, which only damage can cause.
+    /// Checks that the restored files are not far larger than the decoded archive; only damage can make them so large.
+    /// `path` is the path of the archive, for messages.
     fn check_size(&self, content: &ArchiveContent, path: &Path) -> Result<()> {
         let count = content.cloud.len() as u64;
         let values = Attributes::all().iter().map(|attribute| content.cloud.column(attribute).planes().len());
@@ -314,9 +319,9 @@ impl Layout {
     }
 }
 
-/// Returns the bytes of file `k`; `None` if its layout does not match the content. `beside` is the offset of the next
-/// unused byte in [`ArchiveContent::beside`], the bytes that are stored unchanged for each Gaussian. The function
-/// advances it past the bytes of this file.
+/// Returns the bytes of `file`, which is file `k` of the model; `None` if its layout does not match the content.
+/// `beside` is an offset within the bytes that each Gaussian has in [`ArchiveContent::beside`] (stored unchanged): the
+/// offset of the next unused byte. The function advances it past the bytes that this file uses.
 fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut usize) -> Option<Vec<u8>> {
     let mut rest = content.files.get(&rest_name(k))?.as_slice();
     let mut out = Vec::new();
@@ -339,8 +344,9 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut 
     Some(out)
 }
 
-/// Appends one row of `fields` per Gaussian to `out`. Returns `None` if the content of the archive has no values for a
-/// field.
+/// Appends one row of `fields` per Gaussian to `out`. `beside` is the offset of the next unused byte among the bytes
+/// that each Gaussian has in [`ArchiveContent::beside`]; it is advanced. Returns `None` if the content of the archive
+/// has no values for a field.
 fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {
@@ -377,12 +383,14 @@ fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out:
     Some(())
 }
 
-/// Sets the checksums in the zip archive `bytes` to those of its uncompressed files. A checksum of 0, which PyTorch
-/// writes if it did not compute one, stays 0. Returns `None` if the bytes are no zip archive.
+/// Replaces the checksums of the uncompressed files in the zip archive `bytes` by those of the files' present content.
+/// A checksum of 0, which PyTorch writes if it did not compute one, stays 0. Returns `None` if the bytes are no zip
+/// archive.
 fn repair_checksums(bytes: &mut [u8]) -> Option<()> {
-    /// Offset of the checksum in the header before a file, and in its entry in the list of files.
+    /// Offsets in bytes of a file's checksum in a zip archive: from the start of the header before the file, and from
+    /// the start of the file's entry in the central directory.
     const CHECKSUM_AT: [usize; 2] = [14, 16];
-    /// Bit of the flags that says that a record with the checksum follows the file.
+    /// Bit in the flags of a file of a zip archive: if it is set, a record with the checksum follows the file.
     const RECORD_FOLLOWS: u8 = 1 << 3;
     const RECORD_MAGIC: &[u8] = b"PK\x07\x08";
     let mut sums = Vec::new();

@@ -49,7 +49,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
 
-/// Model formats whose archives hold their own files. The first entry that recognizes the restored model opens it.
+/// Model formats that an archive stores as files of the format itself, with a layout. The first entry that recognizes
+/// the restored model opens it.
 const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
     windowed::FTGS,
     spacetime_gaussians::ENTRY,
@@ -61,7 +62,8 @@ const FORMATS_WITH_LAYOUT: [ModelFormat; 8] = [
     dynamic_3d_gaussians::ENTRY,
 ];
 
-/// Reads an archive. Returns its decoded content, and its size in bytes divided by purpose.
+/// Reads the archive at `path`. Returns its decoded content, and the bytes that Gaussians, deformation field and the
+/// rest of the archive take.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`.
@@ -77,7 +79,7 @@ fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     file.by_ref().take(archive::HEADER_BYTES as u64).read_to_end(&mut bytes).map_err(failed)?;
     archive::check_header(&bytes, length, path, memory)?;
-    // `check_head` compared the length of the file with the header, so the length is safe to allocate.
+    // `check_header` compared the length of the file with the header, so the length is safe to allocate.
     bytes.reserve_exact((length - bytes.len() as u64) as usize);
     file.take(length - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
@@ -105,9 +107,9 @@ pub fn unpack(content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
     write_cloud(content, path, &folder.join("point_cloud.ply"))
 }
 
-/// Returns the kind of output as which [`unpack`] restores the model that `content` holds in the layout of its own
-/// format; `None` for a 4DGaussians model folder or a single PLY, which have no layout. `path` is the path of the
-/// archive.
+/// Returns the kind of output that [`unpack`] writes for `content`, the content of the archive at `path`. Returns
+/// `None` for a 4DGaussians model folder or a single PLY: only models of other formats have a layout that states the
+/// kind.
 ///
 /// # Errors
 /// Fails if the layout is malformed.
@@ -119,7 +121,8 @@ pub fn restored_output_kind(content: &ArchiveContent, path: &Path) -> Result<Opt
     }))
 }
 
-/// Returns whether the archive holds a 4DGaussians model folder rather than a single PLY.
+/// Returns whether `content`, the content of an archive without a layout, is a 4DGaussians model folder rather than a
+/// single PLY.
 pub fn holds_model_folder(content: &ArchiveContent) -> bool {
     content.files.contains_key(CFG_ARGS)
 }

@@ -1,7 +1,7 @@
-//! Makes the content of an archive from the files of a model, as its own renderer opens them.
+//! Makes the content of an archive from the files of a model.
 //!
-//! Input: a model that was written in its own format, and what its files hold. Output: [`ArchiveContent`] with the
-//! values of the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
+//! Input: a model that was written in its own format, and the kind of content of each file. Output: [`ArchiveContent`]
+//! with the values of the Gaussians as attributes and columns, the tensors of networks, and the layout of the files
 //! ([`super::layout`]). Memory: the files and their values.
 
 use std::fs;
@@ -29,7 +29,8 @@ use crate::model::{AttributeValues, Attributes, Gaussians, sh_coefficients};
 use crate::models::four_d_gaussians::cfg_args;
 use crate::models::in_checkpoint::rows::{RowElement, RowTensors};
 
-/// What a file of a model holds, besides bytes that the archive stores as they are.
+/// Kind of content of a file of a model. It determines which bytes of the file an archive stores as values; all other
+/// bytes are stored unchanged.
 pub(in crate::models) enum FileContent<'a> {
     /// Gaussians as rows of a PLY.
     Ply,
@@ -37,18 +38,19 @@ pub(in crate::models) enum FileContent<'a> {
     Splatv,
     /// Weights of a network: a PyTorch state dict.
     Weights,
-    /// Gaussians as rows of the tensors of a checkpoint. The tensors are described for the checkpoint from which the
-    /// model was read; the file is a copy of it with the same tree of objects.
+    /// Checkpoint with one row per Gaussian in each of the given tensors. They are tensors of the checkpoint from which
+    /// the model was read; the file is a copy of that checkpoint with the same tree of objects.
     Checkpoint(&'a RowTensors),
-    /// Gaussians in the arrays of a NumPy archive; the function returns the axis that counts them and the attribute
-    /// that an array holds.
+    /// NumPy archive with Gaussians in its arrays. For an array, the function returns the axis that counts the
+    /// Gaussians, and the attribute that the array holds.
     Npz(fn(&crate::files::npz::NpzArray) -> (GaussianAxis, Option<Attributes>)),
-    /// No values.
+    /// File without values. Its bytes are stored unchanged, except that folders are removed from the paths in
+    /// `cfg_args` and YAML files.
     Other,
 }
 
 impl FileContent<'_> {
-    /// Returns what a file called `name` holds in a model whose Gaussians are in PLY or `.splatv` files.
+    /// Returns the kind of content of a file called `name`, in a model whose Gaussians are in PLY or `.splatv` files.
     pub(in crate::models) fn from_name(name: &str) -> FileContent<'static> {
         match name.rsplit('.').next() {
             Some("ply") => FileContent::Ply,
@@ -59,12 +61,12 @@ impl FileContent<'_> {
     }
 }
 
-/// Place of a value of a Gaussian in the content of an archive.
+/// Place in the content of an archive where a value of each Gaussian is stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Target {
-    /// Component of an attribute.
+    /// Component of an attribute: the attribute, and the index of the component.
     Attribute(Attributes, usize),
-    /// Component of the column with this name.
+    /// Component of the column with this name. Columns hold values of Gaussians that belong to no attribute.
     Column(String),
     /// No place: the value is stored exactly, as bytes.
     Bytes,
@@ -72,10 +74,11 @@ enum Target {
     Zeros,
 }
 
-/// Field of a row of a file.
+/// Field of the rows of a file, where each row holds the values of one Gaussian.
 #[derive(Debug, Clone)]
 struct RowField {
-    /// Kind of the field: returns the field with the values of a plane, or with a number of bytes.
+    /// Variant of [`Field`] that describes the field in an archive. Its argument is the index of a plane (scalar
+    /// component of all Gaussians), or a number of bytes.
     kind: fn(usize) -> Field,
     /// Number of bytes of the field in each row.
     bytes: usize,
@@ -110,18 +113,19 @@ impl RowField {
     }
 }
 
-/// Content of an archive to which files are added.
+/// Builder of the content of an archive, to which the files of a model are added.
 pub(in crate::models) struct Packer {
     content: ArchiveContent,
     layout: Layout,
     memory: ReadLimit,
-    /// Bytes beside the values: for each field of this kind, the bytes of all Gaussians.
+    /// Bytes that the archive stores unchanged. Each entry is one field: its number of bytes per Gaussian, and the
+    /// bytes of all Gaussians.
     beside: Vec<(usize, Vec<u8>)>,
 }
 
 impl Packer {
-    /// Returns the content of an archive of `count` Gaussians of this SH degree, still without files. Reading files may
-    /// use at most `memory`.
+    /// Creates a builder for an archive of `count` Gaussians of SH degree `sh_degree`, without files yet. Reading files
+    /// may use at most `memory`.
     pub(in crate::models) fn new(count: usize, sh_degree: usize, memory: ReadLimit) -> Packer {
         let content = ArchiveContent {
             cloud: Gaussians::zeros(count, sh_degree),
@@ -131,8 +135,8 @@ impl Packer {
         Packer { content, layout: Layout { folder: false, files: Vec::new() }, memory, beside: Vec::new() }
     }
 
-    /// Adds the model at `path`, a folder or a file. `holds` returns what a file holds, by its path relative to the
-    /// folder.
+    /// Adds the model at `path`, a folder or a file, and returns the complete content of the archive. `holds` returns
+    /// the kind of content of a file, given its path relative to the folder.
     ///
     /// # Errors
     /// Fails if a file cannot be read or has a layout that an archive cannot hold.
@@ -161,7 +165,7 @@ impl Packer {
         Ok(content)
     }
 
-    /// Adds the file at `file`, whose path relative to the model folder is `name`.
+    /// Adds the file at `file`, whose path relative to the model folder is `name` and whose kind of content is `holds`.
     fn add_file(&mut self, name: String, file: &Path, holds: FileContent<'_>) -> Result<()> {
         let path = plain_path(&name).filter(|path| !self.layout.files.iter().any(|known| known.has_path(path)));
         let path = path.ok_or_else(|| cannot_hold(file, "the name of a file that archives do not allow"))?;
@@ -261,8 +265,9 @@ impl Packer {
         Ok((Span { at: at as u64, of: Values::Rows(coded) }, length))
     }
 
-    /// Adds a column with the values `planes`, and returns the index of its first plane (scalar component), counted
-    /// over all columns. If the name is taken, a number is appended to it.
+    /// Adds a column with the values `planes`, one plane (scalar component of all Gaussians) after another. Returns the
+    /// index of its first plane, counted over the attributes and all columns. If the name is taken, a number is
+    /// appended to it.
     fn add_column(&mut self, name: &str, planes: Vec<Vec<f32>>) -> usize {
         let columns = &mut self.content.columns;
         let first = columns.iter().map(|column| column.values.width()).sum::<usize>();
@@ -321,9 +326,9 @@ impl Packer {
         Ok(vec![self.rows(file, bytes, at, &fields)?])
     }
 
-    /// Adds the tensors of a state dict to the archive, except tensors that are not f32 or share their values; these
-    /// stay bytes of the file. Returns the spans (parts of the file with values) that were added, each with its length
-    /// in bytes.
+    /// Adds the tensors of a state dict to the archive. A tensor stays bytes of the file if it is not f32, has values
+    /// that are not finite, is not stored contiguously, or shares its values with an earlier tensor. Returns the spans
+    /// (parts of the file with values) that were added, each with its length in bytes.
     fn weights(&mut self, name: &str, file: &Path) -> Result<Vec<(Span, usize)>> {
         let checkpoint = Checkpoint::open(file, self.memory)?;
         let mut spans: Vec<(Span, usize)> = Vec::new();
@@ -489,14 +494,14 @@ fn ply_target(name: &str, degree: usize, has_all_degrees: bool) -> Target {
     }
 }
 
-/// Returns the error about a file whose layout an archive cannot hold.
+/// Returns the error for a file that an archive cannot hold; `found` describes what the file has instead.
 fn cannot_hold(file: &Path, found: &str) -> Error {
     Error::input(file, "", "a layout that an archive can hold", found)
         .hint("write the model in its own format, or a .gseq of its frames")
 }
 
-/// Returns the bytes of the file at which the values of `tensor` are stored, from its first to its last value; `None`
-/// if the file does not hold them.
+/// Returns the range of bytes in the file in which the values of `tensor` are stored, if they follow one another
+/// without gaps; `None` if the file does not hold them.
 fn place_of(checkpoint: &Checkpoint, tensor: &TensorView) -> Option<Range<usize>> {
     let stored = checkpoint.storage_range(&tensor.storage)?;
     let bytes = tensor.kind.bytes();
@@ -524,8 +529,8 @@ fn has_dense_rows(tensor: &TensorView) -> bool {
     row == 0 || tensor.shape.first().is_some_and(|&rows| rows <= 1 || tensor.stride[0] == row) && last + 1 == row
 }
 
-/// Adds path relative to `root`, with `/` between names, and path of every file below `folder` to `files`. Leaves out
-/// lists of cameras, which renderers do not need.
+/// Adds every file below `folder` to `files`: its path relative to `root`, with `/` between names, and the path by
+/// which it can be opened. Leaves out the list of cameras, which renderers do not need.
 fn list_files(root: &Path, folder: &Path, files: &mut Vec<(String, PathBuf)>) -> Result<()> {
     for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
         let path = entry.map_err(Error::io("list", folder))?.path();
@@ -542,7 +547,7 @@ fn list_files(root: &Path, folder: &Path, files: &mut Vec<(String, PathBuf)>) ->
     Ok(())
 }
 
-/// Returns the zip archive `bytes` with all its files uncompressed; `None` if they are so already.
+/// Returns the zip archive `bytes` with all its files uncompressed; `None` if none of its files is compressed.
 fn without_compression(bytes: &[u8]) -> std::io::Result<Option<Vec<u8>>> {
     let mut archive = ZipArchive::new(Cursor::new(bytes))?;
     let mut is_compressed = false;

@@ -16,7 +16,8 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
-/// Opens the files in an archive of a model in the way in which the model itself was opened.
+/// Function and options with which a model was opened. Archives of the model are opened with the same function and
+/// options.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Reopener {
     open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
@@ -24,8 +25,7 @@ pub(in crate::models) struct Reopener {
 }
 
 impl Reopener {
-    /// Creates a value that opens archives of a model with the function `open` and the options `options`, with which
-    /// the model itself was opened.
+    /// Creates a reopener for a model that was opened with the function `open` and the options `options`.
     pub(in crate::models) fn new(
         open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
         options: &OpenOptions,
@@ -59,7 +59,7 @@ impl Reopener {
         Packer::new(reduction.len(), degree, self.options.memory).add(&path, holds)
     }
 
-    /// Returns the frames at `times` of the model in `content`.
+    /// Opens the model that `content`, the content of an archive, holds, and returns its frames at `times`.
     ///
     /// # Errors
     /// Fails if `content` is not a complete model.

@@ -13,7 +13,8 @@ use crate::outputs::kind::OutputKind;
 /// Number of Gaussians of the test archive.
 const COUNT: usize = 3;
 
-/// Returns the content of an archive with a file of a header, rows of Gaussians, a tensor, zeros and a tail.
+/// Returns the content of an archive of two files. The first file has a header, rows of Gaussians, a tensor, zeros and
+/// a tail.
 fn content() -> ArchiveContent {
     let mut content = ArchiveContent { cloud: Gaussians::zeros(COUNT, 0), ..ArchiveContent::default() };
     (0..COUNT).for_each(|i| content.cloud.position.set_row(i, [i as f32, 0.5, -1.0]));
@@ -38,7 +39,7 @@ fn layout() -> Layout {
     Layout { folder: true, files: vec![file("a/model.bin", spans), file("b", Vec::new())] }
 }
 
-/// Returns the content of an archive with the layout `text`.
+/// Returns `content` with the text `text` as the layout of its files.
 fn with_text(mut content: ArchiveContent, text: &str) -> ArchiveContent {
     content.files.insert(LAYOUT.to_owned(), text.as_bytes().to_vec());
     content
@@ -48,7 +49,7 @@ fn with_layout(layout: &Layout) -> ArchiveContent {
     with_text(content(), &serde_json::to_string(layout).unwrap())
 }
 
-/// Returns the message with which unpacking `content` is refused. Nothing may be written outside the output folder.
+/// Checks that unpacking `content` fails and writes nothing outside the output folder. Returns the error message.
 fn refusal(content: &ArchiveContent) -> String {
     let folder = tempfile::tempdir().unwrap();
     let to = folder.path().join("deep/out");

@@ -55,7 +55,8 @@ pub(super) trait NetworkMotionModel: MotionModel {
     /// Returns the bytes of memory per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
 
-    /// Returns the bytes of memory that do not depend on the number of Gaussians, in addition to those of the network.
+    /// Returns the bytes of memory that the motion model takes regardless of the number of Gaussians, besides the
+    /// network.
     fn bytes(&self) -> usize {
         0
     }
@@ -125,7 +126,8 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         }))
     }
 
-    /// Returns the text of `cfg_args`, with the SH degree lowered to `sh_degree` if it is higher.
+    /// Returns the text of the input's `cfg_args` file. If its SH degree is higher than `sh_degree`, it is replaced by
+    /// `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
     }
@@ -155,15 +157,15 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     }
 }
 
-/// Returns the member of `cluster` with the largest weight; the first one in a tie.
+/// Returns the id of the member of `cluster` with the largest weight; the first such member in a tie.
 fn heaviest(cluster: &Cluster) -> u32 {
     let first = (cluster.leader, f64::NEG_INFINITY);
     cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0
 }
 
 /// Reads the stored parameters of all Gaussians; the properties `fea_0`, `fea_1`, … become format-specific parameters
-/// ([`StoredParams::format_specific`]). Fails if a value is not finite that the network reads or that is needed for the
-/// covariance.
+/// ([`StoredParams::format_specific`]). Fails if a value is NaN or infinite and is an input of the network or
+/// determines a covariance.
 fn raw(ply: &Ply) -> Result<StoredParams> {
     let count = ply.count();
     let gaussians = ply.whole()?;

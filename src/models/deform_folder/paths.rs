@@ -100,8 +100,8 @@ impl Paths {
         }
     }
 
-    /// Reads the tensors of the network. Also returns a note for the user if all their names have a prefix in the file
-    /// that is left out.
+    /// Reads the tensors of the network, using at most `memory`. If the names of all tensors in the file have the same
+    /// prefix, removes the prefix and also returns a note for the user.
     ///
     /// # Errors
     /// Fails if the file is not a state dict (tensors by name), or belongs to a Grid4D model.

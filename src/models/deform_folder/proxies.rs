@@ -19,20 +19,22 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::{Deformation, FrameSource};
 
-/// Maximum number of frames at which a proxy is compared with its target.
+/// Maximum number of frames at which a proxy (Gaussian that replaces merged ones) is compared with its target state.
 const SAMPLED_FRAMES: usize = 16;
-/// Maximum number of members of a cluster whose positions are candidates for the position of the proxy.
+/// Maximum number of members of a cluster (merged Gaussians) whose positions are tried as the position of the proxy,
+/// the Gaussian that replaces the cluster. The mean of all members is tried as well.
 const MAX_CANDIDATES: usize = 4;
-/// Number of Gauss-Newton steps that improve the position of a proxy.
+/// Number of Gauss-Newton steps that improve the position of a proxy (Gaussian that replaces merged ones).
 const STEPS: usize = 2;
-/// Number of times that the scale and rotation of a proxy are corrected toward the target.
+/// Number of times that scale and rotation of a proxy (Gaussian that replaces merged ones) are corrected toward its
+/// target state.
 const CORRECTIONS: usize = 3;
 /// Damping of a Gauss-Newton step: this fraction of the mean of the matrix's diagonal is added to the diagonal. If the
 /// position moves alike in all frames, the matrix is well conditioned; otherwise a shorter step is better.
 const DAMPING: f64 = 1e-3;
 
-/// Returns the stored parameters of the proxies of `clusters`, one row each. They approximate the motion of the
-/// members.
+/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row
+/// each. A proxy approximates the motion of the members of its cluster (the merged Gaussians).
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
@@ -126,8 +128,9 @@ fn squared_distances<L: NetworkMotionModel>(
     Ok(off)
 }
 
-/// Returns `raw` with the position of every proxy moved by one Gauss-Newton step, so that its path comes nearer to its
-/// target. `wanted` holds the target states of all proxies, one entry for each of `frames`.
+/// Returns the stored parameters `raw` of proxies (Gaussians that replace merged ones), with the position of every
+/// proxy moved by one Gauss-Newton step that brings its path nearer to its target. `wanted` holds the target states of
+/// all proxies, one entry for each of `frames`.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &StoredParams,
@@ -160,8 +163,8 @@ fn gauss_newton_step<L: NetworkMotionModel>(
     Ok(better)
 }
 
-/// Sets all stored parameters of the proxies `made` except their positions. `wanted` holds the target states of all
-/// proxies, one entry for each of `frames`.
+/// Sets all stored parameters of the proxies `made` (Gaussians that replace merged ones) except their positions.
+/// `wanted` holds the target states of all proxies, one entry for each of `frames`.
 ///
 /// The parameters start as those of the `leaders` (the most important member of each cluster). Then they are corrected
 /// [`CORRECTIONS`] times: the difference between the target and the state of the proxy, averaged over `frames`, is
@@ -214,8 +217,8 @@ struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squared difference between target and proxy, in log scales and in unit quaternions, summed over frames and
-    /// components.
+    /// Squared difference between target and proxy, in log scales and in unit quaternions, summed over frames and over
+    /// the components of both.
     off: f64,
 }
 

@@ -132,9 +132,9 @@ impl MotionModel for DeformableMotion {
         Ok(())
     }
 
-    /// Returns the derivative of the positions with respect to the stored positions; all other attributes get the
-    /// identity. The shape is not differentiated, because its decomposition into scales and rotation is not continuous
-    /// from frame to frame.
+    /// Returns the derivative of the positions at `time` with respect to the stored positions. For all other attributes
+    /// the derivative counts as the identity. That of rotation and scales is not computed, because the decomposition of
+    /// the covariance into rotation and scales is not continuous from frame to frame.
     fn jacobian(
         &self,
         time: f64,
@@ -189,8 +189,8 @@ impl NetworkMotionModel for DeformableMotion {
     }
 }
 
-/// Returns as vectors the position `x`, the axis w (the first three of the six network outputs) and the translation v
-/// (the last three) of a screw motion.
+/// Returns three vectors of a screw motion: the position `x`, the axis w (first three of the six network outputs), and
+/// the translation v (last three outputs).
 fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }

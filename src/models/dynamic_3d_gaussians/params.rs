@@ -123,12 +123,13 @@ impl Params {
         &self.npz
     }
 
-    /// Returns the value that opens archives of the model in the way in which the model itself was opened.
+    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened.
     pub(super) fn reopener(&self) -> &Reopener {
         &self.reopener
     }
 
-    /// Returns the axis of the array `entry` that counts the Gaussians, and the attribute that its first frame holds.
+    /// Returns how an archive stores the array `entry`: the axis of the array that counts the Gaussians, and the
+    /// attribute that holds the first frame of the array (`None` if no attribute does).
     pub(super) fn archived(entry: &NpzArray) -> (GaussianAxis, Option<Attributes>) {
         let attribute = match entry.name.as_str() {
             MEANS => Some(Attributes::POSITION),

@@ -14,14 +14,14 @@ use crate::passes::{SourceWithDeltas, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Maximum number of frames over which the scales and opacities of proxies are averaged.
+/// Maximum number of frames over which scale and opacity of a proxy (Gaussian that replaces merged ones) are averaged.
 const SAMPLED_FRAMES: usize = 16;
 /// Attributes that are constant in time in this model format: scale and opacity.
 const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
-/// Returns the constant scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]. The moment
-/// matches (Gaussians with the mean and covariance of the members) at sampled frames are averaged: scales by the
-/// geometric mean, opacities by the arithmetic mean.
+/// Returns the constant scales and opacities of one proxy (Gaussian that replaces merged ones) for each of `clusters`,
+/// as rows of [`Proxies::raw`]. The moment matches (Gaussians with the mean and covariance of the members) at sampled
+/// frames are averaged: scales by the geometric mean, opacities by the arithmetic mean.
 ///
 /// # Errors
 /// Fails if frames cannot be read.
@@ -59,7 +59,8 @@ pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) ->
     ))
 }
 
-/// Frames of the compressed model; proxies have the constant scales and opacities computed by [`solve`].
+/// Frames of a compressed model. Its proxies (Gaussians that replace merged ones) have the constant scales and
+/// opacities that [`solve`] computes.
 pub(super) struct MergedSource<'a> {
     merged: MergedSequence<'a>,
     reduction: &'a CompressedModel,
@@ -67,7 +68,7 @@ pub(super) struct MergedSource<'a> {
 }
 
 impl<'a> MergedSource<'a> {
-    /// Creates the frames of the compressed model that `reduction` makes of the Gaussians `params`.
+    /// Creates the frames of the compressed model `reduction`, which is made from the Gaussians in `params`.
     pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
         MergedSource { merged: merged(params, reduction), reduction, info }
@@ -84,8 +85,8 @@ impl<'a> MergedSource<'a> {
         places.enumerate().filter_map(|(row, place)| Some((row, by_output[found(place)?].1))).collect()
     }
 
-    /// Returns a reader that reads the Gaussians `ids` from `reader` and sets the constant scales and opacities of
-    /// proxies.
+    /// Returns a reader that reads the Gaussians `ids` from `reader` and then sets the scales and opacities of proxies
+    /// (Gaussians that replace merged ones) to their constant values.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
         let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
         Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
@@ -111,10 +112,11 @@ impl FrameSource for MergedSource<'_> {
     }
 }
 
-/// Reader that replaces the scales and opacities of proxies (merged Gaussians) by their constant values.
+/// Reader that replaces the scales and opacities of proxies (Gaussians that replace merged ones) by their constant
+/// values.
 struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    /// For each proxy that is read, its row in the output and the index of its cluster.
+    /// For each proxy that is read: its row among the Gaussians that are read, and the index of its cluster.
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }

@@ -224,8 +224,8 @@ pub(in crate::models) fn with_file_names_only(text: &str, path: &Path) -> Result
     Ok(out + &text[end..])
 }
 
-/// Returns a Python expression in which strings are replaced by their last path components: all strings if `all`, else
-/// only absolute paths.
+/// Returns the Python expression `expression` with strings replaced by their last path components: all strings if
+/// `all`, else only absolute paths.
 fn without_paths(expression: &str, all: bool) -> String {
     let mut out = String::with_capacity(expression.len());
     let mut rest = expression;

@@ -92,8 +92,8 @@ fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     pickle.item(pickle.root(), "splats").is_some_and(|splats| splat_tensor(pickle, splats, "means").is_some())
 }
 
-/// Returns the tensor `name` of the state dict `splats`; its name may have the prefix that a wrapper of the parameters
-/// adds.
+/// Returns the tensor `name` of the state dict `splats`. The tensor is also found under the prefix `module.`, which a
+/// wrapper of the parameters adds to names.
 fn splat_tensor(pickle: &Pickle, splats: NodeId, name: &str) -> Option<NodeId> {
     pickle.item(splats, name).or_else(|| pickle.item(splats, &format!("module.{name}")))
 }

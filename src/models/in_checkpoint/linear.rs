@@ -14,12 +14,13 @@ use crate::passes::{GAUSSIANS_PER_BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum number of frames at which proxies are compared with their members.
+/// Maximum number of frames at which proxies (Gaussians that replace merged ones) are compared with the merged
+/// Gaussians.
 const SAMPLED_FRAMES: usize = 48;
-/// Minimum product of opacity and temporal window that a proxy must have at a frame; frames with a smaller product are
-/// not used for matching.
+/// Minimum product of opacity and temporal window that a proxy (Gaussian that replaces merged ones) must have at a
+/// frame; frames with a smaller product are not used for matching.
 const MIN_VISIBLE: f64 = 1e-4;
-/// Minimum and maximum opacity of a proxy. They bound its opacity logit.
+/// Minimum and maximum opacity of a proxy (Gaussian that replaces merged ones). They bound its opacity logit.
 const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
 /// Straight path with a Gaussian window in time. Position: x(t) = position + velocity·(t − center). Factor of the

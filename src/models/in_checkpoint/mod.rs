@@ -41,8 +41,8 @@ const MAX_COPIED_BYTES: u64 = 1 << 20;
 
 /// Motion model that can compute the stored parameters of proxies (Gaussians that replace merged ones).
 pub(super) trait ProxyRule: MotionModel {
-    /// Returns the stored parameters of one proxy per cluster. They have not been compared with the members (merged
-    /// Gaussians) yet.
+    /// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) per cluster. The caller compares
+    /// the proxies with the merged Gaussians, and may refuse them.
     ///
     /// # Errors
     /// Fails if frames cannot be evaluated.
@@ -136,8 +136,8 @@ impl<L: ProxyRule> CheckpointModel<L> {
         found
     }
 
-    /// Returns the value that opens archives of the model in the way in which the model itself was opened. Fails if
-    /// there is none.
+    /// Returns the reopener of the model, which opens archives of the model as the model itself was opened. Fails if
+    /// the model has none.
     fn reopener(&self) -> Result<&Reopener> {
         self.description.reopener.as_ref().ok_or_else(|| Error::internal("a model does not know how it was opened"))
     }
@@ -309,8 +309,9 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     }
 }
 
-/// Writes the compressed model `reduction` of `model` to `path` as `kind`, an output with frames. Its motion is stored
-/// without a fit if `kind` can do so. Readers keep at most `held` frames. Returns notes for the user.
+/// Writes the compressed model `reduction` of `model` to `path` as `kind`, any kind of output except
+/// [`OutputKind::Model`]. If `kind` can store the motion of the model as it is, the motion is not fitted. Readers keep
+/// at most `held` frames in memory. Returns notes for the user.
 ///
 /// # Errors
 /// Fails if the format cannot hold the values or the file cannot be written.
@@ -363,8 +364,8 @@ pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns number and path of each file of a folder named `<prefix><number><suffix>`, in increasing order of the
-/// numbers.
+/// Returns the number and the path of each file in `folder` that is named `<prefix><number><suffix>`, in increasing
+/// order of the numbers.
 pub(super) fn numbered_files(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let number = |name: &str| name.strip_prefix(prefix)?.strip_suffix(suffix)?.parse::<u32>().ok();

@@ -165,8 +165,8 @@ pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &s
 }
 
 impl RowTensors {
-    /// Returns name, node in the checkpoint and meaning of the values of a row, of every tensor that holds parameters
-    /// of Gaussians.
+    /// Returns, for every tensor that holds parameters of Gaussians, its name, its node in the checkpoint, and the
+    /// meaning of each value of a row (the values of one Gaussian).
     pub(in crate::models) fn params(&self) -> impl Iterator<Item = (&str, NodeId, &[RowElement])> {
         self.params.iter().map(|param| (&*param.name, param.tensor.id, &param.planes[..]))
     }

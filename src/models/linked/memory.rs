@@ -29,9 +29,10 @@ pub(super) struct Sizes {
     pub(super) frame_gaussians: u64,
     /// SH degree of the Gaussians.
     pub(super) sh_degree: usize,
-    /// Number of tracks that linking found, before any of them are joined.
+    /// Number of tracks (Gaussians followed through frames) that linking found, before any of them are joined.
     pub(super) linked: u64,
-    /// Maximum, over all frames, of the number of tracks that may continue in the next frame.
+    /// Number of tracks (Gaussians followed through frames) that may continue in the next frame: the maximum over all
+    /// frames.
     pub(super) live_tracks: u64,
 }
 
@@ -63,14 +64,16 @@ impl Sizes {
         [self.linking(), self.holding(), self.packing()].into_iter().max().unwrap_or(0)
     }
 
-    /// Returns the bytes of memory that the tracks take while the frames are open. Each track takes memory for its
-    /// first frame and row, the joined track it belongs to, and its constant attributes.
+    /// Returns the bytes of memory that the tracks (Gaussians followed through frames) take while the frames are open.
+    /// Each track takes memory for its first frame and row, the joined track it belongs to, and its constant
+    /// attributes.
     pub(super) fn open(&self) -> u64 {
         (8 + 4 + size_of::<Attributes>() as u64) * self.linked
     }
 
-    /// Returns the bytes of memory that linking takes: a frame and its compared attributes, the tracks that may
-    /// continue, and for every track the row of its first frame and its last state.
+    /// Returns the bytes of memory that linking frames into tracks (Gaussians followed through frames) takes: a frame
+    /// and its compared attributes, the tracks that may continue, and for every track the row of its first frame and
+    /// its last state.
     fn linking(&self) -> u64 {
         let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;
         let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_OPEN_TRACK) as u64;
@@ -96,8 +99,9 @@ impl Sizes {
         self.open() + 2 * 8 * self.linked + summing.max(rendering)
     }
 
-    /// Returns the bytes of memory that packing takes: a block of frames, the last row of each track, and for each
-    /// thread a tile (block of Gaussians × frames) of every column.
+    /// Returns the bytes of memory that packing tracks (Gaussians followed through frames) into a container takes: a
+    /// block of frames, the last row of each track, and for each thread a tile (block of Gaussians × frames) of every
+    /// column.
     fn packing(&self) -> u64 {
         let frames = self.frame_block() as u64;
         let blocks = (GAUSSIAN_BLOCK as u64).min(self.linked) * (3 * frames + 4) * self.state();

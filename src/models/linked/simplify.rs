@@ -25,8 +25,9 @@ const VIEWS: usize = 3;
 /// tracks of one Gaussian, the second is half as large.
 const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
-/// Joins tracks that seem to be the same Gaussian. Tries the proposals of `joiner` in order and keeps the first one
-/// with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if the joiner proposed to join any tracks.
+/// Joins tracks (Gaussians followed through frames) that seem to be the same Gaussian. Tries the proposals of `joiner`
+/// in order and keeps the first one with which renders reach [`MIN_PSNR_DB`]. Returns a note for the user if the joiner
+/// proposed to join any tracks.
 ///
 /// # Errors
 /// Fails if a frame cannot be read.
@@ -92,8 +93,9 @@ pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<O
     Ok(None)
 }
 
-/// Returns sums of the attributes over all frames for each track of `range`. Reads only frames from `born` on, because
-/// no track of `range` begins before frame `born`.
+/// Returns, for each track of `range` (Gaussian followed through frames), the sums over all frames from which the means
+/// of its attributes are computed. Reads only frames from `born` on, because no track of `range` begins before frame
+/// `born`.
 fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
     let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
@@ -106,8 +108,8 @@ fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<Track
     Ok(sums)
 }
 
-/// Returns the PSNR in dB of renders with joined tracks against renders with separate ones; `None` if no frame has a
-/// track with several Gaussians, which would be blended into one.
+/// Returns the PSNR in dB of renders with joined tracks (Gaussians followed through frames) against renders with
+/// separate tracks. Returns `None` if no frame has a track with several Gaussians, which would be blended into one.
 fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {

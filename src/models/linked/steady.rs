@@ -22,9 +22,9 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Attributes, Gaussians};
 
-/// Attributes that may become constant along a track. Positions always move.
+/// Attributes that may become constant along a track (Gaussian followed through frames). Positions always vary.
 const STEADY_COLUMNS: Attributes = Attributes::all().difference(Attributes::POSITION);
-/// Maximum number of tracks whose means a thread computes together.
+/// Maximum number of tracks (Gaussians followed through frames) whose means a thread computes together.
 pub(super) const BATCH: usize = 1 << 16;
 
 /// Maximum root mean square deviation from the mean, along a track, of an attribute that becomes constant.
@@ -38,22 +38,23 @@ pub(super) struct Bound {
 
 /// For each track (Gaussian followed through frames) the attributes that are constant, and their values.
 pub(super) struct Steady {
-    /// Constant attributes of every track, by index of the track.
+    /// Attributes that are constant along each track (Gaussian followed through frames), by index of the track.
     columns: Vec<Attributes>,
     /// Means of the attributes [`STEADY_COLUMNS`] over all frames, track by track, component by component.
     means: Spill,
     sh_degree: usize,
 }
 
-/// Constant attributes of some tracks, and their values.
+/// Attributes that are constant along some tracks (Gaussians followed through frames), and their values.
 pub(super) struct HeldMeans {
     columns: Vec<Attributes>,
     values: Gaussians,
 }
 
 impl Steady {
-    /// Finds, for each of `count` tracks, the attributes whose root mean square deviation from their mean over the
-    /// frames is at most `bound`. `sums` returns the [`TrackSums`] over all frames for a range of tracks.
+    /// Finds, for each of `count` tracks (Gaussians followed through frames), the attributes whose root mean square
+    /// deviation from their mean over the frames is at most `bound`. `sums` returns the [`TrackSums`] over all frames
+    /// for a range of tracks.
     ///
     /// # Errors
     /// Fails if `sums` fails or a write to the folder `scratch` fails.
@@ -77,8 +78,8 @@ impl Steady {
         Ok(Steady { columns, means: means.finish()?, sh_degree })
     }
 
-    /// Returns the fraction of all tracks that have constant colors, and the same for scales, rotations and opacities,
-    /// in this order.
+    /// Returns the fraction of all tracks (Gaussians followed through frames) whose colors are constant, then the
+    /// fractions with constant scales, constant rotations and constant opacities.
     pub(super) fn parts(&self) -> [f64; 4] {
         [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
@@ -116,8 +117,8 @@ impl Steady {
 }
 
 impl HeldMeans {
-    /// Writes the values of constant attributes to `state`. Each pair of `places` is the index of a track in this list
-    /// of tracks, and the row of that track in `state`.
+    /// Writes the values of constant attributes to `state`. Each pair in `places` is the index of a track within this
+    /// list of tracks (Gaussians followed through frames), and the row of that track in `state`.
     pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
         for column in STEADY_COLUMNS.iter() {
@@ -174,7 +175,8 @@ impl TrackSums {
         self.opacity.len()
     }
 
-    /// Adds the Gaussian in row `at` of `state` to the sums of `track`, as its state in one frame.
+    /// Adds one frame to the sums of track `track` (Gaussian followed through frames). The state of the track in this
+    /// frame is the Gaussian in row `at` of `state`.
     pub(super) fn add(&mut self, track: usize, state: &Gaussians, at: usize) {
         let [logit] = state.opacity_logit.row(at);
         let alpha = 1.0 / (1.0 + (-f64::from(logit)).exp());

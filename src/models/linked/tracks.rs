@@ -19,31 +19,33 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend_rows};
 
-/// Opacity logit of a track in frames where it is absent; the opacity is then 4·10⁻¹⁸.
+/// Opacity logit of a track (Gaussian followed through frames) in frames where it is absent; the opacity is then
+/// 4·10⁻¹⁸.
 const ABSENT_LOGIT: f32 = -40.0;
 
-/// Row of a Gaussian in the file of a frame, and the track to which it belongs.
+/// Row of a Gaussian in the file of a frame, and the track (Gaussian followed through frames) to which it belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct TrackedRow {
     pub(super) track: u32,
     pub(super) row: u32,
 }
 
-/// Frame, and row in the file of that frame, where a track is present.
+/// Place of a track (Gaussian followed through frames) in one frame: number of the frame, and row in the file of that
+/// frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TrackPosition {
     pub(super) frame: u32,
     row: u32,
 }
 
-/// Frames, and the track to which each Gaussian of each frame belongs. If tracks are joined, several Gaussians of a
-/// frame may belong to one track.
+/// Frames, and the track (Gaussian followed through frames) to which each Gaussian of each frame belongs. If tracks are
+/// joined, several Gaussians of a frame may belong to one track.
 pub(super) struct LinkedTracks {
     frames: PlyFrames,
     count: usize,
-    /// Maximum, over all frames, of the number of linked tracks that may continue in the next frame.
+    /// Number of linked tracks that may continue in the next frame: the maximum over all frames.
     live_tracks: usize,
-    /// For each linked track the index of the joined track to which it belongs, if tracks are joined.
+    /// For each linked track the index of the joined track to which it belongs; `None` if no tracks are joined.
     joined: Option<Vec<u32>>,
     /// Attributes that are constant along tracks, with their values; `None` if there are none.
     steady: Option<Steady>,
@@ -55,7 +57,7 @@ pub(super) struct LinkedTracks {
     starts: Vec<u64>,
 }
 
-/// Number of frames in which each track is present, and frames that need blending.
+/// Number of frames in which each track (Gaussian followed through frames) is present, and frames that need blending.
 pub(super) struct TrackLengths {
     /// Number of frames in which each track is present, by index of the track.
     frames_per_track: Vec<u32>,
@@ -64,7 +66,8 @@ pub(super) struct TrackLengths {
 }
 
 impl TrackLengths {
-    /// Returns the median, over all tracks, of the number of frames in which a track is present.
+    /// Returns the median length of a track (Gaussian followed through frames): the number of frames in which it is
+    /// present.
     pub(super) fn median(mut self) -> u32 {
         let middle = self.frames_per_track.len() / 2;
         if self.frames_per_track.is_empty() { 0 } else { *self.frames_per_track.select_nth_unstable(middle).1 }
@@ -77,7 +80,7 @@ pub(super) struct LinkingResult {
     states: u64,
     /// Numbers of the frames that begin a new scene: no track continues into them.
     cuts: Vec<usize>,
-    /// Number of links between Gaussians that were ambiguous and therefore not made.
+    /// Number of links between Gaussians of different frames that were ambiguous and therefore not made.
     doubtful: usize,
 }
 
@@ -175,8 +178,8 @@ impl LinkedTracks {
         Ok((tracks, LinkingResult { states: end, cuts, doubtful }, linker))
     }
 
-    /// Joins the linked tracks, so that `count` tracks remain. Entry i of `joined_tracks` is the index of the joined
-    /// track to which the linked track i belongs.
+    /// Joins the linked tracks (Gaussians followed through frames), so that `count` tracks remain. Entry i of
+    /// `joined_tracks` is the index of the joined track to which the linked track i belongs.
     pub(super) fn join(&mut self, joined_tracks: Vec<u32>, count: usize) {
         (self.joined, self.count) = (Some(joined_tracks), count);
     }
@@ -191,14 +194,13 @@ impl LinkedTracks {
         self.steady.as_ref()
     }
 
-    /// Separates the tracks that [`LinkedTracks::join`] joined.
+    /// Undoes [`LinkedTracks::join`]: the tracks (Gaussians followed through frames) are separate again.
     pub(super) fn undo_join(&mut self) {
         (self.joined, self.count) = (None, self.births.len());
     }
 
-    /// Counts the frames in which each track is present, and returns the counts with the frames that have several
-    /// Gaussians of one track.
-    ///
+    /// Counts the frames in which each track (Gaussian followed through frames) is present. Returns the counts, and the
+    /// frames that have several Gaussians of one track.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -229,8 +231,8 @@ impl LinkedTracks {
         Ok(tracks)
     }
 
-    /// Returns for each track the first frame in which it is present and its row in the file of that frame. Tracks are
-    /// in the order of their first frames.
+    /// Returns for each track (Gaussian followed through frames) the first frame in which it is present, and its row in
+    /// the file of that frame. Tracks are in the order of their first frames.
     pub(super) fn first(&self) -> Vec<TrackPosition> {
         match &self.joined {
             None => self.births.clone(),
@@ -262,7 +264,8 @@ impl LinkedTracks {
         &self.frames
     }
 
-    /// Returns the number of tracks (joined ones if tracks are joined).
+    /// Returns the number of tracks (Gaussians followed through frames); if tracks are joined, the number of joined
+    /// ones.
     pub(super) fn count(&self) -> usize {
         self.count
     }
@@ -276,8 +279,9 @@ impl LinkedTracks {
         Ok(rows)
     }
 
-    /// Reads the Gaussians in `rows`, which are sorted by track, from the `file` of a frame into `state`. Gaussians of
-    /// one track are blended into the first of them. Returns for each track the index in `rows` of its first row.
+    /// Reads the Gaussians in `rows`, which are sorted by track, from `file`, the file of a frame, into `state`. If a
+    /// track has several Gaussians, they are blended into the first of them. Returns for each track the index in `rows`
+    /// of its first row.
     ///
     /// # Errors
     /// Fails if a read fails.
@@ -363,8 +367,8 @@ struct FrameBlock<'a> {
     files: &'a [Ply],
     /// For each frame of the block the rows of its Gaussians, sorted by track.
     rows: &'a [Vec<TrackedRow>],
-    /// For each track the frame and row of its last Gaussian before this block; if the track begins later, those of its
-    /// first Gaussian.
+    /// For each track the frame and row of its last Gaussian before this block. For a track that begins later: the
+    /// frame and row of its first Gaussian.
     held: &'a [TrackPosition],
 }
 
@@ -386,8 +390,8 @@ impl FrameSource for FrameBlock<'_> {
 }
 
 impl FrameBlock<'_> {
-    /// Writes to `state` the states that the tracks of `range` have just before the first frame of this block of
-    /// frames. A track that has not begun yet gets the state at its beginning.
+    /// Writes to `state` the states that the tracks of `range` (Gaussians followed through frames) have just before the
+    /// first frame of this block of frames. A track that has not begun yet gets the state at its beginning.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -424,7 +428,8 @@ struct TrackReader<'a> {
 }
 
 impl TrackReader<'_> {
-    /// Resets `state` to the states just before the first frame of the block.
+    /// Resets the reader to the beginning of its block of frames: sets `state` to the states of the tracks just before
+    /// the first frame of the block.
     fn begin(&mut self) -> Result<()> {
         self.block.hold(self.range.clone(), &mut self.state)?;
         if let Some(means) = &self.means {

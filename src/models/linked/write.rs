@@ -21,8 +21,8 @@ const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {
     /// Writes one file per frame into `folder`. A proxy (Gaussian that replaces merged tracks) is present in a frame if
-    /// one of its members is, and takes the row of the first of them. Several Gaussians of a track become one, in the
-    /// row of the first. Attributes that are constant along a track have their means.
+    /// one of its members is present, and takes the row of the first such member. Several Gaussians of a track become
+    /// one, in the row of the first. Attributes that are constant along a track have their mean values.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.

@@ -254,7 +254,7 @@ impl<L: MotionModel> PreparedBlock<L> {
         motion_model.state(time, &self.raw, &self.prepared, want, out)
     }
 
-    /// Computes the same as [`MotionModel::state`], compiled for AVX2 instructions.
+    /// Calls [`MotionModel::state`] in code that is compiled for AVX2 instructions.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn state_avx2(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {

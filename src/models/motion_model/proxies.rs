@@ -11,13 +11,14 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum difference in opacity, at any frame, between a proxy and the moment match of its members (the Gaussian with
-/// the mean and covariance of the merged Gaussians).
+/// Maximum difference in opacity, at any frame, between a proxy (Gaussian that replaces merged ones) and the moment
+/// match of its members (the Gaussian with the mean and covariance of the merged Gaussians).
 const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 
-/// Returns the proxies that `propose` computes for `clusters`, one row each. A proxy is refused if at any frame its
-/// state differs by more than `max_drift` in position or 0.1 in opacity from the moment match of its members (the
-/// Gaussian with the mean and covariance of their mixture). Frames in which both are invisible are not compared.
+/// Returns the proxies (Gaussians that replace merged ones) that `propose` computes for `clusters`, one row each. A
+/// proxy is refused if at any frame its state differs by more than `max_drift` in position or 0.1 in opacity from the
+/// moment match of its members (the Gaussian with the mean and covariance of their mixture). Frames in which both are
+/// invisible are not compared.
 ///
 /// # Errors
 /// Fails if `propose` fails or frames cannot be evaluated.

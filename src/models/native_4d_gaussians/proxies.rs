@@ -15,11 +15,12 @@ use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Ridge term of the fit of colors along time, as a fraction of the total weight of the frames. It keeps the
+/// Ridge term of the fit of a proxy's colors along time, as a fraction of the total weight of the frames. It keeps the
 /// coefficients of the cosine terms near 0 if the frames do not distinguish these terms from the constant term.
 const RIDGE: f64 = 1e-3;
 
-/// Returns the stored parameters of the proxies of `clusters`, one row each.
+/// Returns the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`, one row
+/// each.
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.

@@ -199,8 +199,8 @@ impl CachedNodes {
     }
 }
 
-/// Returns for each Gaussian the network's output for its nodes (rows of `output`), summed with the node weights
-/// `shares`. `each` is the number of nodes per Gaussian.
+/// Returns for each Gaussian the network's outputs for the nodes that move it, summed with the weights of the nodes.
+/// `output` has one row per node. `shares` holds node indices and weights, `each` of them per Gaussian.
 fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> AttributeValues {
     let mut out = AttributeValues::zeros(output.width(), shares.len() / each.max(1));
     for c in 0..output.width() {

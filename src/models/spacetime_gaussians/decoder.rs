@@ -16,7 +16,7 @@ const INPUTS: usize = 12;
 /// Number of units in the hidden layer of the network.
 const HIDDEN: usize = 6;
 
-/// Function applied to a color as the last step.
+/// Last step of the computation of a color: function that is applied to each of its three values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColorActivation {
     /// Logistic function, 1/(1 + exp(−x)).
@@ -28,7 +28,8 @@ pub(super) enum ColorActivation {
 }
 
 impl ColorActivation {
-    /// Returns the function that has the name `name` as `rgbfunction` in `cfg_args`; `None` for unknown names.
+    /// Returns the function that `cfg_args` selects by the value `name` of its key `rgbfunction`; `None` for unknown
+    /// names.
     pub(super) fn named(name: &str) -> Option<ColorActivation> {
         match name {
             "sandwich" => Some(ColorActivation::Sigmoid),
@@ -38,7 +39,7 @@ impl ColorActivation {
         }
     }
 
-    /// Returns the color value after the function is applied to `x`.
+    /// Returns the color value that results from applying the function to `x`.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
             ColorActivation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
@@ -48,7 +49,7 @@ impl ColorActivation {
     }
 }
 
-/// Weights of the color network, and the function applied last.
+/// Network that computes the color of a pixel from features: its weights, and the function applied to its result.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],

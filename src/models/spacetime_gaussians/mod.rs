@@ -120,7 +120,7 @@ struct SpacetimeConfig {
 }
 
 impl SpacetimeConfig {
-    /// Reads the used values from the `cfg_args` file at `path`.
+    /// Reads the values that opening a model needs from the `cfg_args` file at `path`.
     fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;

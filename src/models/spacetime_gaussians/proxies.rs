@@ -21,18 +21,20 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum ratio between the widths of the temporal windows of a member and of the proxy. With a larger ratio, or with
-/// centers further apart than half of the proxy's width, the windows count as different.
+/// Maximum ratio between the widths of the temporal windows of a proxy (Gaussian that replaces merged ones) and of a
+/// member (merged Gaussian). With a larger ratio, or with centers further apart than half of the proxy's width, the
+/// windows count as different.
 const MAX_WIDTH_RATIO: f64 = 1.5;
 /// Minimum value of a temporal window, whose maximum is 1. Times at which its value is smaller are ignored.
 const MIN_WINDOW: f64 = 0.05;
-/// Maximum number of times at which a proxy's shape and opacity are compared with those of its members.
+/// Maximum number of times at which shape and opacity of a proxy (Gaussian that replaces merged ones) are compared with
+/// those of the merged Gaussians.
 const SAMPLED_TIMES: usize = 12;
-/// Minimum difference of a proxy's opacity from 0 and from 1.
+/// Minimum difference of the opacity of a proxy (Gaussian that replaces merged ones) from 0 and from 1.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// Computes the stored parameters of one proxy for each of `clusters`. `activation` turns the first three features of
-/// the full model into colors.
+/// Computes the stored parameters of one proxy (Gaussian that replaces merged ones) for each of `clusters`.
+/// `activation` turns the first three features of the full model into colors.
 ///
 /// # Errors
 /// Fails if states cannot be evaluated.
@@ -55,9 +57,9 @@ struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
     raw: StoredParams,
     prepared: <Spacetime as MotionModel>::Prepared,
-    /// Weight in the proxy, and motion, of each member.
+    /// For each member its weight in the proxy (Gaussian that replaces the members), and its motion.
     motions: Vec<(f64, SpacetimeMotion)>,
-    /// Row in `raw` and weight in the proxy of each member.
+    /// For each member its row in `raw`, and its weight in the proxy (Gaussian that replaces the members).
     rows: Vec<(u32, f64)>,
     /// Row in `raw` of the leader, the member to which the others were joined.
     leader: u32,
@@ -96,7 +98,7 @@ impl ClusterMembers<'_> {
     }
 }
 
-/// Computes the stored parameters of the proxy of `cluster`, in one row.
+/// Computes the stored parameters of the proxy (Gaussian that replaces merged ones) of `cluster`, in one row.
 fn proxy_parameters(
     model: &MotionModelFrames<Spacetime>,
     cluster: &Cluster,
@@ -137,15 +139,15 @@ fn proxy_parameters(
     Ok(out)
 }
 
-/// Returns the weighted mean, over the members, of a parameter. `plane` holds its value for each member. If all values
-/// are equal, the result is exactly this value.
+/// Returns the mean of a parameter over the members of a cluster (Gaussians to be merged), by weight. `plane` holds the
+/// value of the parameter for each member. If all values are equal, the result is exactly this value.
 fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
-/// Returns whether the windows of `members` differ so much from that of `proxy` that different members are visible at
-/// different times.
+/// Returns whether the temporal windows of `members` differ so much from that of `proxy` that different members are
+/// visible at different times. Each member is a weight and a motion.
 fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MAX_WIDTH_RATIO.ln();
@@ -153,9 +155,10 @@ fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -
     })
 }
 
-/// Returns the state that the proxy should approximate at each frame: the mean of the members, weighted by their
-/// temporal windows. `recentered` holds the weights of the members and their motions around the center of the proxy.
-/// Quaternions have the sign that brings them nearest to the quaternion of the motion `mean`.
+/// Returns the states that the proxy (Gaussian that replaces `members`) should approximate at the frames: the means of
+/// the members, weighted by their temporal windows. `recentered` holds the weights of the members and their motions
+/// around the center of the proxy. Quaternions have the sign that brings them nearest to the quaternion of the motion
+/// `mean`.
 fn target_states(
     members: &ClusterMembers<'_>,
     recentered: &[(f64, SpacetimeMotion)],
@@ -182,8 +185,9 @@ fn target_states(
     members.model.info().times.iter().filter_map(of_time).collect()
 }
 
-/// Returns the natural logarithms of the scales of the proxy, and sets the rotation of `motion` to the axes along which
-/// these scales are measured. `states` holds the states of the members at each of `times`.
+/// Returns the natural logarithms of the scales of the proxy (Gaussian that replaces `members`), and sets the rotation
+/// of `motion` to the axes along which these scales are measured. `states` holds the states of the members at each of
+/// `times`.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {

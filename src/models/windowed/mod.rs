@@ -41,17 +41,17 @@ struct WindowedModel<L: ProxyRule> {
     own: OutputKind,
     /// Origin of the time stamps of frames: whether frames can be at any time.
     timing: TimeOrigin,
-    /// Repairs and guesses made while opening.
+    /// Notes for the user: repairs and guesses made while the file was opened.
     notes: Vec<String>,
     model: MotionModelFrames<L>,
-    /// Opens the `.ftgs.ply` in an archive of this file in the way in which the file itself was opened. `None` for
+    /// Reopener, which opens the `.ftgs.ply` in an archive of this file as the file itself was opened. `None` for
     /// Gaussians without windows of time, which a `.ftgs.ply` cannot hold; their archives hold frames.
     reopener: Option<Reopener>,
 }
 
 impl<L: ProxyRule> WindowedModel<L> {
-    /// Returns the value that opens the `.ftgs.ply` in an archive of this file in the way in which the file itself was
-    /// opened. Fails if the archives of this file hold frames instead.
+    /// Returns the reopener, which opens the `.ftgs.ply` in an archive of this file as the file itself was opened.
+    /// Fails if the archives of this file hold frames instead.
     fn reopener(&self) -> Result<&Reopener> {
         self.reopener.as_ref().ok_or_else(|| Error::internal("an archive of frames was written as a model"))
     }

@@ -50,7 +50,8 @@ pub(in crate::models) const TSOG: ModelFormat = ModelFormat {
     },
 };
 
-/// Returns whether the file is named `.tsog`, or is a ZIP archive with the content of one.
+/// Returns whether the file is named `.tsog`, or is a ZIP archive with the content of a `.tsog` file. `head` holds the
+/// first bytes of the file.
 fn is_named_or_zip(path: &Path, head: &[u8]) -> bool {
     let is_named = path.extension().is_some_and(|found| found.eq_ignore_ascii_case("tsog"));
     is_named || (head.starts_with(b"PK\x03\x04") && is_tsog(path))

@@ -40,8 +40,9 @@ const NAME: &str = "archive";
 /// Maximum quantization step of a group of values (an attribute or a tensor), in standard deviations of the values; a
 /// coarser step would round nearly all values to the same number.
 const MAX_STEP: f64 = 4.0;
-/// Minimum standard deviation of the values of a column from which its quantization step follows, as a fraction of the
-/// largest magnitude of the values.
+/// Minimum standard deviation that is assumed when the quantization step of an additional column of the Gaussians is
+/// chosen, as a fraction of the largest magnitude in the column. With it, a column of equal values keeps about the
+/// precision of f32.
 const MIN_RELATIVE_DEVIATION: f64 = 1e-6;
 /// Octaves (doublings) by which the initial quantization steps are made coarser to estimate the size of an archive
 /// without rendering. The estimate decides how many Gaussians a result of at most `--size` bytes keeps; with this
@@ -105,8 +106,8 @@ impl ValueGroup {
         }
     }
 
-    /// Returns the number of initial quantization steps in one standard deviation of the values. Initial steps are
-    /// finer than most final ones.
+    /// Returns how many initial quantization steps make up one standard deviation of the values of this group. Initial
+    /// steps are finer than most final ones.
     fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -271,9 +272,9 @@ fn check_coarsest(encoded: EncodedArchive, most: u64, gaussians: usize) -> Resul
 /// Quantization steps of all groups of values (attributes and tensors) in the content of an archive.
 struct Grids {
     groups: Vec<ValueGroup>,
-    /// Standard deviation of the values of each group in `groups`.
+    /// Standard deviation of the values of each group (attribute, column or tensor) in `groups`.
     deviations: Vec<f64>,
-    /// Log2 of the quantization step of each group in `groups`.
+    /// Log2 of the quantization step of each group (attribute, column or tensor) in `groups`.
     octaves: Vec<f64>,
     /// For each tensor, by name: offsets, in eighths of an octave, by which the steps of its channels (or of its rows
     /// and columns) differ from the step of the tensor. See [`TensorSteps::channels`].
@@ -343,8 +344,8 @@ impl Grids {
         Ok(measured)
     }
 
-    /// Returns for each group of values the squared error of renders if only this group is quantized and all others are
-    /// exact. Changes `content` for every measurement and restores it afterward.
+    /// Returns for each group of values (attribute, column or tensor) the squared error of renders if only this group
+    /// is quantized and all others are exact. Changes `content` for every measurement and restores it afterward.
     fn errors(
         &self,
         scene: &Scene,

@@ -55,7 +55,8 @@ pub(crate) struct ShDegreeStage {
     pub margin: f64,
 }
 
-/// Adds the stage that drops SH degrees to `stages` if the output may have a lower SH degree than the input.
+/// Adds the stage that drops SH degrees to `stages` if the recipe asks for the lowest SH degree with which renders
+/// hardly change, and if the output is not an archive.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = ShDegreeStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);
@@ -84,8 +85,9 @@ impl Stage for ShDegreeStage {
 }
 
 impl ShDegreeStage {
-    /// Returns the stage if the output may have a lower SH degree than the input; otherwise `None`. An archive needs no
-    /// such stage, because quantization already removes coefficients that do not change renders.
+    /// Returns the stage that drops SH degrees. Returns `None` unless the recipe asks for the lowest SH degree with
+    /// which renders hardly change. Also returns `None` for an archive, because quantization already removes
+    /// coefficients that do not change renders.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == ShDegreeRule::Needed;

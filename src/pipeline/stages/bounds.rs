@@ -149,8 +149,8 @@ pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
     stored_bytes(scene, source, widened(&initial_bounds(source)?, ESTIMATE_OCTAVES))
 }
 
-/// Writes `source` to a scratch file with the error bounds `widths`, one per attribute. Returns the size of the file in
-/// bytes.
+/// Writes the frames of `source` to a scratch file, as a container with the error bounds `widths`, one per attribute.
+/// Returns the size of the file in bytes.
 fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");

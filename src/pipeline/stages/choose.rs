@@ -182,8 +182,8 @@ mod tests {
         mean_psnr(scene, &[], compressed, &select_evenly(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
-    /// Merges the Gaussians of a scene down to `target`, if given, and runs the stage. Returns the merged model, the
-    /// chosen model, and the journal.
+    /// Merges the Gaussians of a scene down to `target`, if given, and runs the stage `choose` on the merged model.
+    /// Returns the merged model, the model that the stage chose, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,

@@ -61,8 +61,8 @@ impl Stage for FieldPrecisionStage {
 }
 
 impl FieldPrecisionStage {
-    /// Returns the stage if the output `kind` is a model folder and the recipe of `request` allows half precision;
-    /// otherwise `None`.
+    /// Returns the stage that chooses the precision of the deformation field. Returns `None` unless the output `kind`
+    /// is a model folder and the recipe of `request` allows half precision.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == FieldPrecision::Half)
@@ -133,8 +133,8 @@ impl FieldPrecisionStage {
     }
 }
 
-/// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result.
-/// It is `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]; `result` is the PSNR of the result against the original.
+/// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result:
+/// `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]. `result`: PSNR of the result against the original, dB.
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }

@@ -45,7 +45,7 @@ pub struct MeasureStages {
 }
 
 impl MeasureStages {
-    /// Returns the stages for the request and the input in `planning`.
+    /// Returns the stages that compute statistics and scores, for the request and the input in `planning`.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> MeasureStages {
         let recipe = &planning.request.recipe;
         let mut measure = MeasureStages::new(recipe, planning.input.has_cameras, planning.user.clone());
@@ -61,8 +61,9 @@ impl MeasureStages {
         measure
     }
 
-    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own, rather than
-    /// virtual ones placed by the program. `user` states which Gaussians the user wants to keep or to drop in any case.
+    /// Returns the stages that compute statistics and scores by the parameters of `recipe`. `has_cameras` tells whether
+    /// the scene has cameras of its own, rather than virtual ones placed by the program. `user` states which Gaussians
+    /// the user wants to keep or to drop in any case.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> MeasureStages {
         MeasureStages {
             scan: ScanStage { recipe: recipe.scan.clone(), can_be_partial: false },

@@ -226,9 +226,9 @@ impl MergeStage {
     }
 }
 
-/// Returns about the largest number m, up to `all`, for which merging leaves at most `target` Gaussians. Here m is the
-/// number of survivors (Gaussians that pruning keeps) on which merging runs; m = `target` always satisfies the
-/// condition. `merged` returns the number of Gaussians that merging leaves of m survivors.
+/// Returns about the largest number m, from `target` to `all`, such that merging m survivors (Gaussians left by
+/// pruning) leaves at most `target` Gaussians. The callback `merged` merges m survivors and returns the number of
+/// Gaussians that are left. m = `target` always satisfies the condition.
 ///
 /// With more survivors as input, merging leaves more Gaussians, except for small dips, so the interval of possible m is
 /// narrowed by the secant method. The search ends early if the number left is below `target` by at most a thousandth of
@@ -261,7 +261,7 @@ struct Trial<'a> {
     /// Merge parameters of the recipe, with the motion noise raised to at least twice the distance between neighboring
     /// f32 values at the scene's largest coordinate.
     merge: recipe::MergeParams,
-    /// Ids of the Gaussians whose states are in memory, the pool, in increasing order.
+    /// Ids, in increasing order, of the Gaussians whose states are in memory. These Gaussians are called the pool.
     pool: Vec<u32>,
     /// States at the reference frame of the Gaussians in the pool (Gaussians in memory), with base colors only.
     states: Gaussians,
@@ -317,8 +317,8 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` (Gaussians left by pruning) (increasing ids) so that exactly `target` Gaussians are left, and
-    /// returns the result. Fails if merging cannot reduce them to so few.
+    /// Merges `survivors` (increasing ids of Gaussians left by pruning) so that exactly `target` Gaussians are left,
+    /// and returns the result. Fails if merging cannot reduce their number to `target`.
     fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
         let left = merged.compressed.len();

@@ -40,8 +40,8 @@ pub(crate) const BALANCING_ROUNDS: usize = 2;
 const MAX_STEP_CHANGE: f64 = 2.5;
 /// Smallest mean squared error of renders that is distinguished from 0.
 const MIN_ERROR: f64 = 1e-14;
-/// Range, in octaves (doublings), of the common change of all quantization steps at the end: from the finest to the
-/// coarsest steps.
+/// Range, in octaves (doublings), of the common change of all quantization steps that follows the balancing rounds:
+/// from the finest to the coarsest steps.
 pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
 /// Number of bisection steps that find the common change of all quantization steps within [`OCTAVE_RANGE`].
 pub(crate) const OCTAVE_HALVINGS: usize = 6;
@@ -205,10 +205,10 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
     }
 }
 
-/// Searches the range `[low, high]` by bisection, with `halvings` steps, for the number nearest to `high` at which
-/// `evaluate` returns a result. Assumes that there is a result at every number between `low` and the one searched for.
-/// `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried number has a
-/// result.
+/// Searches the numbers from `low` to `high` for the one nearest to `high` at which `evaluate` returns a result. Makes
+/// `halvings` bisection steps. Assumes that `evaluate` also returns a result at every number between `low` and the
+/// number sought. `low` may be larger than `high`. Returns the result at the best tried number, or `None` if no tried
+/// number has a result.
 pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],
     halvings: usize,

@@ -99,8 +99,8 @@ impl ScanStage {
         Ok(found.extrapolate_to_all_frames(&frames, info.times.len()))
     }
 
-    /// Reads all frames of `source` (all or some frames of `scene`), and returns the statistics of every Gaussian as
-    /// the recipe in `plan` defines them. `schedule` holds the views of these frames.
+    /// Reads all frames of `source`, which has all or some of the frames of `scene`. Returns the statistics of every
+    /// Gaussian as the recipe in `plan` defines them. `schedule` holds the views of these frames.
     fn scan_frames(
         &self,
         scene: &Scene,

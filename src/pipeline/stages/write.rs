@@ -41,8 +41,8 @@ const USUAL_LEFT: f64 = 0.5;
 /// Processor time of encoding and writing one Gaussian at one frame, seconds (`benches/pack.rs`).
 pub const ENCODE_SECONDS_PER_STATE: f64 = 3.5e-7;
 
-/// Assumed maximum number of bytes of two parts of the files beside a result: the summary, and the header of the index
-/// map. Long lists of files or notes may exceed it.
+/// Assumed maximum number of bytes of the summary file and the header of the index map together. Long lists of files or
+/// notes may exceed it.
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
 /// Name of the file, beside every result, that holds all parameters of its run.

@@ -39,7 +39,8 @@ impl<'a> BlockScans<'a> {
         block * GAUSSIANS_PER_BLOCK..self.source.info().count.min((block + 1) * GAUSSIANS_PER_BLOCK)
     }
 
-    /// Returns the attributes that may have changed from the previous frame to frame `frame`.
+    /// Returns the attributes that must be read at frame `frame`: all attributes at frame 0, and after it only the
+    /// attributes that may have changed since the previous frame.
     pub(crate) fn changed(&self, frame: usize) -> Attributes {
         wanted(frame, self.source.info().varying)
     }
@@ -75,7 +76,8 @@ impl<'a> BlockScans<'a> {
         Ok(())
     }
 
-    /// Returns the rows of a block whose frames have all been added, and the largest |coordinate| of its positions.
+    /// Returns the results of a block whose frames have all been added: its statistics, one row per Gaussian, and the
+    /// largest |coordinate| of its positions.
     pub(crate) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (StatisticRows, f32) {
         let found = scan.finish();
         let mut alive = self.alive.lock().unwrap_or_else(PoisonError::into_inner);
@@ -85,7 +87,8 @@ impl<'a> BlockScans<'a> {
         (found.rows, found.largest_coordinate)
     }
 
-    /// Scans all frames of block `block`. Returns its rows and the largest |coordinate| of its positions.
+    /// Scans all frames of block `block`. Returns the statistics of its Gaussians, one row each, and the largest
+    /// |coordinate| of its positions.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

@@ -8,8 +8,8 @@
 //! frame block by frame block, because their tiles are adjacent in a container. The pipeline has threads of its own
 //! because they wait for one another, which tasks of a thread pool must not do.
 //!
-//! Memory: two readers per lane, one that decodes and one that is read, each with the frames that it keeps of a frame
-//! block. Fetched bytes stay in the file cache of the system.
+//! Memory: two readers per lane, each with the frames that it keeps of a frame block. One reader decodes tiles while
+//! frames are read from the other. Fetched bytes stay in the file cache of the system.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -26,7 +26,7 @@ use crate::source::{BlockReader, Ids, Prefetch};
 /// fetched and that wait to be decoded.
 const FETCHED: usize = 4;
 
-/// Unit of work: a block of Gaussians at the frames of one frame block.
+/// Unit of work: a block of Gaussians at the frames of one frame block (the frames that share a tile of the container).
 struct Unit {
     block: usize,
     frames: Range<usize>,
@@ -42,7 +42,8 @@ struct StagedResult {
     error: Option<(usize, Error)>,
 }
 
-/// Scans all blocks of `scan`. Returns for each, in order, its rows and the largest |coordinate| of its positions.
+/// Scans all blocks of `scan`. Returns for each block, in order, the statistics of its Gaussians (one row each) and the
+/// largest |coordinate| of its positions.
 ///
 /// # Errors
 /// Fails if a frame cannot be read, with the error of the lowest-numbered block that failed.
@@ -89,8 +90,9 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
     }
 }
 
-/// Decodes the units of work that a lane receives. Reuses a reader that the accumulating thread of the lane returned,
-/// if that reader reads the same block of Gaussians.
+/// Decodes the units of work that a lane receives through `fetched`, and sends each with its reader to `decoded`. The
+/// accumulating thread of the lane returns readers through `free`. Such a reader is used again if it reads the same
+/// block of Gaussians.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,

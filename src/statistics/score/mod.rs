@@ -30,8 +30,8 @@ pub struct Scores {
     pub static_norm: Vec<f64>,
     /// Normalized dynamic score norm(S_dynamic), which the second stage of the selection compares with a threshold.
     pub dynamic_norm: Vec<f64>,
-    /// Normalization of every term of the scores: first the terms of S_static, then those of S_dynamic, then S_static
-    /// and S_dynamic themselves. Terms of weight 0 are not computed and are missing.
+    /// Normalization of every term of the scores: first the terms of S_static, then the terms of S_dynamic, then
+    /// S_static and S_dynamic themselves. Terms of weight 0 are not computed and are missing.
     pub terms: Vec<Term>,
 }
 
@@ -40,7 +40,7 @@ impl Scores {
     pub const BYTES_PER_GAUSSIAN: usize = 5 * size_of::<f64>();
 }
 
-/// Term of a score: a quantity and how it is normalized.
+/// Term of a score: a quantity and its normalization.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// Quantity that the term normalizes.
@@ -73,7 +73,7 @@ impl From<StaticScoreTerm> for ScoredQuantity {
 }
 
 impl ScoredQuantity {
-    /// Returns the name used in summaries and reports.
+    /// Returns the name of the quantity in summaries and reports.
     pub fn name(self) -> &'static str {
         match self {
             ScoredQuantity::By(statistic) => statistic.name(),
@@ -100,7 +100,7 @@ impl ScoredQuantity {
     }
 }
 
-/// Computes the scores of `rows`, which come from a sequence of `frames` frames.
+/// Computes the scores of the Gaussians with the statistics `rows`. The sequence has `frames` frames.
 ///
 /// Rows with [`AnomalyFlags::NON_FINITE`] are excluded from the percentiles, and their scores are 0. The anisotropy
 /// `rows.e` is used only if its weight λ is above 0. An empty list of rows gives empty scores.
@@ -108,7 +108,8 @@ pub fn score(rows: &StatisticRows, frames: usize, recipe: &recipe::ScoreParams) 
     score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
 
-/// Computes the scores as [`score`] does, with percentiles that are found in one pass or two as `passes` states.
+/// Computes the scores as [`score`] does. `passes` selects how percentiles are found: exactly in two passes over the
+/// values, or approximately in one.
 pub fn score_with_passes(
     passes: PercentilePasses,
     rows: &StatisticRows,
@@ -147,7 +148,7 @@ pub fn score_with_passes(
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// State of the computation of one score, a weighted sum of normalized quantities.
+/// State of the computation of the scores, which are weighted sums of normalized quantities.
 struct Summation<'a> {
     is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,
@@ -156,8 +157,8 @@ struct Summation<'a> {
 }
 
 impl Summation<'_> {
-    /// Adds `weight` · norm(`value`) to `total` in all rows that are finite, and records the term under the quantity
-    /// `of`. Does nothing if the weight is 0.
+    /// Adds `weight` · norm(`value(i)`) to `total[i]` for every Gaussian i whose statistics are finite. Appends the
+    /// quantity `of` and its normalization to the list of terms. Does nothing if the weight is 0.
     fn add(&mut self, total: &mut [f64], of: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;

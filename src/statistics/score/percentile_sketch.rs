@@ -7,14 +7,15 @@
 //! result does not depend on the order of the values. Rank-error sketches (KLL, t-digest) are random or depend on the
 //! order, and were off by 3–47% in value at P99 of a heavy tail.
 
-/// Number of mantissa bits of a histogram key, unless another is requested.
+/// Default number of mantissa bits of a histogram key.
 const MANTISSA_BITS: u32 = 7;
 /// Maximum number of mantissa bits of a histogram key; the counts then take 16 MiB.
 pub const MAX_MANTISSA_BITS: u32 = 13;
 /// Number of mantissa bits that an f32 stores.
 const ALL_BITS: u32 = 23;
 
-/// Histogram of the finite values among at most 2³² − 1 values.
+/// Histogram of f64 values, from which percentiles are computed. Holds at most 2³² − 1 values. NaN and infinities are
+/// not counted.
 pub struct FloatSketch {
     /// Number of low f32 mantissa bits that a histogram key omits.
     dropped: u32,

@@ -30,8 +30,9 @@ fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit>
     Some(MemoryLimit { bytes: kibibytes.saturating_mul(1024), source: LimitSource::Machine })
 }
 
-/// Appends to `limits` the limits of the control group of this process, and those of its parent groups as far as they
-/// are mounted in the file system: they apply to this process too. `read` returns the text of a system file.
+/// Appends to `limits` the limits of the control group of this process and of its parent groups, which apply to this
+/// process too. Parent groups that are not mounted in the file system are skipped. `read` returns the text of a system
+/// file.
 fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLimit>) {
     let (Some(memberships), Some(mounts)) =
         (read(Path::new("/proc/self/cgroup")), read(Path::new("/proc/self/mountinfo")))
@@ -125,10 +126,10 @@ pub fn reset_peak_memory() -> bool {
 }
 
 /// Makes the allocator return every freed block of 256 KiB or more to the system at once, so that the resident memory
-/// of this process is what it uses. By default, glibc keeps freed blocks of up to 32 MiB in the heaps of the threads
-/// that allocated them: one run took between 62 and 69 MiB that way, and 43 MiB with this function. Costs up to 5% more
-/// processor time, because returned pages have to be cleared when they are used again. No effect with other allocators
-/// than that of glibc.
+/// of this process does not include freed memory. By default, glibc keeps freed blocks of up to 32 MiB in the heaps of
+/// the threads that allocated them: one run took between 62 and 69 MiB that way, and 43 MiB with this function. Costs
+/// up to 5% more processor time, because returned pages have to be cleared when they are used again. No effect with
+/// other allocators than that of glibc.
 pub fn return_freed_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `mallopt` only sets a parameter of the allocator. It may be called at any time.

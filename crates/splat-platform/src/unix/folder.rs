@@ -13,7 +13,8 @@ use rustix::fs::{AtFlags, CWD, Dir, FileType, Mode, OFlags};
 
 use crate::{FileIdentity, FolderStatus};
 
-/// Open folder. Its methods take the names of entries of this folder, and never follow links.
+/// Handle of an open folder. Its methods address the entries of this folder by name, and do not follow an entry that is
+/// a link.
 #[derive(Debug)]
 pub struct FolderHandle(OwnedFd);
 

@@ -15,7 +15,8 @@ use windows_sys::Win32::Storage::FileSystem::{FILE_FLAG_BACKUP_SEMANTICS, FILE_F
 
 use crate::{FileIdentity, FileStatus, FolderStatus};
 
-/// Open folder. Its methods take the names of entries of this folder, and never follow links.
+/// Handle of an open folder. Its methods address the entries of this folder by name, and do not follow an entry that is
+/// a link.
 #[derive(Debug)]
 pub struct FolderHandle {
     /// Absolute path of the folder, without links.

@@ -29,8 +29,8 @@ fn machine_bytes() -> Option<u64> {
     (unsafe { GlobalMemoryStatusEx(&mut status) } != 0).then_some(status.ullTotalPhys)
 }
 
-/// Returns the memory limits of the job object of this process in bytes: the limit per process and that of the whole
-/// job, if they are set. Returns an empty list if the process belongs to no job object.
+/// Returns the memory limits of the job object of this process in bytes: the limit per process and the limit of the
+/// whole job, if they are set. Returns an empty list if the process belongs to no job object.
 fn job_bytes() -> Vec<u64> {
     // SAFETY: all fields are integers.
     let mut limits: JOBOBJECT_EXTENDED_LIMIT_INFORMATION = unsafe { zeroed() };

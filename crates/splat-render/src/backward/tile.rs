@@ -1,9 +1,9 @@
 //! Backward pass over a tile: computes gradient sums of splats from the gradients of pixels.
 //!
-//! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its part
-//! from the color of a pixel; the rest is the color that comes from behind the splat (docs/method.md, section 8.1).
-//! Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per splat of the tile ([`SplatSums`]).
-//! Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
+//! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its weight
+//! times its color from the color of a pixel. The remaining color comes from behind the splat (docs/method.md, section
+//! 8.1). Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per splat of the tile
+//! ([`SplatSums`]). Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
 
 use super::super::blend::{BlendSink, Fragment, GROUPS, TilePlane};
 use super::super::convention::{MAX_ALPHA, TILE};

@@ -63,7 +63,8 @@ pub(super) trait Lanes: Copy {
     /// Type of the sum of several groups of eight lanes. It has eight values: value k is the sum of lane k of all
     /// groups that were added.
     type Sums: Sums;
-    /// Type of two sets of eight sums over groups: one over the groups with even index, one over those with odd index.
+    /// Type of two sums over groups of eight lanes: one over the groups with even index, one over the groups with odd
+    /// index. Each sum has eight values, one per lane.
     type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
     /// Number of groups of eight lanes in a vector; a power of two.
     const GROUPS: usize;
@@ -92,9 +93,9 @@ pub(super) trait Lanes: Copy {
     fn mul(self, other: Self) -> Self;
     /// Returns the quotient `self / other` in each lane.
     fn div(self, other: Self) -> Self;
-    /// Returns the smaller value of each lane; that of `other` if either is NaN.
+    /// Returns the smaller value of each lane; the value of `other` if either is NaN.
     fn min(self, other: Self) -> Self;
-    /// Returns the larger value of each lane; that of `other` if either is NaN.
+    /// Returns the larger value of each lane; the value of `other` if either is NaN.
     fn max(self, other: Self) -> Self;
     /// Returns the mask of the lanes with `self ≥ other`, which is false for NaN.
     fn at_least(self, other: Self) -> Self::Mask;
@@ -104,7 +105,7 @@ pub(super) trait Lanes: Copy {
     fn bits(mask: Self::Mask) -> u32;
     /// Returns a vector with the lanes of `self` where `mask` is set, and 0 elsewhere.
     fn keep(self, mask: Self::Mask) -> Self;
-    /// Returns a vector with the lanes of `self` where `mask` is set, and those of `other` elsewhere.
+    /// Returns a vector with the lanes of `self` where `mask` is set, and the lanes of `other` elsewhere.
     fn or_else(self, mask: Self::Mask, other: Self) -> Self;
     /// Returns `self` with the sign bit set to 1 in the lanes where `mask` is set.
     fn negate_where(self, mask: Self::Mask) -> Self;
@@ -114,8 +115,8 @@ pub(super) trait Lanes: Copy {
     fn largest(self) -> f32;
     /// Adds each group of the vector to `sums`, one group after the other, and returns the result.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// Adds the groups with even index to the even sums and those with odd index to the odd sums, and returns the
-    /// result. A vector of one group is always added to the first of the two, see [`EvenOddSums`].
+    /// Adds the groups with even index to the even sums and the groups with odd index to the odd sums, and returns the
+    /// result. A vector of one group is always added to the first of the two sums, see [`EvenOddSums`].
     fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
     /// Returns `self · 2ⁿ` in each lane. `rounded` is n + [`ROUND`], whose low bits hold n.
     fn scale(self, rounded: Self) -> Self;

@@ -12,7 +12,7 @@ pub use ssim::{ssim, ssim_gradient};
 
 use crate::Image;
 
-/// Bytes of memory per pixel for comparing two images: those of SSIM, which needs the most of all metrics.
+/// Maximum bytes of memory per pixel for comparing two images by a metric other than FLIP. SSIM takes this much.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
 /// Bytes of memory per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and two copies of the

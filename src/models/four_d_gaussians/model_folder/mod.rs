@@ -297,13 +297,15 @@ impl Deformation for ModelFolder {
     }
 }
 
-/// Gaussians with given stored parameters. Computes their states a block of Gaussians at a time.
+/// Gaussians of a 4DGaussians model with given stored parameters. Their states are computed a block of Gaussians at a
+/// time.
 struct PreparedModel<'a> {
     model: &'a ModelFolder,
     stored: &'a StoredParams,
     /// Indices of all Gaussians.
     ids: Vec<u32>,
-    /// What the field computes without time, for each block of [`GAUSSIANS_PER_BLOCK`] Gaussians.
+    /// Values that the field computes from positions alone and that serve all frames; one entry for each block of
+    /// [`GAUSSIANS_PER_BLOCK`] Gaussians.
     prepared: Vec<PreparedPositions>,
 }
 
