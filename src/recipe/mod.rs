@@ -150,8 +150,8 @@ impl Recipe {
             (
                 "select.round_fraction",
                 self.select.round_fraction,
-                (0.1..=MAX_ROUND_FRACTION).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
-                "0.1 to 0.99, or 1 for no rounds",
+                (0.01..=MAX_ROUND_FRACTION).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
+                "0.01 to 0.99, or 1 for no rounds",
             ),
             ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),
             (
@@ -293,7 +293,7 @@ mod tests {
     fn values_that_make_a_run_endless_are_refused() {
         let many = "[[merge.passes]]\nepsilon = 0.01\nd0 = 1.0\nrho = 0.9\ntau_m = 0.9\n".repeat(MOST_PASSES + 1);
         for (text, parts) in [
-            ("[select]\nround_fraction = 0.9999999999\n", ["select.round_fraction", "0.1 to 0.99, or 1"]),
+            ("[select]\nround_fraction = 0.9999999999\n", ["select.round_fraction", "0.01 to 0.99, or 1"]),
             ("[refine]\nrefine_steps = 4000000000\n", ["refine.refine_steps", "0 to 1000000"]),
             ("[refine]\nrefine_cut_steps = 4000000000\n", ["refine.refine_cut_steps", "0 to 1000000"]),
             (&many, ["merge.passes", "at most 16 passes, found 17"]),

@@ -36,12 +36,12 @@ const NAME: &str = "rounds";
 /// removes the lowest.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Fraction of the Gaussians present at the start of a round that the round leaves.
+    /// Fraction of the remaining Gaussians that one pruning round keeps.
     pub fraction: f64,
     /// Number of views by which Gaussians are ranked. It does not grow with the number of frames.
     pub pictures: usize,
-    /// Number of groups (turns) into which the views are divided. A round renders the views of one group; for the other
-    /// groups it uses errors measured in earlier rounds.
+    /// Number of groups (turns) into which the views are divided. Every round after the first renders the views of one
+    /// group; for the other groups it uses errors measured in earlier rounds.
     pub turns: usize,
     /// Color difference (norm over red, green and blue, each from 0 to 1) whose square is added to the squared color
     /// difference between a Gaussian and what is behind it. It prevents a removal error of 0 for a Gaussian with the
@@ -98,8 +98,9 @@ impl Stage for Rounds {
 }
 
 impl Rounds {
-    /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians,
-    /// if any. The stage can run only if the visible contributions of the Gaussians were measured.
+    /// Returns the stage that ranks Gaussians in pruning rounds, or `None` if `recipe` ranks only once. `target` is the
+    /// requested fraction of the Gaussians, if any. The stage can run only if the visible contributions of the
+    /// Gaussians were measured.
     pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
         let recipe::SelectParams {
             round_fraction: fraction,
@@ -143,8 +144,8 @@ impl Rounds {
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
-    /// Returns one line of text for display for each round on the way from `count` Gaussians down to `fewest`: the name
-    /// of the round and the maximum number of its views.
+    /// Returns one line of text for display per pruning round that reduces `count` Gaussians to `fewest`. A line has
+    /// the name of the round and the maximum number of views that it renders.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
         let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
@@ -218,9 +219,9 @@ impl Rounds {
         Ok(Ranking::new(protected.iter().copied().chain(free).chain(removed).collect()))
     }
 
-    /// Returns for each round the number of removable Gaussians that it leaves. At the start there are `free` removable
-    /// Gaussians and `protected` Gaussians that must stay; rounds follow until both together are at most `fewest`.
-    /// Every round removes at least one Gaussian.
+    /// Returns for each pruning round the number of removable Gaussians that it leaves. At the start there are `free`
+    /// removable Gaussians and `protected` Gaussians that must stay; rounds follow until both together are at most
+    /// `fewest`. Every round removes at least one Gaussian.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
@@ -300,7 +301,7 @@ impl Rounds {
 struct RoundState {
     /// Ids of the survivors (Gaussians not removed so far) that later rounds may remove, most important first.
     free: Vec<u32>,
-    /// Ids of the Gaussians removed so far, worst last.
+    /// Ids of the Gaussians removed so far, least important last.
     removed: Vec<u32>,
     /// For each group of views: removal error of every Gaussian, by id, from the last round that rendered this group.
     errors: Vec<Vec<u64>>,
