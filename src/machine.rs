@@ -17,9 +17,9 @@ pub fn memory_limit() -> (u64, String) {
 /// Returns the smallest of the memory limits `system` and of the limits in the environment variables of a batch job, in
 /// bytes, with a description of its source. `variable` looks up an environment variable.
 fn least_limit(system: MemoryLimits, variable: impl Fn(&str) -> Option<String>) -> (u64, String) {
-    let mut limits: Vec<(u64, String)> = system.around.into_iter().map(described).collect();
+    let mut limits: Vec<(u64, String)> = system.shared.into_iter().map(described).collect();
     add_job_limits(&variable, &mut limits);
-    limits.extend(system.own.into_iter().map(described));
+    limits.extend(system.process.into_iter().map(described));
     // Of equal limits the first is taken: the machine's own rather than that of a job that may use all of the machine.
     let stated = limits.into_iter().filter(|&(bytes, _)| (1..UNLIMITED_BYTES).contains(&bytes));
     stated.min_by_key(|&(bytes, _)| bytes).unwrap_or((u64::MAX, "this system tells of no limit".to_owned()))
@@ -80,13 +80,13 @@ mod tests {
     /// Returns the memory limit, bytes, of a batch job with these environment variables on a machine of 64 GiB.
     fn job(variables: &[(&str, &str)]) -> u64 {
         let variables: BTreeMap<_, _> = variables.iter().copied().collect();
-        let system = MemoryLimits { around: vec![MACHINE], own: Vec::new() };
+        let system = MemoryLimits { shared: vec![MACHINE], process: Vec::new() };
         least_limit(system, |name| variables.get(name).map(|&value| value.to_owned())).0
     }
 
     /// Returns the memory limit, bytes, of a process outside any batch job, and the description of its source.
-    fn limit(around: &[MemoryLimit], own: &[MemoryLimit]) -> (u64, String) {
-        least_limit(MemoryLimits { around: around.to_vec(), own: own.to_vec() }, |_| None)
+    fn limit(shared: &[MemoryLimit], process: &[MemoryLimit]) -> (u64, String) {
+        least_limit(MemoryLimits { shared: shared.to_vec(), process: process.to_vec() }, |_| None)
     }
 
     #[test]

@@ -64,12 +64,14 @@ pub(super) struct PointCloudShape {
     pub(super) lowest: [i64; 3],
     /// Number of low bits of each coordinate of a position that are stored as plain bits. The Morton curve does not use
     /// these bits.
-    pub(super) loose: u32,
+    #[serde(rename = "loose")]
+    pub(super) plain_bits: u32,
     /// Mean of every plane (scalar component), in quantization steps. The three planes of the position have none.
     pub(super) means: Vec<i64>,
     /// Predictor weights (with which a value is predicted from known values) of every plane (scalar component), except
     /// the three planes of the position.
-    pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
+    #[serde(rename = "parts")]
+    pub(super) weights: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
 /// Plane (scalar component of all Gaussians) that is coded after the positions.
@@ -107,9 +109,9 @@ impl PointCloudShape {
         let steps = self.steps.iter().chain(self.columns.iter().map(|column| &column.step));
         self.sh_degree <= MAX_SH_DEGREE
             && self.plane_count() == Some(self.means.len())
-            && self.parts.len() == self.means.len()
+            && self.weights.len() == self.means.len()
             && steps.into_iter().all(|step| super::STEP_NUMBERS.contains(step))
-            && self.loose <= 32
+            && self.plain_bits <= 32
             && self.gaussians <= u32::MAX as usize
     }
 
@@ -147,7 +149,7 @@ impl PointCloudShape {
 
 /// Returns the lowest 21 bits of `x` with two zero bits inserted between consecutive bits. Higher bits of `x` are
 /// dropped.
-pub(crate) fn spread(x: u64) -> u64 {
+pub(crate) fn interleave_zeros(x: u64) -> u64 {
     let mut x = x & ((1 << CURVE_BITS) - 1);
     for (shift, mask) in [
         (32, 0x001f_0000_0000_ffff),
@@ -161,7 +163,7 @@ pub(crate) fn spread(x: u64) -> u64 {
     x
 }
 
-/// Returns every third bit of `x`, packed together; the inverse of [`spread`].
+/// Returns every third bit of `x`, packed together; the inverse of [`interleave_zeros`].
 fn gather(x: u64) -> u64 {
     let mut x = x & 0x1249_2492_4924_9249;
     for (shift, mask) in [
@@ -188,9 +190,9 @@ fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u
 }
 
 /// Returns the index along the Morton curve of the position `place`, which is given in quantization steps from the
-/// minimum on each axis. The index leaves out the `loose` lowest bits of each coordinate.
-fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
-    let [x, y, z] = place.map(|x| spread(x >> loose));
+/// minimum on each axis. The index leaves out the `plain_bits` lowest bits of each coordinate.
+fn curve_index(place: &[u64; 3], plain_bits: u32) -> u64 {
+    let [x, y, z] = place.map(|x| interleave_zeros(x >> plain_bits));
     x | y << 1 | z << 2
 }
 
@@ -205,17 +207,17 @@ pub(super) fn encode(
     bits: &mut BTreeMap<String, f64>,
 ) -> (PointCloudShape, Vec<u8>, Vec<u32>) {
     let mut encoder = SymbolEncoder::default();
-    let (places, lowest, loose) = grid_positions(&cloud.position, QuantizationGrid::new(steps[0]));
+    let (places, lowest, plain_bits) = grid_positions(&cloud.position, QuantizationGrid::new(steps[0]));
     let mut order: Vec<u32> = (0..cloud.len() as u32).collect();
     // The sort is stable: Gaussians with the same curve index stay in their original order.
-    order.sort_by_key(|&id| curve_index(&places[id as usize], loose));
+    order.sort_by_key(|&id| curve_index(&places[id as usize], plain_bits));
     let (mut lengths, mut before) = (CurveDistances::new(), 0);
     for &id in &order {
         let place = &places[id as usize];
-        let at = curve_index(place, loose);
+        let at = curve_index(place, plain_bits);
         lengths.encode(at - before, &mut encoder);
         before = at;
-        place.iter().for_each(|&x| encoder.long_bits(x, loose));
+        place.iter().for_each(|&x| encoder.long_bits(x, plain_bits));
     }
     bits.insert(ATTRIBUTES[0].to_owned(), encoder.cost());
     let column_shape = |(column, &step): (&Column, &i32)| ColumnShape {
@@ -229,9 +231,9 @@ pub(super) fn encode(
         steps: *steps,
         columns: columns.iter().zip(column_steps).map(column_shape).collect(),
         lowest,
-        loose,
+        plain_bits,
         means: Vec::new(),
-        parts: Vec::new(),
+        weights: Vec::new(),
     };
     let mut coder = PlaneCoder::new(cloud.len());
     let rotation = nonzero_rotations(&cloud.rotation, QuantizationGrid::new(steps[1]));
@@ -250,8 +252,8 @@ pub(super) fn encode(
             fit.add(around, grid.value(multiples[i]) - grid.value(mean));
             (multiples[i], 0)
         });
-        let parts = fit.parts();
-        let factors = factors(&parts);
+        let weights = fit.weights();
+        let factors = factors(&weights);
         let before = encoder.cost();
         coder.plane(group, grid, mean, |i, around, size, models| {
             let predicted = grid.predicted(expected(grid.value(mean), &factors, around));
@@ -263,7 +265,7 @@ pub(super) fn encode(
         };
         *bits.entry(name.to_owned()).or_default() += encoder.cost() - before;
         shape.means.push(mean);
-        shape.parts.push(parts);
+        shape.weights.push(weights);
     }
     (shape, encoder.finish(), order)
 }
@@ -283,7 +285,7 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
     for i in 0..shape.gaussians {
         at = at.wrapping_add(lengths.decode(&mut decoder));
         let place = [0, 1, 2].map(|axis| {
-            let x = gather(at >> axis) << shape.loose | decoder.long_bits(shape.loose);
+            let x = gather(at >> axis) << shape.plain_bits | decoder.long_bits(shape.plain_bits);
             grid.value(shape.lowest[axis].wrapping_add(x as i64))
         });
         cloud.position.set_row(i, place);
@@ -291,7 +293,7 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<(Gaussians
     let mut coder = PlaneCoder::new(shape.gaussians);
     for (k, coded) in shape.planes().into_iter().enumerate() {
         let (grid, mean) = (shape.grid(coded), shape.means[k]);
-        let factors = factors(&shape.parts[k]);
+        let factors = factors(&shape.weights[k]);
         let plane = match coded.source {
             PlaneSource::Attribute(attribute, c) => cloud.column_mut(attribute).plane_mut(c),
             PlaneSource::Column(column, c) => columns[column].values.plane_mut(c),

@@ -60,7 +60,8 @@ pub(super) struct TensorEntry {
     /// tensors.
     pub(super) mean: i64,
     /// Weights with which a value is predicted from its neighbors in the tensor (predictor weights).
-    pub(super) parts: PredictorWeights<NEIGHBORS>,
+    #[serde(rename = "parts")]
+    pub(super) weights: PredictorWeights<NEIGHBORS>,
 }
 
 /// Quantization step of each tensor, by the name of the tensor.
@@ -92,7 +93,7 @@ impl TensorEntry {
     pub(super) fn new(name: &str, tensor: &Tensor, role: TensorRole, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
-        TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBORS] }
+        TensorEntry { name, shape, role, step, channels, mean: 0, weights: [0; NEIGHBORS] }
     }
 
     /// Returns the number of values of the tensor; `None` if it overflows.
@@ -259,11 +260,11 @@ pub(super) fn encode(
             let mean = entry.with_quantized(readers, |quantized| quantized.mean(&tensor.data)).unwrap_or(0.0);
             entry.mean = QuantizationGrid::new(entry.step).nearest(mean);
         }
-        if let Some(parts) = entry.with_quantized(readers, |quantized| quantized.fit(&mut tensor.data.clone())) {
-            entry.parts = parts;
+        if let Some(weights) = entry.with_quantized(readers, |quantized| quantized.fit(&mut tensor.data.clone())) {
+            entry.weights = weights;
             let before = encoder.cost();
             entry.with_quantized(readers, |quantized| {
-                quantized.encode(&parts, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
+                quantized.encode(&weights, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
             });
             bits.insert(entry.name.clone(), encoder.cost() - before);
         }
@@ -291,7 +292,7 @@ pub(super) fn decode(
         } else {
             let mut data = vec![0.0; count];
             entry.with_quantized(readers, |quantized| {
-                quantized.decode(&entry.parts, shared.residuals(entry), &mut data, &mut decoder)
+                quantized.decode(&entry.weights, shared.residuals(entry), &mut data, &mut decoder)
             });
             data
         };

@@ -24,7 +24,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-pub(crate) use cloud::spread;
+pub(crate) use cloud::interleave_zeros;
 pub use cloud::{ATTRIBUTES, CloudSteps, Column};
 pub use field::{FieldSteps, TensorRole, TensorSteps, round_tensor};
 pub use file::{ArchiveSize, HEADER_BYTES, MAGIC, VERSION};
@@ -56,7 +56,7 @@ pub struct ArchiveContent {
     pub times: [f32; 2],
     /// Extra bytes of every Gaussian that belong to no attribute (for example, other PLY properties). Each Gaussian has
     /// the same number of extra bytes; they are stored one Gaussian after another.
-    pub beside: Vec<u8>,
+    pub extra_bytes: Vec<u8>,
     /// Files of the model that are stored without change, such as `cfg_args`, and other bytes, by name.
     pub files: BTreeMap<String, Vec<u8>>,
 }
@@ -126,7 +126,7 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
         )));
     }
     let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
-    let width = content.beside.len() / content.cloud.len().max(1);
+    let width = content.extra_bytes.len() / content.cloud.len().max(1);
     let table = Table {
         cloud: shape,
         times: content.times.map(f32::to_bits),
@@ -137,7 +137,7 @@ pub fn encode(content: &ArchiveContent, steps: &QuantizationSteps) -> Result<Enc
     let mut blobs: Vec<u8> = exact.iter().flat_map(|value| value.to_le_bytes()).collect();
     // The bytes are ordered by their place in the row of a Gaussian first, so that similar bytes are adjacent.
     for at in 0..width {
-        blobs.extend(order.iter().map(|&id| content.beside[id as usize * width + at]));
+        blobs.extend(order.iter().map(|&id| content.extra_bytes[id as usize * width + at]));
     }
     content.files.values().for_each(|bytes| blobs.extend(bytes));
     let table = serde_json::to_vec(&table).map_err(|error| Error::internal(error.to_string()))?;
@@ -220,10 +220,10 @@ fn decoded(
     if !content.times.iter().all(|time| time.is_finite()) {
         return Err(unsound("times"));
     }
-    content.beside = vec![0; planes.len()];
+    content.extra_bytes = vec![0; planes.len()];
     for (at, plane) in planes.chunks_exact(cloud.len().max(1)).enumerate() {
         for (i, &byte) in plane.iter().enumerate() {
-            content.beside[i * table.beside + at] = byte;
+            content.extra_bytes[i * table.beside + at] = byte;
         }
     }
     for (name, length) in table.files {

@@ -9,8 +9,8 @@ const WEIGHT_DENOMINATOR: f32 = 64.0;
 pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
 /// Returns the predictor weights as f32 factors: a weight of 64 becomes 1.0.
-pub(super) fn factors<const N: usize>(parts: &PredictorWeights<N>) -> [f32; N] {
-    parts.map(|part| f32::from(part) / WEIGHT_DENOMINATOR)
+pub(super) fn factors<const N: usize>(weights: &PredictorWeights<N>) -> [f32; N] {
+    weights.map(|weight| f32::from(weight) / WEIGHT_DENOMINATOR)
 }
 
 /// Returns the predicted value: `mean` plus each of `differences` times its factor, added in order.
@@ -54,7 +54,7 @@ impl<const N: usize> PredictorFit<N> {
     /// Returns the fitted predictor weights in 64ths. Solves the normal equations by Cholesky factorization, with a
     /// ridge of 1e-4 times the mean diagonal so that they are solvable. Returns zeros if the differences of all samples
     /// are 0, or if a difference is not finite.
-    pub(super) fn parts(mut self) -> PredictorWeights<N> {
+    pub(super) fn weights(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {
             return [0; N];
@@ -80,7 +80,7 @@ impl<const N: usize> PredictorFit<N> {
             found[i] = (found[i] - known) / root[i][i];
         }
         // `as` saturates and turns NaN into 0.
-        found.map(|part| (part * f64::from(WEIGHT_DENOMINATOR)).round() as i8)
+        found.map(|weight| (weight * f64::from(WEIGHT_DENOMINATOR)).round() as i8)
     }
 }
 
@@ -95,18 +95,18 @@ mod tests {
             let x = [(i as f32 * 0.7).sin(), (i as f32 * 1.3).cos(), (i as f32 * 0.11).sin()];
             fit.add(&x, 0.75 * x[0] - 1.25 * x[1] + 0.5 * x[2]);
         }
-        let parts = fit.parts();
-        assert_eq!(parts, [48, -80, 32]);
-        assert_eq!(expected(2.0, &factors(&parts), &[1.0, 1.0, 2.0]), 2.5);
+        let weights = fit.weights();
+        assert_eq!(weights, [48, -80, 32]);
+        assert_eq!(expected(2.0, &factors(&weights), &[1.0, 1.0, 2.0]), 2.5);
     }
 
     #[test]
     fn zero_or_nan_differences_give_zero_weights() {
         let mut fit = PredictorFit::<4>::new();
         fit.add(&[0.0; 4], 1.0);
-        assert_eq!(fit.parts(), [0; 4]);
+        assert_eq!(fit.weights(), [0; 4]);
         let mut fit = PredictorFit::<2>::new();
         fit.add(&[f32::NAN; 2], 1.0);
-        assert_eq!(fit.parts(), [0; 2]);
+        assert_eq!(fit.weights(), [0; 2]);
     }
 }

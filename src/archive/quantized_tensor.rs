@@ -77,19 +77,19 @@ impl QuantizedTensor<'_> {
             fit.add(&context.values, value - self.mean);
             (value, 0.0)
         });
-        fit.parts()
+        fit.weights()
     }
 
-    /// Encodes the values `data` with the predictor weights `parts` and the entropy models `models`, and writes the
+    /// Encodes the values `data` with the predictor weights `weights` and the entropy models `models`, and writes the
     /// symbols to `to`. Replaces `data` by the values that a decoder restores.
     pub(super) fn encode(
         &self,
-        parts: &PredictorWeights<NEIGHBORS>,
+        weights: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
         to: &mut SymbolEncoder,
     ) {
-        let factors = factors(parts);
+        let factors = factors(weights);
         self.visit(data, |_, value, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let multiple = grid.multiple(value);
@@ -98,16 +98,16 @@ impl QuantizedTensor<'_> {
         });
     }
 
-    /// Decodes values from `from` into `data`. `parts` and `models` must be those that [`QuantizedTensor::encode`]
+    /// Decodes values from `from` into `data`. `weights` and `models` must be those that [`QuantizedTensor::encode`]
     /// used.
     pub(super) fn decode(
         &self,
-        parts: &PredictorWeights<NEIGHBORS>,
+        weights: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
         from: &mut SymbolDecoder<'_>,
     ) {
-        let factors = factors(parts);
+        let factors = factors(weights);
         self.visit(data, |_, _, context, grid| {
             let predicted = grid.predicted(expected(self.mean, &factors, &context.values));
             let (multiple, residual) = models.decode(predicted, context.size, from);

@@ -56,7 +56,7 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> ArchiveContent {
         values.planes_mut().iter_mut().for_each(|value| *value = noise.next());
         content.columns.push(Column { name: name.to_owned(), values });
     }
-    content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
+    content.extra_bytes = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.files.insert("empty".to_owned(), Vec::new());
     content
@@ -112,7 +112,7 @@ proptest! {
             }
         }
         for (i, &id) in order.iter().enumerate() {
-            prop_assert_eq!(&back.beside[3 * i..3 * i + 3], &content.beside[3 * id as usize..][..3]);
+            prop_assert_eq!(&back.extra_bytes[3 * i..3 * i + 3], &content.extra_bytes[3 * id as usize..][..3]);
         }
         prop_assert_eq!(&back.files, &content.files);
         prop_assert_eq!(&back.field, &content.field);

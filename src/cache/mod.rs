@@ -53,7 +53,7 @@ pub struct Cache {
     dir: Option<CacheDir>,
     part: Option<Shard>,
     /// Cache key made from the ids of Gaussians that are excluded from the input; `None`: none are excluded.
-    absent: Mutex<Option<CacheKey>>,
+    excluded_ids_key: Mutex<Option<CacheKey>>,
     notes: Mutex<Vec<String>>,
 }
 
@@ -88,18 +88,18 @@ impl Cache {
     /// Makes all cache keys that are created from now on depend on the ids of the Gaussians that are excluded from the
     /// input, if there are any.
     pub fn set_excluded_ids(&self, ids: &[u32]) {
-        *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
+        *self.excluded_ids_key.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.is_enabled() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
     /// Returns the cache key of `value`, a digest of its bits. Without a work folder returns [`CacheKey::NONE`] and
     /// does not hash.
     pub fn key(&self, value: &impl Serialize) -> CacheKey {
-        let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
-        match (self.is_enabled(), absent) {
+        let excluded_ids_key = *self.excluded_ids_key.lock().unwrap_or_else(PoisonError::into_inner);
+        match (self.is_enabled(), excluded_ids_key) {
             (false, _) => CacheKey::NONE,
             (true, None) => CacheKey::new(value),
-            (true, Some(absent)) => CacheKey::new(value).extended_by(&absent),
+            (true, Some(excluded_ids_key)) => CacheKey::new(value).extended_by(&excluded_ids_key),
         }
     }
 

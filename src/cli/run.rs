@@ -65,7 +65,7 @@ pub(super) fn run(cli: Cli) -> Result<()> {
 /// Runs `compress`. With `--list-stages` or `--dry-run`, prints the stages or the plan instead and compresses nothing.
 fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
     let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
-    let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Most };
+    let detail = if args.verbose { SummaryDetail::All } else { SummaryDetail::Brief };
     let page_output = args.view.clone();
     let request = compress_options(args, quiet, events)?;
     if list_stages {

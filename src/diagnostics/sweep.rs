@@ -168,17 +168,17 @@ fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> b
     wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// Measures and returns one point of the trade-off curves by running `method`, whose recipe or baseline is `means`.
-/// `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their number. Also sets the number of
-/// compared views in `found`.
+/// Measures and returns one point of the trade-off curves by running `method`, whose recipe or baseline is
+/// `method_kind`. `fraction`: fraction of the Gaussians to keep; `None`: the method chooses their number. Also sets the
+/// number of compared views in `found`.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,
     fraction: Option<f64>,
-    means: &MethodKind,
+    method_kind: &MethodKind,
     found: &mut TradeOff,
 ) -> Result<TradeOffPoint> {
-    let (evaluation, cost) = run.run(means, fraction.map(Target::Ratio), |result| run.compare(result))?;
+    let (evaluation, cost) = run.run(method_kind, fraction.map(Target::Ratio), |result| run.compare(result))?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(TradeOffPoint {

@@ -118,7 +118,7 @@ impl TestSceneReport {
     /// Returns the report as text for the terminal: the summary, and a table with the numbers of kept, merged and
     /// pruned Gaussians of each body.
     pub fn text(&self) -> String {
-        let mut out = self.summary.text(SummaryDetail::Most);
+        let mut out = self.summary.text(SummaryDetail::Brief);
         // Writing to a String cannot fail.
         let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "body", "Gaussians", "kept", "merged", "pruned");
         for &(body, all, kept, merged) in &self.bodies {

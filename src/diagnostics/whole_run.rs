@@ -35,24 +35,24 @@ pub(crate) struct WholeRun<'a> {
 }
 
 impl WholeRun<'_> {
-    /// Compresses the input by the recipe or baseline `means`, as often as `repeats` allows, and measures time and
-    /// memory. `target`: number or fraction of the Gaussians to keep; `None`: `means` decides. Then calls `look` with
-    /// the path of the last result, and deletes this result. Returns the value of `look` and the cost of the
-    /// compression.
+    /// Compresses the input by the recipe or baseline `method_kind`, as often as `repeats` allows, and measures time
+    /// and memory. `target`: number or fraction of the Gaussians to keep; `None`: `method_kind` decides. Then calls
+    /// `inspect` with the path of the last result, and deletes this result. Returns the value of `inspect` and the cost
+    /// of the compression.
     ///
     /// # Errors
-    /// Returns the errors of `compress` and of `look`.
+    /// Returns the errors of `compress` and of `inspect`.
     pub(crate) fn run<T>(
         &self,
-        means: &MethodKind,
+        method_kind: &MethodKind,
         target: Option<Target>,
-        look: impl FnOnce(&Path) -> Result<T>,
+        inspect: impl FnOnce(&Path) -> Result<T>,
     ) -> Result<(T, Cost)> {
         let input = with_training_views(self.input);
         let output = self.scratch.join(self.name);
         let clear = || fs::remove_dir_all(self.scratch).map_err(Error::io("remove", self.scratch));
         let create = || fs::create_dir(self.scratch).map_err(Error::io("create", self.scratch));
-        let once = || match means {
+        let once = || match method_kind {
             MethodKind::Recipe(recipe, only) => {
                 let run = Request::new(input.clone(), output.clone(), (**recipe).clone());
                 compress(&Request { only: *only, target, ..run }).map(|_| ())
@@ -61,7 +61,7 @@ impl WholeRun<'_> {
         };
         create()?;
         let ((), cost) = self.repeats.measure_cost(once, || clear().and_then(|()| create()))?;
-        let seen = look(&output)?;
+        let seen = inspect(&output)?;
         clear()?;
         Ok((seen, cost))
     }

@@ -26,9 +26,11 @@ pub struct MedianAndRange {
     /// Median of the measured values; the mean of the two middle values if their number is even.
     pub median: f64,
     /// Smallest of the measured values.
-    pub least: f64,
+    #[serde(rename = "least")]
+    pub min: f64,
     /// Largest of the measured values.
-    pub most: f64,
+    #[serde(rename = "most")]
+    pub max: f64,
 }
 
 impl MedianAndRange {
@@ -41,8 +43,8 @@ impl MedianAndRange {
         let last = values.len() - 1;
         MedianAndRange {
             median: 0.5 * (values[last / 2] + values[values.len() / 2]),
-            least: values[0],
-            most: values[last],
+            min: values[0],
+            max: values[last],
         }
     }
 }
@@ -53,13 +55,13 @@ pub struct RepeatLimits {
     /// Maximum number of runs; the work always runs at least once.
     pub most: usize,
     /// Limit on the total time of the runs, seconds. No further run starts after this time is reached.
-    pub enough: f64,
+    pub max_total_seconds: f64,
 }
 
 impl RepeatLimits {
     /// Returns limits that allow exactly `most` runs (at least one), without a time limit.
     pub fn exactly(most: usize) -> RepeatLimits {
-        RepeatLimits { most, enough: f64::INFINITY }
+        RepeatLimits { most, max_total_seconds: f64::INFINITY }
     }
 
     /// Runs `work` repeatedly within these limits. Returns the value of the last run, and the cost of the runs. Calls
@@ -81,7 +83,7 @@ impl RepeatLimits {
             processors.extend(clock.processor_seconds());
             // `None` is less than every `Some`.
             peak = peak.max(if is_peak_reset { peak_memory_bytes() } else { None });
-            if seconds.len() >= self.most || seconds.iter().sum::<f64>() >= self.enough {
+            if seconds.len() >= self.most || seconds.iter().sum::<f64>() >= self.max_total_seconds {
                 let runs = seconds.len();
                 let processor_seconds = (processors.len() == runs).then(|| MedianAndRange::from_values(processors));
                 let seconds = MedianAndRange::from_values(seconds);
@@ -101,8 +103,8 @@ mod tests {
         for (values, expected) in
             [(vec![7.0], [7.0; 3]), (vec![9.0, 1.0], [5.0, 1.0, 9.0]), (vec![9.0, 1.0, 2.0], [2.0, 1.0, 9.0])]
         {
-            let MedianAndRange { median, least, most } = MedianAndRange::from_values(values);
-            assert_eq!([median, least, most], expected);
+            let MedianAndRange { median, min, max } = MedianAndRange::from_values(values);
+            assert_eq!([median, min, max], expected);
         }
     }
 
@@ -110,8 +112,8 @@ mod tests {
     fn work_repeats_until_run_or_time_limit() {
         for (repeats, expected) in [
             (RepeatLimits::exactly(3), 3),
-            (RepeatLimits { most: 3, enough: 0.0 }, 1),
-            (RepeatLimits { most: 1, enough: 1e9 }, 1),
+            (RepeatLimits { most: 3, max_total_seconds: 0.0 }, 1),
+            (RepeatLimits { most: 1, max_total_seconds: 1e9 }, 1),
             (RepeatLimits::exactly(0), 1),
         ] {
             let (mut runs, mut clears) = (0, 0);
@@ -121,7 +123,7 @@ mod tests {
             };
             let (last, cost) = repeats.measure_cost(|| count(&mut runs), || count(&mut clears).map(|_| ())).unwrap();
             assert_eq!((last, cost.runs, runs, clears), (expected, expected, expected, expected - 1));
-            assert!(cost.seconds.least <= cost.seconds.median && cost.seconds.median <= cost.seconds.most);
+            assert!(cost.seconds.min <= cost.seconds.median && cost.seconds.median <= cost.seconds.max);
         }
     }
 }

@@ -294,7 +294,7 @@ impl ModelPair {
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
-                of: self.views.len(),
+                compared_views: self.views.len(),
                 compressed: Comparison::from_views(&scores, |picture| Some(picture.truth?.compressed))?,
                 original: Comparison::from_views(&scores, |picture| Some(picture.truth?.original))?,
             })

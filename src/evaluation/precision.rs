@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use serde::{Deserialize, Serialize};
 
 use crate::evaluation::cost::{Cost, MedianAndRange};
-use crate::files::csv::{known, table};
+use crate::files::csv::{optional_field, table};
 
 /// Result of the command `precision`: measurements of all varied settings, and the conditions that they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -284,16 +284,16 @@ impl PrecisionDiagram {
             for mark in &curve.settings {
                 let Cost { runs, seconds, processor_seconds, peak_memory_bytes } = &mark.cost;
                 let spread_columns = |spread: Option<&MedianAndRange>| {
-                    [spread.map(|s| s.median), spread.map(|s| s.least), spread.map(|s| s.most)].map(known)
+                    [spread.map(|s| s.median), spread.map(|s| s.min), spread.map(|s| s.max)].map(optional_field)
                 };
                 rows.extend(mark.errors.iter().map(|(of, error)| {
                     let mut row = vec![knob.name.clone(), knob.source.name().to_owned(), curve.name.clone()];
                     row.extend([mark.value, mark.step, *error].map(|value| value.to_string()));
-                    row.extend([of.clone(), known(mark.psnr), runs.to_string()]);
+                    row.extend([of.clone(), optional_field(mark.psnr), runs.to_string()]);
                     row.extend(
                         spread_columns(Some(seconds)).into_iter().chain(spread_columns(processor_seconds.as_ref())),
                     );
-                    row.push(known(*peak_memory_bytes));
+                    row.push(optional_field(*peak_memory_bytes));
                     row
                 }));
             }

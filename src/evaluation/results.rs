@@ -11,7 +11,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::ShowPath;
-use crate::files::csv::{known, table};
+use crate::files::csv::{optional_field, table};
 use crate::files::names::name_of;
 use crate::journal::records::RenderTime;
 use crate::models::ModelSize;
@@ -114,7 +114,8 @@ pub struct TruthComparison {
     /// Path of the folder of the photographs.
     pub folder: String,
     /// Number of views on which the models are compared. Only [`QualityMeans::pairs`] of them have a photograph.
-    pub of: usize,
+    #[serde(rename = "of")]
+    pub compared_views: usize,
     /// Mean scores of the compressed model against the photographs.
     #[serde(flatten)]
     pub compressed: Comparison,
@@ -306,11 +307,11 @@ impl Evaluation {
         }
         if let Some(truth) = &self.ground_truth {
             let pairs = truth.compressed.overall.pairs;
-            if pairs < truth.of {
+            if pairs < truth.compared_views {
                 let _ = writeln!(
                     out,
                     "  ground truth: {pairs} of {} views have a photograph in {}",
-                    truth.of, truth.folder
+                    truth.compared_views, truth.folder
                 );
             }
         }
@@ -337,8 +338,8 @@ impl Evaluation {
             let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
             let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
-                row.extend([score.psnr.to_string(), score.ssim.to_string(), known(score.temporal)]);
-                row.extend(with_flip.then(|| known(score.flip)));
+                row.extend([score.psnr.to_string(), score.ssim.to_string(), optional_field(score.temporal)]);
+                row.extend(with_flip.then(|| optional_field(score.flip)));
             }
             row.resize(names.len(), String::new());
             row
@@ -388,7 +389,7 @@ mod tests {
             rig_sides: None,
             ground_truth: truth.map(|comparison| TruthComparison {
                 folder: String::new(),
-                of: 2,
+                compared_views: 2,
                 compressed: comparison.clone(),
                 original: comparison,
             }),

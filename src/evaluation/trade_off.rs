@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 
-use crate::files::csv::{known, table};
+use crate::files::csv::{optional_field, table};
 
 /// Result of the command `sweep`: measurements of all methods, and the conditions that they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -111,15 +111,15 @@ impl TradeOff {
     fn row(&self, point: &TradeOffPoint) -> Vec<String> {
         vec![
             point.method.clone(),
-            known(point.asked),
+            optional_field(point.asked),
             point.count.to_string(),
             self.kept_fraction(point).to_string(),
             point.bytes.to_string(),
             point.psnr.to_string(),
             point.ssim.to_string(),
-            known(point.temporal),
+            optional_field(point.temporal),
             point.seconds.to_string(),
-            known(point.peak_memory_bytes),
+            optional_field(point.peak_memory_bytes),
         ]
     }
 

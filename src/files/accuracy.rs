@@ -69,7 +69,7 @@ impl RenderedAttributes {
     }
 
     /// Returns the median of the Gaussian's three scales.
-    fn middle_scale(&self) -> f64 {
+    fn median_scale(&self) -> f64 {
         let mut scale = self.scale;
         scale.sort_unstable_by(f64::total_cmp);
         scale[1]
@@ -157,7 +157,7 @@ impl CodingErrors {
             id,
             "position",
             position_error,
-            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.middle_scale()),
+            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.median_scale()),
         );
         let flat = FLAT_SCALE * (self.scene + distance(wanted.position, self.middle));
         let mut is_reduced = false;

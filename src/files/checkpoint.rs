@@ -318,7 +318,7 @@ impl Checkpoint {
     fn plain_tensor(&self, id: NodeId) -> Option<TensorView> {
         let (name, arguments) = self.pickle.call(id)?;
         let [storage, offset, size, stride, ..] = *arguments else { return None };
-        let Node::Outside(named) = self.pickle.node(storage) else { return None };
+        let Node::PersistentId(named) = self.pickle.node(storage) else { return None };
         let [what, kind, key, _device, numel] = *self.pickle.elements(*named)? else { return None };
         let Node::Global(kind) = self.pickle.node(kind) else { return None };
         let is_tensor = name == "torch._utils._rebuild_tensor_v2" && self.pickle.text(what)? == "storage";

@@ -6,7 +6,7 @@
 use std::fmt::Display;
 
 /// Formats a value as a CSV field; `None` becomes an empty field.
-pub(crate) fn known(value: Option<impl Display>) -> String {
+pub(crate) fn optional_field(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 

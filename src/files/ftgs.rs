@@ -106,13 +106,14 @@ pub struct Ftgs {
 }
 
 /// Defect of a row (Gaussian) with a value that is not finite: its name, whether the row is left out, and the reason.
-/// `ZERO_QUATERNION` and `KEPT_ZERO_QUATERNION` describe zero quaternions in the same form.
 const NON_FINITE: (&str, bool, &str) = ("NaN or infinite value", true, "the player refuses files with such values");
+/// Defect of a row (Gaussian) with a zero quaternion, if such rows are left out. Same form as [`NON_FINITE`].
 const ZERO_QUATERNION: (&str, bool, &str) = (
     "zero quaternion",
     true,
     "the player refuses files with such rotations; --zero-rotation identity keeps the Gaussians without a rotation",
 );
+/// Defect of a row (Gaussian) with a zero quaternion, if such rows are kept. Same form as [`NON_FINITE`].
 const KEPT_ZERO_QUATERNION: (&str, bool, &str) =
     ("zero quaternion", false, "taken as the identity, as --zero-rotation asks");
 

@@ -55,7 +55,7 @@ pub(crate) enum Node {
     /// Result of calling `callee` with `arguments`, and the items that are set in the result afterwards.
     Called { callee: NodeId, arguments: NodeId, items: Vec<(NodeId, NodeId)> },
     /// An object that is stored outside the pickle (persistent id). Holds the node that identifies the object.
-    Outside(NodeId),
+    PersistentId(NodeId),
 }
 
 /// Object tree that a pickle builds.
@@ -195,7 +195,7 @@ impl Pickle {
                 let names: Vec<&str> = self.items(id).into_iter().flatten().map(|(name, _)| name).take(MOST).collect();
                 format!("a dict of {}: {}", self.pairs(id).map_or(0, <[_]>::len), names.join(", "))
             }
-            Node::Outside(_) => "a storage".into(),
+            Node::PersistentId(_) => "a storage".into(),
         }
     }
 

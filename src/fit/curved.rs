@@ -53,7 +53,7 @@ impl CubicTrack {
 pub struct CurveForm {
     /// Whether positions are linear and rotations are constant in time. If not, positions are cubic and rotations are
     /// linear.
-    is_linear: bool,
+    has_linear_motion: bool,
     /// Minimum width of the time window, in units of time.
     min_width: f64,
     /// Maximum number of intervals between the centers of overlapping curves: the number of curves minus 1.
@@ -62,12 +62,12 @@ pub struct CurveForm {
 
 impl CurveForm {
     /// Cubic motion, linear rotation, and time windows of any width.
-    pub const CUBIC: CurveForm = CurveForm { is_linear: false, min_width: 0.0, max_intervals: 32 };
+    pub const CUBIC: CurveForm = CurveForm { has_linear_motion: false, min_width: 0.0, max_intervals: 32 };
 
     /// Returns the form with linear motion, constant rotation, and time windows of at least `min_width` units of time.
     /// A [`CubicTrack`] of this form has quadratic and cubic coefficients of 0.
     pub fn linear(min_width: f64) -> CurveForm {
-        CurveForm { is_linear: true, min_width, max_intervals: 32 }
+        CurveForm { has_linear_motion: true, min_width, max_intervals: 32 }
     }
 
     /// Returns this form with at most `max_intervals` intervals between the centers of overlapping curves, that is,
@@ -79,7 +79,7 @@ impl CurveForm {
     /// Returns the numbers of intervals to try, in this order. An interval lies between the centers of two neighboring
     /// overlapping curves, so n intervals take n + 1 curves.
     fn intervals(self) -> &'static [usize] {
-        if self.is_linear { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
+        if self.has_linear_motion { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32] } else { &[2, 4, 8, 16, 32] }
     }
 }
 
@@ -120,7 +120,7 @@ pub fn fit_curves(
         excess <= 1.0
     };
     let mut done = attempt(vec![constant_curve(track, form)]);
-    let fading = if form.is_linear { fading_curve(track, form) } else { None };
+    let fading = if form.has_linear_motion { fading_curve(track, form) } else { None };
     done = done || fading.is_some_and(|curve| attempt(vec![curve]));
     done = done || attempt(vec![single_window_curve(track, form)]);
     let visible = [track.times[first], track.times[last]];
@@ -273,7 +273,7 @@ fn fit_motion(
     let scaled = |frame: usize| (track.times[frame] - center) / reach;
     let positions = samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight));
     let rotations = samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight));
-    let (position, rotation): ([[f64; 3]; 4], [[f64; 4]; 2]) = if form.is_linear {
+    let (position, rotation): ([[f64; 3]; 4], [[f64; 4]; 2]) = if form.has_linear_motion {
         let [at, velocity] = polynomial(positions, RIDGE);
         let [mean] = polynomial(rotations, RIDGE);
         ([at, velocity, [0.0; 3], [0.0; 3]], [mean, [0.0; 4]])

@@ -77,7 +77,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::files::checkpoint::made::{Made, named, tensor};
+    use crate::files::checkpoint::made::{PythonValue, named, tensor};
     use crate::models;
     use crate::models::OpenOptions;
 
@@ -86,13 +86,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let error_message = |path: &Path| models::open(path, &OpenOptions::default()).err().unwrap().to_string();
         let file = folder.path().join("step-000029999.ckpt");
-        let one = || Made::Tensor(tensor(0, &[1], &[0.0]));
-        let pipeline = |name| Made::Dict(named(vec![("pipeline", Made::Dict(named(vec![(name, one())])))]));
+        let one = || PythonValue::Tensor(tensor(0, &[1], &[0.0]));
+        let pipeline =
+            |name| PythonValue::Dict(named(vec![("pipeline", PythonValue::Dict(named(vec![(name, one())])))]));
         for (made, expected) in [
             (pipeline("_model.gauss_params.scales_t"), "4D-Rotor"),
             (pipeline("_model.gauss_params.means"), "nerfstudio"),
-            (Made::Tuple(vec![Made::Ordered(named(vec![("hash_encoder.params", one())]))]), "Grid4D"),
-            (Made::Int(7), "unsupported checkpoint"),
+            (PythonValue::Tuple(vec![PythonValue::Ordered(named(vec![("hash_encoder.params", one())]))]), "Grid4D"),
+            (PythonValue::Int(7), "unsupported checkpoint"),
         ] {
             fs::write(&file, made.file()).unwrap();
             let message = error_message(&file);

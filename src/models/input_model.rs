@@ -83,12 +83,12 @@ pub trait InputModel: Send + Sync {
     fn timing(&self) -> TimeOrigin;
 
     /// Returns the unit of the camera times, for models whose frame times come from cameras.
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Normalized
     }
 
     /// Returns the duration of the model in its own time unit. It is used if no frame times are given.
-    fn span(&self) -> f64 {
+    fn duration(&self) -> f64 {
         1.0
     }
 

@@ -112,9 +112,9 @@ fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
     let is_lost = 2 * lost > found.len();
     let Some(OrderDifference {
         position_difference: moved,
-        apart,
+        unrelated_position_difference: apart,
         appearance_difference: unlike,
-        unrelated_pairs: strangers,
+        unrelated_appearance_difference: strangers,
         ..
     }) = found.iter().find(|found| found.is_common != is_lost)
     else {

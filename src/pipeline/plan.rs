@@ -219,8 +219,8 @@ impl RunPlan {
         limits: &'a Limits,
         measured: MeasuredOnArrival,
     ) -> EstimateInput<'a> {
-        let left = self.target.map_or(1.0, |target| target as f64 / self.gaussians.max(1) as f64).min(1.0);
-        EstimateInput { work, limits, left, measured }
+        let output_fraction = self.target.map_or(1.0, |target| target as f64 / self.gaussians.max(1) as f64).min(1.0);
+        EstimateInput { work, limits, output_fraction, measured }
     }
 
     fn estimates_where(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {

@@ -14,7 +14,7 @@ use super::quality_meter::{QualityMeter, QualityReference};
 use super::request::{Goal, Quality};
 use super::stage::{EstimateInput, Phase, RunState};
 use super::stages::bands::ShDegreeStage;
-use super::stages::choose::CLUSTERED;
+use super::stages::choose;
 use super::stages::field::FieldPrecisionStage;
 use super::stages::reference_views::ARCHIVE_HEADROOM;
 use super::summary::GoalSummary;
@@ -147,7 +147,11 @@ impl SearchStage {
         need.fixed.push(("field", work.input.fixed));
         // Prune steps remove a fifth of the Gaussians each, starting from two fifths of all: the states kept after them
         // hold twice the number of Gaussians together.
-        need.per_gaussian.extend([("ways", 3 * (whole + 8)), ("result", work.input.reduced), ("kept", CLUSTERED)]);
+        need.per_gaussian.extend([
+            ("ways", 3 * (whole + 8)),
+            ("result", work.input.reduced),
+            ("kept", choose::BYTES_PER_GAUSSIAN),
+        ]);
         need
     }
 
@@ -225,9 +229,9 @@ impl SearchStage {
                 )
             }
             None => {
-                let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
+                let mut numbers = [&parts.validation[..], &parts.test[..]].concat();
                 numbers.sort_unstable();
-                let view = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
+                let view = |&k: &usize| (targets.pictures[k], parts.test.contains(&k));
                 let views = numbers.iter().map(view).collect();
                 QualityMeter::new(scene, &targets.cameras, views, QualityReference::Original(targets, numbers))
             }

@@ -52,7 +52,7 @@ pub struct EstimateInput<'a> {
     pub limits: &'a Limits,
     /// Number of Gaussians in the output divided by that in the input, above 0 and at most 1; 1 if the number is not
     /// known in advance.
-    pub left: f64,
+    pub output_fraction: f64,
     /// Kinds of statistics that were already computed while the input, a stream, arrived.
     pub measured: MeasuredOnArrival,
 }

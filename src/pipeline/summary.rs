@@ -190,7 +190,7 @@ impl MergeSummary {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SummaryDetail {
     /// Number of Gaussians, size, quality, time, output and a few notes.
-    Most,
+    Brief,
     /// Number of Gaussians, size, quality, time and output, every stage, omitted stages with reasons, and all notes.
     All,
 }

@@ -27,7 +27,7 @@ impl Summary {
         // Writing to a String cannot fail.
         let _ = match detail {
             SummaryDetail::All => self.write_stages(&mut out),
-            SummaryDetail::Most => Ok(()),
+            SummaryDetail::Brief => Ok(()),
         };
         let _ = self.write_table(&mut out);
         let _ = self.write_notes(&mut out, detail);
@@ -168,11 +168,12 @@ impl Summary {
         format!("{} PSNR{ssim} vs. original ({views})", decibels_text(psnr, 2))
     }
 
-    /// Writes the notes of the summary to `out`. With [`SummaryDetail::Most`], writes only the first [`NOTES`] of them.
+    /// Writes the notes of the summary to `out`. With [`SummaryDetail::Brief`], writes only the first [`NOTES`] of
+    /// them.
     fn write_notes(&self, out: &mut String, detail: SummaryDetail) -> std::fmt::Result {
         let shown = match detail {
             SummaryDetail::All => self.notes.len(),
-            SummaryDetail::Most => self.notes.len().min(NOTES),
+            SummaryDetail::Brief => self.notes.len().min(NOTES),
         };
         for note in &self.notes[..shown] {
             writeln!(out, "note: {note}")?;

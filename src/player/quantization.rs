@@ -93,7 +93,7 @@ pub fn quantize_into(state: &Gaussians, which: Attributes, steps: &PlayerSteps, 
         plain(&state.position, &mut points[of(Attributes::POSITION)], &|x| nearest(x.into(), steps.position));
     }
     if which.contains(Attributes::ROTATION) {
-        turn(&state.rotation, steps.rotation, &mut points[of(Attributes::ROTATION)]);
+        quantize_rotations(&state.rotation, steps.rotation, &mut points[of(Attributes::ROTATION)]);
     }
     if which.contains(Attributes::LOG_SCALE) {
         let point = |x: f32| nearest(x.clamp(-LOGARITHM_LIMIT, LOGARITHM_LIMIT).into(), steps.log_scale);
@@ -145,7 +145,7 @@ fn nearest(value: f64, step: f64) -> i32 {
 /// Normalizes the quaternions `rotation` and writes them as multiples of `step` into `points`. A quaternion and its
 /// negative are the same rotation; the one closer to the earlier content of `points` is written. Without this choice, a
 /// jump of the sign would make differences between frames large.
-fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
+fn quantize_rotations(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {
         let q: [f32; 4] = rotation.row(i);

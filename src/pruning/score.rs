@@ -22,9 +22,9 @@ use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
 use crate::recipe::{self, NonFinite};
 use crate::scene::Scene;
-use crate::statistics::aside::StatisticsRows;
 use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
+use crate::statistics::spilled::StatisticsRows;
 use crate::statistics::{fill_anisotropy, snap_noise_to_zero, ulp};
 
 /// Name of this stage in messages and in the cache.
@@ -203,7 +203,7 @@ impl ScoreStage {
                 terms: scores.terms,
                 flags: flags(&rows),
                 statistics: match scene.limits.statistics_on_disk {
-                    true => StatisticsRows::aside(rows, &scene.scratch)?,
+                    true => StatisticsRows::spill(rows, &scene.scratch)?,
                     false => StatisticsRows::Memory(rows),
                 },
                 selection,
@@ -285,7 +285,7 @@ impl Scored {
     pub(crate) fn within(self, limits: &Limits, folder: &Path) -> Result<Scored> {
         Ok(match self.statistics {
             StatisticsRows::Memory(rows) if limits.statistics_on_disk => {
-                Scored { statistics: StatisticsRows::aside(rows, folder)?, ..self }
+                Scored { statistics: StatisticsRows::spill(rows, folder)?, ..self }
             }
             _ => self,
         })
@@ -343,7 +343,7 @@ impl Scored {
     /// whether these differ.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
         let summarize = |term: &Term| TermSummary {
-            name: term.of.name().to_owned(),
+            name: term.quantity.name().to_owned(),
             p1: term.norm.p1,
             p99: term.norm.p99,
             active: term.norm.has_spread(),
@@ -378,10 +378,10 @@ impl Scored {
         if info.sh_degree == 0 {
             journal.leave_out("SH coefficients above degree 0", "SH degree 0");
         }
-        let was_measured = |term: &&Term| !(is_partial && term.of.describes_motion());
+        let was_measured = |term: &&Term| !(is_partial && term.quantity.describes_motion());
         for term in self.terms.iter().filter(was_measured).filter(|term| !term.norm.has_spread()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
-            journal.leave_out(format!("grading by {}", term.of.measured_property()), why);
+            journal.leave_out(format!("grading by {}", term.quantity.measured_property()), why);
         }
         let absent = self.absent.len();
         if absent > 0 {

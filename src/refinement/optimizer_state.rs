@@ -61,22 +61,22 @@ pub(super) struct OptimizerState<'a> {
     /// Indices of the frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Attributes,
-    /// State of each frame in `frames`, without the changes (delta) that the optimizer `descent` has made.
+    /// State of each frame in `frames`, without the changes (delta) that `constant_optimizer` has made.
     linearized: LinearizedFrames,
-    /// Stored parameters without the changes (delta) that the optimizer `descent` has made. Used only if the model has
+    /// Stored parameters without the changes (delta) that `constant_optimizer` has made. Used only if the model has
     /// a deformation field.
     stored: StoredParams,
     /// Constant delta (change of the stored parameters since the start of refinement) that `stored` and `linearized`
-    /// already include. The total constant delta is this one plus the delta of the optimizer `descent`.
-    before: ParamDelta,
+    /// already include. The total constant delta is this one plus the delta of `constant_optimizer`.
+    baked_delta: ParamDelta,
     fixed: Vec<bool>,
     /// Settings of optimization steps, without the attributes and SH degrees that the model does not have or whose
     /// derivatives its deformation field cannot compute.
     step_params: StepParams,
-    descent: Adam,
+    constant_optimizer: Adam,
     /// One optimizer per keyframe of the time-varying delta (values that refinement adds to each frame); empty if the
     /// delta is constant in time.
-    course: Vec<Adam>,
+    keyframe_optimizers: Vec<Adam>,
     /// For each Gaussian, the attributes that vary between frames; no attributes if the model has a deformation field.
     changing: Vec<Attributes>,
     gradients: Gradients,
@@ -88,7 +88,7 @@ pub(super) struct OptimizerState<'a> {
     stride: NonZeroU32,
     /// Number of optimization steps since the frame states were last evaluated.
     steps: usize,
-    /// Whether the frame states were evaluated again since the optimizer `descent` was created, at the beginning or in
+    /// Whether the frame states were evaluated again since `constant_optimizer` was created, at the beginning or in
     /// the last prune step.
     reevaluated: bool,
 }
@@ -132,9 +132,9 @@ impl<'a> OptimizerState<'a> {
             deformation,
             linearized: LinearizedFramesWriter::new(&scene.scratch, varying)?.finish()?,
             stored: deformation.map_or_else(|| empty.clone().into(), |deformation| deformation.stored().clone()),
-            before: ParamDelta::default(),
-            descent: Adam::new(&empty, columns, sh_degree, &[]),
-            course: Vec::new(),
+            baked_delta: ParamDelta::default(),
+            constant_optimizer: Adam::new(&empty, columns, sh_degree, &[]),
+            keyframe_optimizers: Vec::new(),
             changing: vec![Attributes::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
             now: LinearizedState::none(state_degree),
@@ -174,13 +174,13 @@ impl<'a> OptimizerState<'a> {
         Ok(optimizer)
     }
 
-    /// Replaces the optimizer `descent` by a new one, which has not changed anything yet, for the Gaussians in
+    /// Replaces `constant_optimizer` by a new one, which has not changed anything yet, for the Gaussians in
     /// `linearized`. Also sets the stride that suits the number of these Gaussians.
     fn start_optimizer(&mut self) {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
         let StepParams { columns, sh_degree, loss } = self.step_params;
-        self.descent = Adam::new(state, columns, sh_degree, &self.fixed);
+        self.constant_optimizer = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
         // A multiple of the stride of the stored values.
         let (pixels, stored) = (self.scene.workload().pixels, self.targets.stride());
@@ -197,18 +197,22 @@ impl<'a> OptimizerState<'a> {
         let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {
             return false;
         };
-        self.course = (0..keyframe_count).map(|_| Adam::new(state, columns, 0, &self.fixed)).collect();
+        self.keyframe_optimizers = (0..keyframe_count).map(|_| Adam::new(state, columns, 0, &self.fixed)).collect();
         true
     }
 
     /// Returns the time-varying delta, the values that refinement adds to each frame: one set of values per keyframe.
-    pub(super) fn course(&self) -> TrajectoryDelta {
-        TrajectoryDelta(self.course.iter().map(|knot| knot.delta().clone()).collect())
+    pub(super) fn trajectory_delta(&self) -> TrajectoryDelta {
+        TrajectoryDelta(self.keyframe_optimizers.iter().map(|knot| knot.delta().clone()).collect())
     }
 
     /// Returns the two keyframes between which frame `frames[k]` lies, with their interpolation weights.
     fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
-        TrajectoryDelta::keyframe_weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
+        TrajectoryDelta::keyframe_weights(
+            self.keyframe_optimizers.len(),
+            self.frames[k],
+            self.scene.source().info().times.len(),
+        )
     }
 
     /// Returns for each Gaussian whether it is excluded from optimization because it is protected.
@@ -219,8 +223,12 @@ impl<'a> OptimizerState<'a> {
     /// Returns the total constant delta: the current stored parameters minus the stored parameters at the start. The
     /// time-varying delta is not part of it.
     pub(super) fn change(&self) -> ParamDelta {
-        let before = self.before.clone();
-        if self.descent.has_moved() { before.plus(self.descent.delta().clone()) } else { before }
+        let baked_delta = self.baked_delta.clone();
+        if self.constant_optimizer.has_moved() {
+            baked_delta.plus(self.constant_optimizer.delta().clone())
+        } else {
+            baked_delta
+        }
     }
 
     /// Evaluates the frame states anew from the stored parameters. Does nothing if the model has no deformation field,
@@ -248,10 +256,10 @@ impl<'a> OptimizerState<'a> {
 
     /// Returns the state of the optimizer for a checkpoint, from which [`OptimizerState::resume`] continues.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
-        let reevaluated = self.reevaluated.then_some((&self.stored, &self.before));
-        let course = self.course.iter().map(Adam::checkpoint).collect();
+        let reevaluated = self.reevaluated.then_some((&self.stored, &self.baked_delta));
+        let keyframe_optimizers = self.keyframe_optimizers.iter().map(Adam::checkpoint).collect();
         let checkpoint: OptimizerCheckpoint<&StoredParams, &ParamDelta, &[Gaussians; 2]> =
-            (reevaluated, self.descent.checkpoint(), self.steps, course);
+            (reevaluated, self.constant_optimizer.checkpoint(), self.steps, keyframe_optimizers);
         checkpoint
     }
 
@@ -259,17 +267,23 @@ impl<'a> OptimizerState<'a> {
     ///
     /// # Errors
     /// Fails if a scratch file cannot be written.
-    pub(super) fn resume(&mut self, (reevaluated, descent, steps, course): KeptCheckpoint) -> Result<()> {
-        if let Some((stored, before)) = reevaluated {
-            self.descent.take_delta();
-            (self.stored, self.before) = (stored, before);
+    pub(super) fn resume(
+        &mut self,
+        (reevaluated, constant_optimizer, steps, keyframe_optimizers): KeptCheckpoint,
+    ) -> Result<()> {
+        if let Some((stored, baked_delta)) = reevaluated {
+            self.constant_optimizer.take_delta();
+            (self.stored, self.baked_delta) = (stored, baked_delta);
             self.reevaluate_states()?;
         }
-        self.descent.resume(descent);
+        self.constant_optimizer.resume(constant_optimizer);
         self.steps = steps;
-        if !course.is_empty() {
-            self.enable_keyframes(course.len());
-            self.course.iter_mut().zip(course).for_each(|(knot, checkpoint)| knot.resume(checkpoint));
+        if !keyframe_optimizers.is_empty() {
+            self.enable_keyframes(keyframe_optimizers.len());
+            self.keyframe_optimizers
+                .iter_mut()
+                .zip(keyframe_optimizers)
+                .for_each(|(knot, checkpoint)| knot.resume(checkpoint));
         }
         Ok(())
     }
@@ -278,7 +292,7 @@ impl<'a> OptimizerState<'a> {
     pub(super) fn positions(&self) -> AttributeValues {
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return AttributeValues::default() };
         let mut moved = Gaussians { position: state.position.clone(), ..Gaussians::default() };
-        self.descent.delta().add_to(&mut moved, Attributes::POSITION);
+        self.constant_optimizer.delta().add_to(&mut moved, Attributes::POSITION);
         moved.position
     }
 
@@ -288,21 +302,21 @@ impl<'a> OptimizerState<'a> {
     /// # Errors
     /// Fails if a scratch file cannot be written.
     pub(super) fn restart_from(&mut self, change: &ParamDelta) -> Result<()> {
-        self.descent.restart(&change.minus(&self.before));
+        self.constant_optimizer.restart(&change.minus(&self.baked_delta));
         self.reevaluate_states()
     }
 
-    /// Adds the delta of the optimizer `descent` to the delta `self.before` and, if the model has a deformation field,
-    /// to the parameters `self.stored`. Then resets the delta of `descent` to 0.
+    /// Adds the delta of `constant_optimizer` to the delta `self.baked_delta` and, if the model has a deformation
+    /// field, to the parameters `self.stored`. Then resets the delta of `constant_optimizer` to 0.
     fn bake_delta(&mut self) {
-        if !self.descent.has_moved() {
+        if !self.constant_optimizer.has_moved() {
             return;
         }
-        let moved = self.descent.take_delta();
+        let moved = self.constant_optimizer.take_delta();
         if self.deformation.is_some() {
             moved.add_to(&mut self.stored.gaussians, Attributes::all());
         }
-        self.before = std::mem::take(&mut self.before).plus(moved);
+        self.baked_delta = std::mem::take(&mut self.baked_delta).plus(moved);
     }
 
     /// Removes all Gaussians except those with the indices `places`. The remaining ones keep their current states.
@@ -321,7 +335,7 @@ impl<'a> OptimizerState<'a> {
         if self.deformation.is_some() {
             self.stored = self.stored.pick(places);
         }
-        self.before = self.before.pick(places);
+        self.baked_delta = self.baked_delta.pick(places);
         self.changing = places.iter().map(|&frame_index| self.changing[frame_index as usize]).collect();
         self.fixed = places.iter().map(|&frame_index| self.fixed[frame_index as usize]).collect();
         self.start_optimizer();
@@ -332,14 +346,14 @@ impl<'a> OptimizerState<'a> {
     /// `now`.
     fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
         self.linearized.read(k, now)?;
-        let change = self.descent.delta();
+        let change = self.constant_optimizer.delta();
         match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
         }
-        if !self.course.is_empty() {
+        if !self.keyframe_optimizers.is_empty() {
             let deltas = self.keyframes_around(k).map(|(knot, weight)| {
-                let change = self.course[knot].delta();
+                let change = self.keyframe_optimizers[knot].delta();
                 let mut change = now.present.as_ref().map_or_else(|| change.clone(), |present| change.pick(present));
                 change.scale(weight);
                 change
@@ -365,7 +379,7 @@ impl<'a> OptimizerState<'a> {
         }
         self.steps += 1;
         self.differentiate(k)?;
-        self.descent.step(&self.gradients, 1.0, schedule);
+        self.constant_optimizer.step(&self.gradients, 1.0, schedule);
         Ok(())
     }
 
@@ -386,7 +400,7 @@ impl<'a> OptimizerState<'a> {
             }
         }
         for (knot, weight) in self.keyframes_around(self.frame_index(k)) {
-            self.course[knot].step(&self.gradients, weight, schedule);
+            self.keyframe_optimizers[knot].step(&self.gradients, weight, schedule);
         }
         Ok(())
     }

@@ -233,9 +233,9 @@ impl<'a> RefineRun<'a> {
         targets: &'a Targets,
         parts: ViewSplit,
     ) -> RefineRun<'a> {
-        let views = (&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart);
+        let views = (&targets.cameras, &targets.pictures, &parts.training, &parts.validation);
         let key = scene.work.key(&(refine.key(), views, &scored.protected));
-        let (sampler, validation) = (EpochSampler::new(parts.stepped), parts.apart);
+        let (sampler, validation) = (EpochSampler::new(parts.training), parts.validation);
         let progress = scene.events.task(stage, "steps", 0);
         RefineRun { refine, scene, scored, targets, sampler, validation, stage, progress, key }
     }
@@ -558,7 +558,7 @@ impl<'a> RefineRun<'a> {
                 let now = optimizer.quality(&self.validation)?;
                 let gains = self.refine.loss.ssim > 0.0 || now.psnr >= best_state.best.psnr + MIN_KEYFRAME_GAIN;
                 if gains && self.refine.loss.is_closer(&now, &best_state.best) {
-                    (best_state.best, best_state.trajectory) = (now, optimizer.course());
+                    (best_state.best, best_state.trajectory) = (now, optimizer.trajectory_delta());
                 }
             }
             self.save_checkpoint(optimizer, timer, (steps + step, schedule), Some(best_state.checkpoint()))?;

@@ -38,11 +38,11 @@ const TEST_EVERY: usize = 4;
 #[derive(Clone)]
 pub(crate) struct ViewSplit {
     /// Training views, to which optimization steps fit the parameters.
-    pub(crate) stepped: Vec<usize>,
+    pub(crate) training: Vec<usize>,
     /// Validation views, by which the best parameters are chosen.
-    pub(crate) apart: Vec<usize>,
+    pub(crate) validation: Vec<usize>,
     /// Test views, used only to report the quality, not for training or validation.
-    pub(crate) held: Vec<usize>,
+    pub(crate) test: Vec<usize>,
 }
 
 /// Returns two numbers of target views: from the scene's cameras, and from new cameras. Their sum is at most
@@ -124,9 +124,9 @@ impl Targets {
     pub(crate) fn split(&self) -> ViewSplit {
         let with_purpose = |purpose| (0..self.pictures.len()).filter(|&k| self.purpose(k) == purpose).collect();
         ViewSplit {
-            stepped: with_purpose(Purpose::Training),
-            apart: with_purpose(Purpose::Validation),
-            held: with_purpose(Purpose::Test),
+            training: with_purpose(Purpose::Training),
+            validation: with_purpose(Purpose::Validation),
+            test: with_purpose(Purpose::Test),
         }
     }
 

@@ -363,7 +363,7 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
     for stored in [2, 3] {
         let targets = Targets::new(&scene, 60, stride(stored), true).unwrap();
         let split = targets.split();
-        assert!(!split.stepped.is_empty() && !split.apart.is_empty() && !split.held.is_empty());
+        assert!(!split.training.is_empty() && !split.validation.is_empty() && !split.test.is_empty());
         for k in 0..targets.pictures.len() {
             for wanted in [stride(stored), stride(2 * stored)] {
                 let [expected, got] = [&all, &targets].map(|targets| targets.values(k, wanted).unwrap());
@@ -374,7 +374,7 @@ fn values_at_a_stride_do_not_depend_on_the_stored_stride() {
                 assert!(largest <= 7, "view {k} at stride {wanted}: values differ by {largest} of 65535");
             }
         }
-        for k in split.apart.into_iter().chain(split.held) {
+        for k in split.validation.into_iter().chain(split.test) {
             assert_eq!(targets.view(k, stride(stored)).grid, crate::render::PixelGrid::ALL, "view {k}");
         }
     }

@@ -137,7 +137,7 @@ impl AxisScale {
 
     /// Extends the range of values of this axis at its upper end, so that `room` pixels stay free after the largest
     /// value.
-    fn leave(&mut self, room: f64) {
+    fn reserve_end(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
@@ -201,7 +201,7 @@ impl Plot {
         let y = AxisScale::new(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
         let (Some(mut x), Some(y)) = (x, y) else { return out.empty() };
         let longest = self.series.iter().flat_map(|series| &series.labels).map(|label| label.chars().count()).max();
-        x.leave(longest.unwrap_or(0) as f64 * LETTER);
+        x.reserve_end(longest.unwrap_or(0) as f64 * LETTER);
         out.axes(&x, &y, &self.x.label, &self.y.label);
         for (series, look) in self.series.iter().zip(looks) {
             let place = |(k, &(a, b)): (usize, &(f64, f64))| Some((k, x.at(a)?, y.at(b)?));

@@ -97,7 +97,8 @@ pub fn kind_flags(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> 
         .copied()
         .filter(|&i| visible(i as usize) && rows.d[i as usize] >= MIN_FAST_MOTION * extent)
         .collect();
-    for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
+    for (&id, bent) in fast.iter().zip(non_rigid_motion(source, &reference, &fast, visible, &frames, NEAREST * extent)?)
+    {
         found[id as usize][GaussianKind::Motion as usize] = bent >= MIN_NON_RIGID_CHANGE;
     }
     let recolored = color_change(source, &all, &frames, alpha_min)?;
@@ -145,7 +146,7 @@ fn samples(frames: usize) -> Vec<usize> {
 /// divided by the distance at the reference frame or by `nearest`, whichever is larger. Returns for each Gaussian the
 /// lower median of these relative changes over its neighbors. `frames` are the frames at which distances are measured.
 /// A rigid motion, rotations included, gives 0. The median ignores neighbors that belong to another object.
-fn bending(
+fn non_rigid_motion(
     source: &dyn FrameSource,
     reference: &Gaussians,
     ids: &[u32],
@@ -271,8 +272,8 @@ mod tests {
         SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Attributes::all() }
     }
 
-    /// Returns the non-rigid motion ([`bending`]) of each point of a moving lattice of 5 × 5 × 5 points. `place`
-    /// returns the position of a lattice point at a time from 0 to 1.
+    /// Returns the non-rigid motion ([`non_rigid_motion`]) of each point of a moving lattice of 5 × 5 × 5 points.
+    /// `place` returns the position of a lattice point at a time from 0 to 1.
     fn bent(place: impl Fn([f64; 3], f64) -> [f64; 3] + Sync + Send) -> Vec<f64> {
         let source = Made(info(125, 10), |id, frame, out: &mut Gaussians, row| {
             let at = [id % 5, id / 5 % 5, id / 25].map(|k| k as f64);
@@ -280,7 +281,7 @@ mod tests {
         });
         let all: Vec<u32> = (0..125).collect();
         let reference = gather(&source, &all, 0, Attributes::POSITION).unwrap();
-        bending(&source, &reference, &all, |_| true, &samples(10), 1e-3).unwrap()
+        non_rigid_motion(&source, &reference, &all, |_| true, &samples(10), 1e-3).unwrap()
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::statistics::score::{ScoredQuantity, Scores};
 const BINS: usize = 40;
 /// Minimum of the lower edge of the first bin, as a fraction of the largest value. Smaller positive values are counted
 /// in the first bin.
-const DEEPEST: f64 = 1e-8;
+const MIN_LOW_EDGE: f64 = 1e-8;
 
 /// One value for each fate of Gaussians: kept, merged, dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
@@ -105,7 +105,7 @@ impl Histogram {
             .copied()
             .filter(positive)
             .fold((f64::INFINITY, 0.0f64), |(low, high), v| (low.min(v), high.max(v)));
-        low = low.max(high * DEEPEST);
+        low = low.max(high * MIN_LOW_EDGE);
         let bins = if high == 0.0 {
             0
         } else if low == high {

@@ -38,7 +38,7 @@ pub fn page(found: &PrecisionDiagram) -> String {
             "<section>\n<h2>{} <small>({} error)</small></h2>\n{}</section>\n",
             escape(&knob.name),
             knob.source.name(),
-            turned(knob)
+            knob_html(knob)
         );
     }
     body += &format!(
@@ -52,7 +52,7 @@ pub fn page(found: &PrecisionDiagram) -> String {
 /// Returns the work-precision diagrams as an HTML section of a report.
 pub(super) fn section(found: &PrecisionDiagram) -> String {
     let knob = |knob: &PrecisionKnob| {
-        format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
+        format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), knob_html(knob))
     };
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
@@ -77,7 +77,7 @@ fn conditions(found: &PrecisionDiagram) -> String {
 }
 
 /// Returns the HTML of the charts and tables of one knob (group of parameters that were varied).
-fn turned(knob: &PrecisionKnob) -> String {
+fn knob_html(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
         out += &figure_of(&caption, &svg);
@@ -166,7 +166,7 @@ fn table(curve: &PrecisionCurve) -> String {
         let cells = [
             label(curve, mark),
             figure(cost.seconds.median),
-            format!("{} – {}", figure(cost.seconds.least), figure(cost.seconds.most)),
+            format!("{} – {}", figure(cost.seconds.min), figure(cost.seconds.max)),
             known(cost.processor_seconds.map(|seconds| seconds.median)),
             known(cost.peak_memory_bytes.map(|bytes| (bytes >> 20) as f64)),
             known(mark.psnr),
@@ -242,7 +242,7 @@ mod tests {
     fn what_is_exact_has_a_table_and_no_diagram() {
         let knob = knob(vec![mark(1.0, &[("bytes", 0.0)])]);
         assert!(charts(&knob).is_empty());
-        let section = turned(&knob);
+        let section = knob_html(&knob);
         assert!(section.contains("<td>0</td>") && !section.contains("<b>"), "{section}");
     }
 }

@@ -1,7 +1,7 @@
 //! CSV tables that are written beside the report page.
 
 use super::failure::FailureMode;
-use crate::files::csv::{known, table};
+use crate::files::csv::{optional_field, table};
 use crate::journal::records::StageRecord;
 
 /// Returns a CSV table of the measurements of all failure modes, one line per failure mode.
@@ -27,17 +27,17 @@ pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
             of.name.to_owned(),
             serde_json::to_value(of.verdict).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default(),
             of.gaussians.to_string(),
-            known(of.dropped),
-            known(of.merged),
+            optional_field(of.dropped),
+            optional_field(of.merged),
             of.coverage.to_string(),
-            known(of.coverage_lost),
+            optional_field(of.coverage_lost),
             of.pixel_share.to_string(),
-            known(of.psnr_on_kind),
-            known(of.psnr_elsewhere),
-            known(of.detail_lost),
-            known(of.worst.map(|worst| worst.frame)),
-            known(of.worst.map(|worst| worst.view)),
-            known(of.worst.map(|worst| worst.psnr)),
+            optional_field(of.psnr_on_kind),
+            optional_field(of.psnr_elsewhere),
+            optional_field(of.detail_lost),
+            optional_field(of.worst.map(|worst| worst.frame)),
+            optional_field(of.worst.map(|worst| worst.view)),
+            optional_field(of.worst.map(|worst| worst.psnr)),
         ]
     };
     table(&names, modes.iter().map(row))
@@ -51,8 +51,8 @@ pub(super) fn stages(stages: &[StageRecord]) -> String {
             of.gaussians_in.to_string(),
             of.gaussians_out.to_string(),
             of.seconds.to_string(),
-            known(of.processor_seconds),
-            known(of.peak_memory_bytes),
+            optional_field(of.processor_seconds),
+            optional_field(of.peak_memory_bytes),
         ]
     };
     table(

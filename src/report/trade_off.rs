@@ -103,14 +103,14 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
         plot("PSNR by run time", log("time to compress, s"), linear("PSNR, dB"), [&seconds, &psnr], true),
         plot("SSIM by run time", log("time to compress, s"), linear("SSIM"), [&seconds, &ssim], true),
     ];
-    charts.extend(found.knobs.iter().map(|knob| turned(knob, found)));
+    charts.extend(found.knobs.iter().map(|knob| effort_chart(knob, found)));
     charts.push(plot("Error by memory", log("peak memory, MiB"), log(ERROR), [&memory, &|p| Some(error(p))], false));
     charts
 }
 
 /// Returns the chart of error against run time with a mark for each tried value of the parameter `knob`. For
 /// comparison, the chart also has a mark for the same method without refinement, at the same number of Gaussians.
-fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
+fn effort_chart(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
     let is_beside = |point: &&TradeOffPoint| {

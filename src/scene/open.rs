@@ -41,7 +41,7 @@ pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
                 None if !times.is_empty() => times,
                 // The given number of frames equals the number of the cameras' times, so these times are used.
                 Some(frames) if frames == times.len() => times,
-                given => evenly_spaced(given, input.span(), &mut notes)?,
+                given => evenly_spaced(given, input.duration(), &mut notes)?,
             };
             input.with_times(times)?
         }
@@ -81,7 +81,7 @@ fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<
         _ => options.times.clone(),
     };
     let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, Some(input));
-    let rig = load(input.clock())?;
+    let rig = load(input.time_convention())?;
     let fits = |rig: &Rig| rig.schedule(&input.source().info().times, options.split).is_ok();
     match rig.as_ref().is_some_and(|rig| input.timing() == TimeOrigin::Stamped && !fits(rig)) {
         true => Ok(load(TimeConvention::Given)?.filter(fits).or(rig)),

@@ -9,7 +9,6 @@
 //! order, without changing a bit of the result.
 
 mod anisotropy;
-pub(crate) mod aside;
 mod life;
 mod motion;
 mod noise;
@@ -18,6 +17,7 @@ mod plan;
 pub mod projection;
 mod scan;
 pub mod score;
+pub(crate) mod spilled;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -25,5 +25,5 @@ mod tests;
 pub use anisotropy::fill_anisotropy;
 pub use noise::{SnapCounts, snap_noise_to_zero, ulp};
 pub use plan::ScanPlan;
-use scan::wanted;
+use scan::attributes_to_read;
 pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED_ATTRIBUTES};

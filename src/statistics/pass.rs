@@ -16,7 +16,7 @@ use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
-use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan, wanted};
+use crate::statistics::{BlockScan, NEEDED_ATTRIBUTES, ScanPlan, attributes_to_read};
 
 /// Statistics that a scan has computed.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -149,7 +149,7 @@ impl<'a> RunningScan<'a> {
                 let mut state = Gaussians::zeros(range.len(), info.sh_degree);
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
-                    let changed = wanted(first + t, info.varying);
+                    let changed = attributes_to_read(first + t, info.varying);
                     // The buffer is new, so its first read must also fill the attributes that do not vary. They count
                     // as unchanged all the same, since the scan knows them already.
                     let want = if t == 0 { changed | NEEDED_ATTRIBUTES } else { changed };

@@ -29,7 +29,7 @@ const CARRY_BITS: u32 = 52;
 pub const NEEDED_ATTRIBUTES: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Returns the attributes to read at frame `frame`: all of them at frame 0, and only the `varying` ones after it.
-pub(super) fn wanted(frame: usize, varying: Attributes) -> Attributes {
+pub(super) fn attributes_to_read(frame: usize, varying: Attributes) -> Attributes {
     if frame == 0 { Attributes::all() } else { varying }
 }
 

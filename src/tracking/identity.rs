@@ -23,16 +23,16 @@ pub struct OrderDifference {
     pub position_difference: f64,
     /// Median distance between the positions of unrelated Gaussians (index i of the first frame and i + N/2 of the
     /// second), in units of the smaller Gaussian's size.
-    pub apart: f64,
+    pub unrelated_position_difference: f64,
     /// Median difference in appearance between Gaussians at the same index: sum of the squared differences in size,
     /// shape, opacity and base color, each divided by the difference that adds 1 to the cost of a link.
     pub appearance_difference: f64,
     /// Median difference in appearance, in the unit of `appearance_difference`, between unrelated Gaussians (index i of
     /// the first frame and i + N/2 of the second).
-    pub unrelated_pairs: f64,
+    pub unrelated_appearance_difference: f64,
     /// Whether equal indices in the two frames denote the same Gaussian: `position_difference` is at most half of
-    /// `apart` or no more than rounding, and `appearance_difference` is at most half of `unrelated_pairs` or no more
-    /// than rounding. Always true for fewer than 16 Gaussians.
+    /// `unrelated_position_difference` or no more than rounding, and `appearance_difference` is at most half of
+    /// `unrelated_appearance_difference` or no more than rounding. Always true for fewer than 16 Gaussians.
     pub is_common: bool,
 }
 
@@ -52,9 +52,9 @@ pub fn compare_order(before: &Gaussians, after: &Gaussians) -> OrderDifference {
     let holds = count < MIN_GAUSSIANS || (is_less(moved, apart) && is_less(unlike, strangers));
     OrderDifference {
         position_difference: moved,
-        apart,
+        unrelated_position_difference: apart,
         appearance_difference: unlike,
-        unrelated_pairs: strangers,
+        unrelated_appearance_difference: strangers,
         is_common: holds,
     }
 }

@@ -244,7 +244,10 @@ fn kept_order_is_told_from_shuffled_order() {
     let next = later(&cloud, 1, 0.02, &mut random);
     let kept = compare_order(&cloud, &next);
     assert!(
-        kept.is_common && kept.position_difference < 2.0 && kept.apart > 5.0 && kept.appearance_difference < 1e-6,
+        kept.is_common
+            && kept.position_difference < 2.0
+            && kept.unrelated_position_difference > 5.0
+            && kept.appearance_difference < 1e-6,
         "{kept:?}"
     );
     let (mixed, _) = shuffled_part(&next, &mut random, |_| true);

@@ -127,7 +127,7 @@ impl<'a> GradientSpan<'a> {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
-    /// Adds one value of `parts` to the derivative of each Gaussian from index `first` on, in the order of the
+    /// Adds one value of `terms` to the derivative of each Gaussian from index `first` on, in the order of the
     /// Gaussians. The derivative is with respect to component `component` of the single attribute `column`.
     ///
     /// Does nothing if the attribute or component is not differentiated. Skips a value that is not finite or whose
@@ -136,12 +136,12 @@ impl<'a> GradientSpan<'a> {
     /// # Panics
     /// Panics if `first` lies before the span, or more than one index after its last Gaussian.
     #[inline(always)]
-    pub fn add(&mut self, column: Attributes, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
+    pub fn add(&mut self, column: Attributes, component: usize, first: usize, terms: impl IntoIterator<Item = f32>) {
         let start = first - self.ids.start;
         let Some(plane) = self.planes(column).get_mut(component) else { return };
-        for (sum, part) in plane[start..].iter_mut().zip(parts) {
+        for (sum, term) in plane[start..].iter_mut().zip(terms) {
             // Adds 0 instead of skipping the store: a store that depends on a condition is slow.
-            *sum += if (*sum + part).is_finite() { part } else { 0.0 };
+            *sum += if (*sum + term).is_finite() { term } else { 0.0 };
         }
     }
 }

@@ -180,9 +180,9 @@ pub enum LimitSource {
 pub struct MemoryLimits {
     /// Limits that apply to more than this process: the physical memory of the machine first, then control groups or
     /// job objects.
-    pub around: Vec<MemoryLimit>,
+    pub shared: Vec<MemoryLimit>,
     /// Limits of this process alone.
-    pub own: Vec<MemoryLimit>,
+    pub process: Vec<MemoryLimit>,
 }
 
 /// Smallest number of bytes that means "no limit". Control groups of version 1 without a limit report a number of this

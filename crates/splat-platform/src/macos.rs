@@ -25,7 +25,7 @@ pub fn memory_limits() -> MemoryLimits {
         let bytes = getrlimit(resource).current?;
         Some(MemoryLimit { bytes, source })
     });
-    MemoryLimits { around: machine.into_iter().collect(), own: own.collect() }
+    MemoryLimits { shared: machine.into_iter().collect(), process: own.collect() }
 }
 
 /// Returns the physical memory of the machine in bytes, or `None` if the system gives no answer.

@@ -229,7 +229,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         work,
         recipe: &options.recipe,
         kept,
-        repeats: RepeatLimits { most: options.runs, enough: MAX_SETTING_SECONDS },
+        repeats: RepeatLimits { most: options.runs, max_total_seconds: MAX_SETTING_SECONDS },
         scratch: &staged.path().join("run"),
         name,
         progress: options.input.events.counting_task("precision", "settings"),
@@ -310,7 +310,7 @@ impl Bench<'_> {
     /// Measures all settings of `knob`. Returns `None` if the scene or the recipe has no settings for it.
     fn measure_knob(&self, knob: Knob) -> Result<Option<PrecisionKnob>> {
         match knob {
-            Knob::FirstRanking => self.look(),
+            Knob::FirstRanking => self.first_ranking(),
             Knob::Rounds => self.rounds(),
             Knob::Percentiles => self.percentiles().map(Some),
             Knob::Sums => self.sums(),

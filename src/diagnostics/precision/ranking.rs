@@ -57,7 +57,7 @@ struct RankingVariant {
 impl Bench<'_> {
     /// Measures settings of the first ranking by renders: several numbers of views, and several strides of pixels,
     /// views and frames. Returns `None` if the recipe does not rank by renders.
-    pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
+    pub(super) fn first_ranking(&self) -> Result<Option<PrecisionKnob>> {
         let all = self.scene.schedule.pair_count();
         let variant = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
             let mut recipe = self.recipe.clone();
@@ -105,9 +105,9 @@ impl Bench<'_> {
     /// if the recipe does not rank by renders.
     fn contributions(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
         let measure = MeasureStages::new(recipe, self.scene.has_cameras, UserOverrides::default());
-        let look =
+        let inspect =
             |visible: &VisibilityStage| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
-        measure.visible.as_ref().map(look).transpose()
+        measure.visible.as_ref().map(inspect).transpose()
     }
 
     /// Returns the result of [`Bench::contributions`] for `recipe`, and the time and memory of computing it.

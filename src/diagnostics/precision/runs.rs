@@ -193,7 +193,7 @@ impl Bench<'_> {
         &self,
         recipe: &Recipe,
         input: &InputOptions,
-        look: impl FnOnce(&WholeRun<'_>, &Path) -> Result<T>,
+        inspect: impl FnOnce(&WholeRun<'_>, &Path) -> Result<T>,
     ) -> Result<(T, Cost)> {
         let run = WholeRun {
             input,
@@ -203,8 +203,8 @@ impl Bench<'_> {
             max_frames: Some(FRAMES_COMPARED),
             background: None,
         };
-        let means = MethodKind::Recipe(Box::new(recipe.clone()), PruneOrMerge::Both);
-        let measured = run.run(&means, Some(self.target()), |result| look(&run, result))?;
+        let method_kind = MethodKind::Recipe(Box::new(recipe.clone()), PruneOrMerge::Both);
+        let measured = run.run(&method_kind, Some(self.target()), |result| inspect(&run, result))?;
         self.advance();
         Ok(measured)
     }

@@ -13,7 +13,7 @@ use super::fields::{CameraFields, POSE, place};
 use super::image_list::outline;
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
-use crate::files::json::lists::{JsonPlace, ListSelection, each_element};
+use crate::files::json::lists::{ElementPosition, ListSelection, each_element};
 use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
@@ -143,7 +143,7 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     ];
     let (mut used, mut next) = (0, [0; KEYS.len()]);
     let ask = ListSelection { keys: &KEYS, nested: true, wanted: &[] };
-    each_element(file, ask, |JsonPlace { key, index, inner }, value| {
+    each_element(file, ask, |ElementPosition { key, index, inner }, value| {
         let name = KEYS[key];
         if index != next[key] {
             return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));

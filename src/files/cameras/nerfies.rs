@@ -21,7 +21,7 @@ use super::fields::CameraFields;
 use super::image_list::read_keys;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
-use crate::files::json::lists::{JsonPlace, ListSelection, each_element, each_entry};
+use crate::files::json::lists::{ElementPosition, ListSelection, each_element, each_entry};
 use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
@@ -77,7 +77,7 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
     each_element(
         file,
         ListSelection { keys: &LIST_KEYS, nested: false, wanted: &[] },
-        |JsonPlace { key, index, .. }, name| {
+        |ElementPosition { key, index, .. }, name| {
             if index != names[key].len() {
                 return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
             }

@@ -7,16 +7,16 @@ use zip::{CompressionMethod, ZipWriter};
 
 /// Python value to be written as a pickle.
 #[derive(Debug, Clone)]
-pub(crate) enum Made {
+pub(crate) enum PythonValue {
     None,
     Bool(bool),
     Int(i64),
     Float(f64),
     Text(&'static str),
-    Tuple(Vec<Made>),
-    List(Vec<Made>),
-    Dict(Vec<(Made, Made)>),
-    Ordered(Vec<(Made, Made)>),
+    Tuple(Vec<PythonValue>),
+    List(Vec<PythonValue>),
+    Dict(Vec<(PythonValue, PythonValue)>),
+    Ordered(Vec<(PythonValue, PythonValue)>),
     Tensor(PickledTensor),
     Parameter(PickledTensor),
 }
@@ -49,15 +49,15 @@ pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> Pickled
     }
 }
 
-/// Converts dict items whose keys are texts to items whose keys are [`Made`] values.
-pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
-    items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
+/// Converts dict items whose keys are texts to items whose keys are [`PythonValue`] values.
+pub(crate) fn named(items: Vec<(&'static str, PythonValue)>) -> Vec<(PythonValue, PythonValue)> {
+    items.into_iter().map(|(key, value)| (PythonValue::Text(key), value)).collect()
 }
 
-impl Made {
+impl PythonValue {
     /// Appends the pickle (protocol 2, without memo) of this value to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
-        let items = |items: &[(Made, Made)], out: &mut Vec<u8>| {
+        let items = |items: &[(PythonValue, PythonValue)], out: &mut Vec<u8>| {
             out.push(b'(');
             items.iter().for_each(|(key, value)| {
                 key.pickle(out);
@@ -65,29 +65,31 @@ impl Made {
             });
             out.push(b'u');
         };
-        let several = |open: &[u8], elements: &[Made], close: u8, out: &mut Vec<u8>| {
+        let several = |open: &[u8], elements: &[PythonValue], close: u8, out: &mut Vec<u8>| {
             out.extend(open);
             elements.iter().for_each(|element| element.pickle(out));
             out.push(close);
         };
         match self {
-            Made::None => out.push(b'N'),
-            Made::Bool(value) => out.push(0x89 - u8::from(*value)),
-            Made::Int(value) => out.extend([&[b'J'][..], &(*value as i32).to_le_bytes()].concat()),
-            Made::Float(value) => out.extend([&[b'G'][..], &value.to_be_bytes()].concat()),
-            Made::Text(text) => out.extend([b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()),
-            Made::Tuple(elements) => several(b"(", elements, b't', out),
-            Made::List(elements) => several(b"](", elements, b'e', out),
-            Made::Dict(entries) => {
+            PythonValue::None => out.push(b'N'),
+            PythonValue::Bool(value) => out.push(0x89 - u8::from(*value)),
+            PythonValue::Int(value) => out.extend([&[b'J'][..], &(*value as i32).to_le_bytes()].concat()),
+            PythonValue::Float(value) => out.extend([&[b'G'][..], &value.to_be_bytes()].concat()),
+            PythonValue::Text(text) => {
+                out.extend([b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat())
+            }
+            PythonValue::Tuple(elements) => several(b"(", elements, b't', out),
+            PythonValue::List(elements) => several(b"](", elements, b'e', out),
+            PythonValue::Dict(entries) => {
                 out.push(b'}');
                 items(entries, out);
             }
-            Made::Ordered(entries) => {
+            PythonValue::Ordered(entries) => {
                 out.extend(b"ccollections\nOrderedDict\n)R");
                 items(entries, out);
             }
-            Made::Tensor(tensor) => tensor.pickle(out),
-            Made::Parameter(tensor) => {
+            PythonValue::Tensor(tensor) => tensor.pickle(out),
+            PythonValue::Parameter(tensor) => {
                 out.extend(b"ctorch._utils\n_rebuild_parameter\n(");
                 tensor.pickle(out);
                 out.extend(b"\x88ccollections\nOrderedDict\n)RtR");
@@ -98,9 +100,15 @@ impl Made {
     /// Adds the storages (blocks of values) of all tensors in this value to `found`, as (number, bytes).
     fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
         match self {
-            Made::Tensor(tensor) | Made::Parameter(tensor) => found.push((tensor.storage, tensor.bytes.clone())),
-            Made::Tuple(elements) | Made::List(elements) => elements.iter().for_each(|element| element.storages(found)),
-            Made::Dict(items) | Made::Ordered(items) => items.iter().for_each(|(_, value)| value.storages(found)),
+            PythonValue::Tensor(tensor) | PythonValue::Parameter(tensor) => {
+                found.push((tensor.storage, tensor.bytes.clone()))
+            }
+            PythonValue::Tuple(elements) | PythonValue::List(elements) => {
+                elements.iter().for_each(|element| element.storages(found))
+            }
+            PythonValue::Dict(items) | PythonValue::Ordered(items) => {
+                items.iter().for_each(|(_, value)| value.storages(found))
+            }
             _ => (),
         }
     }
@@ -124,17 +132,18 @@ impl Made {
 impl PickledTensor {
     /// Appends the pickle of the tensor to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
-        let numbers = |values: &[usize]| Made::Tuple(values.iter().map(|&x| Made::Int(x as i64)).collect());
+        let numbers =
+            |values: &[usize]| PythonValue::Tuple(values.iter().map(|&x| PythonValue::Int(x as i64)).collect());
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
-        Made::Text("storage").pickle(out);
+        PythonValue::Text("storage").pickle(out);
         out.extend(format!("ctorch\n{}\n", self.class).bytes());
         // The keys of storages are their numbers written as texts.
         let key = self.storage.to_string();
         out.extend([b"X", &(key.len() as u32).to_le_bytes()[..], key.as_bytes()].concat());
-        Made::Text("cuda:0").pickle(out);
-        Made::Int((self.bytes.len() / self.width) as i64).pickle(out);
+        PythonValue::Text("cuda:0").pickle(out);
+        PythonValue::Int((self.bytes.len() / self.width) as i64).pickle(out);
         out.extend(b"tQ");
-        Made::Int(self.offset as i64).pickle(out);
+        PythonValue::Int(self.offset as i64).pickle(out);
         numbers(&self.shape).pickle(out);
         numbers(&self.stride).pickle(out);
         out.extend(b"\x89ccollections\nOrderedDict\n)RtR");

@@ -3,7 +3,7 @@ use std::io::Cursor;
 
 use proptest::prelude::*;
 
-use super::made::{Made, PickledTensor, named, tensor, zip};
+use super::made::{PickledTensor, PythonValue, named, tensor, zip};
 use super::*;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 
@@ -37,25 +37,25 @@ fn ramp(n: usize) -> Vec<f32> {
 
 /// Returns a pair of dicts for the tests. It contains tensors of four rows, one of them a transposed parameter, a
 /// tensor whose rows are not Gaussians, two tensors that share a storage (block of values), a mask and other values.
-fn model() -> Made {
+fn model() -> PythonValue {
     let transposed = PickledTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =
         [0, 12].map(|offset| PickledTensor { offset, shape: vec![4, 3], ..tensor(3, &[4, 3], &ramp(24)) });
     let mask = PickledTensor { class: "BoolStorage", width: 1, bytes: vec![1, 0, 1, 1], ..tensor(4, &[4], &[]) };
-    Made::Tuple(vec![
-        Made::Dict(named(vec![
-            ("means", Made::Tensor(tensor(0, &[4, 3], &ramp(12)))),
-            ("turned", Made::Parameter(transposed)),
-            ("net", Made::Tensor(tensor(2, &[2, 2], &ramp(4)))),
+    PythonValue::Tuple(vec![
+        PythonValue::Dict(named(vec![
+            ("means", PythonValue::Tensor(tensor(0, &[4, 3], &ramp(12)))),
+            ("turned", PythonValue::Parameter(transposed)),
+            ("net", PythonValue::Tensor(tensor(2, &[2, 2], &ramp(4)))),
         ])),
-        Made::Ordered(named(vec![
-            ("first", Made::Tensor(first)),
-            ("second", Made::Tensor(second)),
-            ("mask", Made::Tensor(mask)),
-            ("step", Made::Int(7)),
-            ("rate", Made::Float(0.25)),
-            ("text", Made::Text("abc")),
-            ("nothing", Made::List(vec![Made::None, Made::Bool(true)])),
+        PythonValue::Ordered(named(vec![
+            ("first", PythonValue::Tensor(first)),
+            ("second", PythonValue::Tensor(second)),
+            ("mask", PythonValue::Tensor(mask)),
+            ("step", PythonValue::Int(7)),
+            ("rate", PythonValue::Float(0.25)),
+            ("text", PythonValue::Text("abc")),
+            ("nothing", PythonValue::List(vec![PythonValue::None, PythonValue::Bool(true)])),
         ])),
     ])
 }
@@ -90,7 +90,7 @@ fn every_float_type_is_converted_to_f32() {
     let temp = TempCheckpoint::new();
     let checkpoint_of_type = |class, width, bytes: Vec<u8>| {
         let shape = vec![bytes.len() / width];
-        Made::Tensor(PickledTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
+        PythonValue::Tensor(PickledTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
     };
     let le16 = |values: &[u16]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     for (class, width, bytes, expected) in [
@@ -204,8 +204,10 @@ fn keeping_all_rows_keeps_all_bytes() {
 #[test]
 fn a_shared_shape_is_refused_if_one_tensor_changes() {
     let temp = TempCheckpoint::new();
-    let file =
-        Made::Tuple(vec![Made::Tensor(tensor(0, &[3, 3], &ramp(9))), Made::Tensor(tensor(1, &[3, 3], &ramp(9)))]);
+    let file = PythonValue::Tuple(vec![
+        PythonValue::Tensor(tensor(0, &[3, 3], &ramp(9))),
+        PythonValue::Tensor(tensor(1, &[3, 3], &ramp(9))),
+    ]);
     let whole = file.file();
     let checkpoint = temp.open(&whole).unwrap();
     let mut files = Vec::new();
@@ -235,7 +237,7 @@ fn a_shared_shape_is_refused_if_one_tensor_changes() {
 fn incomplete_tensors_and_files_are_named() {
     let temp = TempCheckpoint::new();
     let message = |tensor: PickledTensor| {
-        let checkpoint = temp.open(&Made::Tensor(tensor).file()).unwrap();
+        let checkpoint = temp.open(&PythonValue::Tensor(tensor).file()).unwrap();
         checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string()
     };
     let valid = || tensor(0, &[4, 3], &ramp(12));
@@ -252,7 +254,7 @@ fn incomplete_tensors_and_files_are_named() {
     let no_rank = message(PickledTensor { stride: vec![1], ..valid() });
     assert!(no_rank.contains("_rebuild_tensor_v2"), "{no_rank}");
     // The archive lacks the file that holds the values of the tensor.
-    let checkpoint = temp.open(&Made::Tensor(valid()).file()).unwrap();
+    let checkpoint = temp.open(&PythonValue::Tensor(valid()).file()).unwrap();
     let mut files = Vec::new();
     checkpoint
         .files(|name, _, bytes| {

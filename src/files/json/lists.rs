@@ -13,7 +13,7 @@ use crate::files::open::open_file;
 
 /// Position of a list element in a JSON document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct JsonPlace {
+pub(crate) struct ElementPosition {
     /// Index in [`ListSelection::keys`] of the key of the list; 0 if the document itself is the list.
     pub(crate) key: usize,
     /// Index of the element in the list. If the key of the list occurs several times, the index restarts at 0 for each
@@ -43,7 +43,7 @@ pub(crate) struct ListSelection<'a> {
 pub(crate) fn each_element(
     path: &Path,
     ask: ListSelection<'_>,
-    each: impl FnMut(JsonPlace, SmallValue) -> Result<()>,
+    each: impl FnMut(ElementPosition, SmallValue) -> Result<()>,
 ) -> Result<()> {
     each_element_from(open_file(path)?, path, ask, each)
 }
@@ -57,7 +57,7 @@ pub(crate) fn each_element_from(
     file: impl Read,
     path: &Path,
     ask: ListSelection<'_>,
-    mut each: impl FnMut(JsonPlace, SmallValue) -> Result<()>,
+    mut each: impl FnMut(ElementPosition, SmallValue) -> Result<()>,
 ) -> Result<()> {
     let stopped = ParseAbort::default();
     let mut lists = Lists { ask, each: &mut each, stopped: &stopped };
@@ -82,7 +82,7 @@ pub(crate) fn each_entry(
 /// stores an error of the callback.
 struct Lists<'a> {
     ask: ListSelection<'a>,
-    each: &'a mut dyn FnMut(JsonPlace, SmallValue) -> Result<()>,
+    each: &'a mut dyn FnMut(ElementPosition, SmallValue) -> Result<()>,
     stopped: &'a ParseAbort,
 }
 
@@ -172,7 +172,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
         let Lists { ask, stopped, .. } = *self.lists;
         for index in 0.. {
-            let at = JsonPlace { key: self.key, index, inner: None };
+            let at = ElementPosition { key: self.key, index, inner: None };
             let value = match ask.nested {
                 true => list.next_element_seed(InnerList { lists: self.lists, at })?,
                 false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
@@ -193,7 +193,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
 /// list, returns this element or a description of it.
 struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
-    at: JsonPlace,
+    at: ElementPosition,
 }
 
 impl<'de> DeserializeSeed<'de> for InnerList<'_, '_> {
@@ -240,7 +240,7 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
         for inner in 0.. {
             let keep = Keep { wanted: ask.wanted, elements: MAX_ELEMENTS };
             let Some(value) = list.next_element_seed(keep)? else { break };
-            let at = JsonPlace { inner: Some(inner), ..self.at };
+            let at = ElementPosition { inner: Some(inner), ..self.at };
             (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
         }
         Ok(SmallValue::List(Vec::new(), 0))
@@ -291,7 +291,7 @@ mod tests {
     fn elements(text: &str, keys: &[&str], nested: bool) -> Vec<(usize, usize, Option<usize>, String)> {
         let mut found = Vec::new();
         let ask = ListSelection { keys, nested, wanted: &[] };
-        each_element(file(text).path(), ask, |JsonPlace { key, index, inner }, value| {
+        each_element(file(text).path(), ask, |ElementPosition { key, index, inner }, value| {
             found.push((key, index, inner, value.describe()));
             Ok(())
         })

@@ -25,9 +25,9 @@ pub(crate) enum GaussianAxis {
     /// No axis: the array has no values per Gaussian and is copied unchanged.
     None,
     /// Axis 0.
-    First,
+    Axis0,
     /// Axis 1; the index of axis 0 is the frame.
-    Second,
+    Axis1,
 }
 
 /// Writes a copy of the archive `template` to `path` that keeps only the Gaussians `kept`. `axis` receives an array and
@@ -52,8 +52,8 @@ pub(crate) fn write_like(
         let mut shape = entry.shape.clone();
         match axis {
             GaussianAxis::None => (),
-            GaussianAxis::First => shape[0] = kept.len(),
-            GaussianAxis::Second => shape[1] = kept.len(),
+            GaussianAxis::Axis0 => shape[0] = kept.len(),
+            GaussianAxis::Axis1 => shape[1] = kept.len(),
         }
         let method = if entry.is_compressed { CompressionMethod::Deflated } else { CompressionMethod::Stored };
         let options = FileOptions::default()
@@ -72,7 +72,7 @@ pub(crate) fn write_like(
             };
             archive.write_all(&header(&entry.descr, false, &shape)).map_err(failed)?;
             let (frames, rows) = match axis {
-                GaussianAxis::Second => (entry.shape[0], &entry.shape[1..]),
+                GaussianAxis::Axis1 => (entry.shape[0], &entry.shape[1..]),
                 _ => (1, &entry.shape[..]),
             };
             let width: usize = rows[1..].iter().product();

@@ -164,7 +164,7 @@ impl<'a> PickleMachine<'a> {
             b'Q' => {
                 let what = self.pop()?;
                 let depth = self.container_depth([what])?;
-                self.push(Node::Outside(what), depth)?;
+                self.push(Node::PersistentId(what), depth)?;
             }
             b'q' => {
                 let [key] = self.take_bytes()?;

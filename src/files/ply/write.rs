@@ -185,7 +185,7 @@ fn inria_header<'a>(count: usize, rest: usize, comments: &[String], more: impl I
 
 /// Returns the stored bytes of the extra properties (those that are no attribute of a Gaussian) in the `rows` of
 /// `template`, one row after another.
-pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
+pub(crate) fn extra_property_bytes(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
     let ranges = extra_ranges(template.properties(), template.layout());
     rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
         .collect()
@@ -198,8 +198,8 @@ pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
 }
 
 /// Writes a PLY file to `path` with the header `header`, which was read from the file `from`. The rows hold the
-/// attributes of `cloud` and the extra properties in the bytes `beside`. `lead` and `tail` are the bytes before and
-/// after the rows.
+/// attributes of `cloud` and the extra properties in the bytes `extra_bytes`. `lead` and `tail` are the bytes before
+/// and after the rows.
 ///
 /// # Errors
 /// Fails if the header does not match the rows, or if the file cannot be written.
@@ -207,7 +207,7 @@ pub(crate) fn write_rows(
     from: &Path,
     header: &PlyHeader,
     [lead, tail]: [&[u8]; 2],
-    beside: &[u8],
+    extra_bytes: &[u8],
     cloud: &Gaussians,
     path: &Path,
 ) -> Result<()> {
@@ -218,7 +218,7 @@ pub(crate) fn write_rows(
     let layout = PlyLayout::from_element(from, vertex)?;
     let ranges = extra_ranges(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
-    if layout.planes(Attributes::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
+    if layout.planes(Attributes::SH).len() != cloud.sh.width() || width * cloud.len() != extra_bytes.len() {
         return Err(mismatch("the properties of the rows".to_owned()));
     }
     let big_endian = header.encoding == PlyEncoding::BigEndian;
@@ -227,7 +227,7 @@ pub(crate) fn write_rows(
         out.write_all(lead)?;
         let mut row = vec![0; vertex.stride];
         for i in 0..cloud.len() {
-            let mut rest = &beside[i * width..(i + 1) * width];
+            let mut rest = &extra_bytes[i * width..(i + 1) * width];
             for range in &ranges {
                 let (own, after) = rest.split_at(range.len());
                 row[range.clone()].copy_from_slice(own);
@@ -251,8 +251,8 @@ fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>
         }));
     }
     let is_extra = |property: &&Property| !used.contains(&property.offset) && !property.name.starts_with("f_rest_");
-    let beside = properties.iter().filter(is_extra);
-    beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
+    let extra = properties.iter().filter(is_extra);
+    extra.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
 }
 
 /// Creates the file at `path` and calls `fill` to write its content.

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::codebook::Codebook;
 use super::palette::Palette;
-use crate::archive::spread;
+use crate::archive::interleave_zeros;
 use crate::files::webp::{MAX_SIDE, RgbaImage};
 use crate::model::{AttributeValues, logit};
 
@@ -97,7 +97,7 @@ pub fn morton_order(position: &AttributeValues) -> Vec<u32> {
     let range = Range3::from_rows((0..position.len()).map(logs));
     let code = |row: u32| {
         let logs = logs(row as usize);
-        (0..3).map(|axis| spread(u64::from(range.encode(axis, logs[axis]))) << axis).sum::<u64>()
+        (0..3).map(|axis| interleave_zeros(u64::from(range.encode(axis, logs[axis]))) << axis).sum::<u64>()
     };
     let mut keys: Vec<(u64, u32)> = (0..position.len() as u32).into_par_iter().map(|row| (code(row), row)).collect();
     keys.par_sort_unstable();

@@ -221,7 +221,7 @@ impl TensorSearch<'_> {
 
     /// Returns whether node `id` is a tensor or a storage (block of tensor values).
     fn holds_values(&self, id: NodeId) -> bool {
-        matches!(self.checkpoint.pickle().node(id), Node::Outside(_)) || self.checkpoint.tensor(id).is_some()
+        matches!(self.checkpoint.pickle().node(id), Node::PersistentId(_)) || self.checkpoint.tensor(id).is_some()
     }
 }
 

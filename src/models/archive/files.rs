@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::archive::ArchiveContent;
 use crate::error::{Error, Result};
 use crate::files::names::last_component;
-use crate::files::ply::write::{beside, extra_bytes_per_row, write_rows};
+use crate::files::ply::write::{extra_bytes_per_row, extra_property_bytes, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
 /// Name of the archive part with the header of the PLY file.
@@ -34,7 +34,7 @@ pub(crate) fn add_cloud(content: &mut ArchiveContent, template: &Ply, rows: impl
     let bytes = lead + tail + extra_bytes_per_row(template) * content.cloud.len();
     // Counted twice: for the content and for the archive encoded from it.
     template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;
-    content.beside = beside(template, rows);
+    content.extra_bytes = extra_property_bytes(template, rows);
     let around = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| {
         let mut bytes = Vec::new();
         write(&mut bytes).map(|()| bytes).map_err(Error::io("read", template.path()))
@@ -56,7 +56,7 @@ pub(super) fn write_cloud(content: &ArchiveContent, path: &Path, to: &Path) -> R
         content.files.get(name).ok_or_else(missing)
     };
     let header = PlyHeader::parse(path, part(HEADER)?)?;
-    write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.beside, &content.cloud, to)
+    write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.extra_bytes, &content.cloud, to)
 }
 
 /// Returns the YAML text `text` without the folders of the training machine, because archives are made to be shared.

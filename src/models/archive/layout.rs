@@ -101,7 +101,7 @@ pub(super) enum Field {
     Octaves(usize),
     /// Byte that is 255 times the value of the plane (scalar component of all Gaussians) with this index.
     Byte(usize),
-    /// Given number of bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::beside`]).
+    /// Given number of bytes that the archive stores unchanged for each Gaussian ([`ArchiveContent::extra_bytes`]).
     Bytes(usize),
     /// Given number of bytes that the archive does not store and that are restored as zeros.
     Zeros(usize),
@@ -278,10 +278,10 @@ impl Layout {
     /// Fails if the content does not match the layout or a write fails.
     pub(super) fn write(&self, content: &ArchiveContent, path: &Path, to: &Path) -> Result<()> {
         self.check_size(content, path)?;
-        // Offset of the next bytes beside the values, in the bytes of a Gaussian.
-        let mut beside = 0;
+        // Offset of the next extra bytes, in the bytes of a Gaussian.
+        let mut extra_offset = 0;
         for (k, file) in self.files.iter().enumerate() {
-            let bytes = assemble(content, k, file, &mut beside)
+            let bytes = assemble(content, k, file, &mut extra_offset)
                 .ok_or_else(|| damaged(path, "places of values that match the archive", file.path.clone()))?;
             let target = if self.folder { to.join(&file.path) } else { to.to_owned() };
             if let Some(parent) = target.parent().filter(|_| self.folder) {
@@ -301,7 +301,7 @@ impl Layout {
         let tensors = content.tensors.values().map(|tensor| tensor.data.len());
         let values: usize = values.chain(columns).chain(tensors).sum();
         let files: usize = content.files.values().map(Vec::len).sum();
-        let stored = 4 * values as u64 + (files + content.beside.len()) as u64;
+        let stored = 4 * values as u64 + (files + content.extra_bytes.len()) as u64;
         let of_span = |span: &Span| match &span.of {
             Values::Rows(fields) => {
                 fields.iter().fold(0u64, |sum, field| sum.saturating_add(field.bytes() as u64)).saturating_mul(count)
@@ -320,9 +320,9 @@ impl Layout {
 }
 
 /// Returns the bytes of `file`, which is file `k` of the model; `None` if its layout does not match the content.
-/// `beside` is an offset within the bytes that each Gaussian has in [`ArchiveContent::beside`] (stored unchanged): the
-/// offset of the next unused byte. The function advances it past the bytes that this file uses.
-fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut usize) -> Option<Vec<u8>> {
+/// `extra_offset` is an offset within the bytes that each Gaussian has in [`ArchiveContent::extra_bytes`] (stored
+/// unchanged): the offset of the next unused byte. The function advances it past the bytes that this file uses.
+fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, extra_offset: &mut usize) -> Option<Vec<u8>> {
     let mut rest = content.files.get(&rest_name(k))?.as_slice();
     let mut out = Vec::new();
     for span in &file.spans {
@@ -334,7 +334,7 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut 
             Values::Tensor(name) => {
                 out.extend(content.tensors.get(name)?.data.iter().flat_map(|value| value.to_le_bytes()));
             }
-            Values::Rows(fields) => add_rows(content, fields, beside, &mut out)?,
+            Values::Rows(fields) => add_rows(content, fields, extra_offset, &mut out)?,
         }
     }
     out.extend_from_slice(rest);
@@ -344,16 +344,16 @@ fn assemble(content: &ArchiveContent, k: usize, file: &FileLayout, beside: &mut 
     Some(out)
 }
 
-/// Appends one row of `fields` per Gaussian to `out`. `beside` is the offset of the next unused byte among the bytes
-/// that each Gaussian has in [`ArchiveContent::beside`]; it is advanced. Returns `None` if the content of the archive
-/// has no values for a field.
-fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out: &mut Vec<u8>) -> Option<()> {
+/// Appends one row of `fields` per Gaussian to `out`. `extra_offset` is the offset of the next unused byte among the
+/// bytes that each Gaussian has in [`ArchiveContent::extra_bytes`]; it is advanced. Returns `None` if the content of
+/// the archive has no values for a field.
+fn add_rows(content: &ArchiveContent, fields: &[Field], extra_offset: &mut usize, out: &mut Vec<u8>) -> Option<()> {
     let (count, start) = (content.cloud.len(), out.len());
     if count == 0 {
         return Some(());
     }
     let stride: usize = fields.iter().map(|field| field.bytes()).sum();
-    let bytes_beside = content.beside.len() / count;
+    let extra_bytes_per_gaussian = content.extra_bytes.len() / count;
     out.resize(start + stride * count, 0);
     let rows = &mut out[start..];
     let mut at = 0;
@@ -367,14 +367,16 @@ fn add_rows(content: &ArchiveContent, fields: &[Field], beside: &mut usize, out:
                 }
             }
             Field::Bytes(_) => {
-                let from = *beside..beside.checked_add(bytes)?;
-                if from.end > bytes_beside {
+                let from = *extra_offset..extra_offset.checked_add(bytes)?;
+                if from.end > extra_bytes_per_gaussian {
                     return None;
                 }
-                for (row, stored) in rows.chunks_exact_mut(stride).zip(content.beside.chunks_exact(bytes_beside)) {
+                for (row, stored) in
+                    rows.chunks_exact_mut(stride).zip(content.extra_bytes.chunks_exact(extra_bytes_per_gaussian))
+                {
                     row[at..at + bytes].copy_from_slice(&stored[from.clone()]);
                 }
-                *beside += bytes;
+                *extra_offset += bytes;
             }
             Field::Zeros(_) => (),
         }

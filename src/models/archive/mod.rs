@@ -217,12 +217,12 @@ impl InputModel for OpenArchive {
         Ok(Box::new(OpenArchive { inner: inner.with_times(times)?, scratch, digest, size }))
     }
 
-    fn clock(&self) -> TimeConvention {
-        self.inner.clock()
+    fn time_convention(&self) -> TimeConvention {
+        self.inner.time_convention()
     }
 
-    fn span(&self) -> f64 {
-        self.inner.span()
+    fn duration(&self) -> f64 {
+        self.inner.duration()
     }
 
     fn notes(&self) -> Vec<String> {

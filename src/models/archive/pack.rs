@@ -79,7 +79,7 @@ enum Target {
 struct RowField {
     /// Variant of [`Field`] that describes the field in an archive. Its argument is the index of a plane (scalar
     /// component of all Gaussians), or a number of bytes.
-    kind: fn(usize) -> Field,
+    to_field: fn(usize) -> Field,
     /// Number of bytes of the field in each row.
     bytes: usize,
     target: Target,
@@ -87,29 +87,29 @@ struct RowField {
 
 impl RowField {
     fn f32(target: Target) -> RowField {
-        RowField { kind: Field::F32, bytes: 4, target }
+        RowField { to_field: Field::F32, bytes: 4, target }
     }
 
     fn half(target: Target) -> RowField {
-        RowField { kind: Field::Half, bytes: 2, target }
+        RowField { to_field: Field::Half, bytes: 2, target }
     }
 
     fn octaves(target: Target) -> RowField {
-        RowField { kind: Field::Octaves, bytes: 2, target }
+        RowField { to_field: Field::Octaves, bytes: 2, target }
     }
 
     fn byte(target: Target) -> RowField {
-        RowField { kind: Field::Byte, bytes: 1, target }
+        RowField { to_field: Field::Byte, bytes: 1, target }
     }
 
     /// Creates a field of `bytes` bytes that an archive stores unchanged.
     fn exact(bytes: usize) -> RowField {
-        RowField { kind: Field::Bytes, bytes, target: Target::Bytes }
+        RowField { to_field: Field::Bytes, bytes, target: Target::Bytes }
     }
 
     /// Creates a field of `bytes` bytes that an archive does not store, and restores as zeros.
     fn zeros(bytes: usize) -> RowField {
-        RowField { kind: Field::Zeros, bytes, target: Target::Zeros }
+        RowField { to_field: Field::Zeros, bytes, target: Target::Zeros }
     }
 }
 
@@ -120,7 +120,7 @@ pub(in crate::models) struct Packer {
     memory: ReadLimit,
     /// Bytes that the archive stores unchanged. Each entry is one field: its number of bytes per Gaussian, and the
     /// bytes of all Gaussians.
-    beside: Vec<(usize, Vec<u8>)>,
+    extra_bytes: Vec<(usize, Vec<u8>)>,
 }
 
 impl Packer {
@@ -132,7 +132,7 @@ impl Packer {
             times: [0.0, 1.0],
             ..ArchiveContent::default()
         };
-        Packer { content, layout: Layout { folder: false, files: Vec::new() }, memory, beside: Vec::new() }
+        Packer { content, layout: Layout { folder: false, files: Vec::new() }, memory, extra_bytes: Vec::new() }
     }
 
     /// Adds the model at `path`, a folder or a file, and returns the complete content of the archive. `holds` returns
@@ -155,10 +155,12 @@ impl Packer {
         for (name, file) in files {
             self.add_file(name.clone(), &file, holds(&name))?;
         }
-        let Packer { mut content, layout, beside, .. } = self;
+        let Packer { mut content, layout, extra_bytes, .. } = self;
         let count = content.cloud.len();
         for i in 0..count {
-            beside.iter().for_each(|(width, bytes)| content.beside.extend(&bytes[i * width..(i + 1) * width]));
+            extra_bytes
+                .iter()
+                .for_each(|(width, bytes)| content.extra_bytes.extend(&bytes[i * width..(i + 1) * width]));
         }
         let text = serde_json::to_vec(&layout).map_err(|error| Error::internal(error.to_string()))?;
         content.files.insert(LAYOUT.to_owned(), text);
@@ -235,7 +237,7 @@ impl Packer {
             let width: usize = group.iter().map(|field| field.bytes).sum();
             let rows = || stored.chunks_exact(stride.max(1)).map(|row| &row[offset..offset + width]);
             let decoded = |field: &RowField, from: usize| -> Vec<f32> {
-                rows().filter_map(|row| (field.kind)(0).decode(&row[from..from + field.bytes])).collect()
+                rows().filter_map(|row| (field.to_field)(0).decode(&row[from..from + field.bytes])).collect()
             };
             let mut from = 0;
             let mut planes = Vec::with_capacity(together);
@@ -247,15 +249,15 @@ impl Packer {
             match target {
                 Target::Attribute(attribute, c) => {
                     self.content.cloud.column_mut(*attribute).plane_mut(*c).copy_from_slice(&planes[0]);
-                    coded.push((group[0].kind)(first_plane(*attribute) + c));
+                    coded.push((group[0].to_field)(first_plane(*attribute) + c));
                 }
                 Target::Column(name) if is_finite => {
                     let plane = self.add_column(name, planes);
-                    coded.extend(group.iter().enumerate().map(|(c, field)| (field.kind)(plane + c)));
+                    coded.extend(group.iter().enumerate().map(|(c, field)| (field.to_field)(plane + c)));
                 }
                 Target::Zeros => coded.push(Field::Zeros(width)),
                 Target::Column(_) | Target::Bytes => {
-                    self.beside.push((width, rows().flatten().copied().collect()));
+                    self.extra_bytes.push((width, rows().flatten().copied().collect()));
                     coded.push(Field::Bytes(width));
                 }
             }
@@ -420,8 +422,8 @@ impl Packer {
             let (axis, attribute) = axis(entry);
             let frames = match axis {
                 GaussianAxis::None => continue,
-                GaussianAxis::First => 1,
-                GaussianAxis::Second => entry.shape[0],
+                GaussianAxis::Axis0 => 1,
+                GaussianAxis::Axis1 => entry.shape[0],
             };
             let width = entry.len() / (frames * count).max(1);
             let Some(value_bytes) = entry.float.map(|float| float.bytes) else {

@@ -21,7 +21,7 @@ fn content() -> ArchiveContent {
     let values = AttributeValues::from_planes(1, vec![0.25, 0.5, 1.0]);
     content.columns.push(Column { name: "width".into(), values });
     content.tensors.insert("weights".into(), Tensor { shape: vec![2], data: vec![1.5, -2.0] });
-    content.beside = (0..2 * COUNT as u8).collect();
+    content.extra_bytes = (0..2 * COUNT as u8).collect();
     content.files.insert(rest_name(0), b"headtail".to_vec());
     content.files.insert(rest_name(1), b"other".to_vec());
     content

@@ -260,7 +260,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     }
 
     /// Returns [`TimeConvention::Given`]: camera times are used unchanged, because the network was trained with them.
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Given
     }
 

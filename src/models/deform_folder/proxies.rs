@@ -99,7 +99,7 @@ pub(super) fn propose<L: NetworkMotionModel>(
             }
         }
     }
-    shape(model, &mut made, &leaders, &frames, &wanted)?;
+    fit_parameters(model, &mut made, &leaders, &frames, &wanted)?;
     Ok(made)
 }
 
@@ -170,7 +170,7 @@ fn gauss_newton_step<L: NetworkMotionModel>(
 /// [`CORRECTIONS`] times: the difference between the target and the state of the proxy, averaged over `frames`, is
 /// added. One correction suffices if the network's output is simply added; quaternions that are not normalized need
 /// several. Each proxy keeps the scale and rotation of the correction with the smallest difference from the target.
-fn shape<L: NetworkMotionModel>(
+fn fit_parameters<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut StoredParams,
     leaders: &[u32],

@@ -155,8 +155,8 @@ impl Params {
     /// Returns which axis of the array `entry` counts the Gaussians.
     pub(super) fn axis(entry: &NpzArray) -> GaussianAxis {
         match entry.name.as_str() {
-            MEANS | ROTATIONS | COLORS => GaussianAxis::Second,
-            LOG_SCALES | OPACITIES | SEGMENTS => GaussianAxis::First,
+            MEANS | ROTATIONS | COLORS => GaussianAxis::Axis1,
+            LOG_SCALES | OPACITIES | SEGMENTS => GaussianAxis::Axis0,
             _ => GaussianAxis::None,
         }
     }

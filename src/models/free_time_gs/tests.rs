@@ -2,7 +2,7 @@ use std::fs;
 
 use super::*;
 use crate::compressed_model::{Cluster, CompressedModel, ReferenceFrame};
-use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
+use crate::files::checkpoint::made::{PickledTensor, PythonValue, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
@@ -46,20 +46,28 @@ fn file(splats: &Splats) -> Vec<u8> {
     let stored_tensor = |k: usize, row: &[usize], values: &[f32]| {
         tensor(k, &[&[values.len() / row.iter().product::<usize>().max(1)], row].concat(), values)
     };
-    let own =
-        splats.iter().enumerate().map(|(k, (name, row, values))| (*name, Made::Tensor(stored_tensor(k, row, values))));
+    let own = splats
+        .iter()
+        .enumerate()
+        .map(|(k, (name, row, values))| (*name, PythonValue::Tensor(stored_tensor(k, row, values))));
     let adam = splats.iter().enumerate().map(|(k, (name, row, values))| {
-        let average = |storage| Made::Tensor(PickledTensor { storage, ..stored_tensor(k, row, values) });
-        let step = Made::Tensor(tensor(20 + k, &[], &[7.0]));
+        let average = |storage| PythonValue::Tensor(PickledTensor { storage, ..stored_tensor(k, row, values) });
+        let step = PythonValue::Tensor(tensor(20 + k, &[], &[7.0]));
         let state = named(vec![("step", step), ("exp_avg", average(40 + k)), ("exp_avg_sq", average(60 + k))]);
-        (*name, Made::Dict(named(vec![("state", Made::Dict(vec![(Made::Int(0), Made::Dict(state))]))])))
+        (
+            *name,
+            PythonValue::Dict(named(vec![(
+                "state",
+                PythonValue::Dict(vec![(PythonValue::Int(0), PythonValue::Dict(state))]),
+            )])),
+        )
     });
     let root = named(vec![
-        ("step", Made::Int(59_999)),
-        ("splats", Made::Ordered(named(own.collect()))),
-        ("optimizers", Made::Dict(named(adam.collect()))),
+        ("step", PythonValue::Int(59_999)),
+        ("splats", PythonValue::Ordered(named(own.collect()))),
+        ("optimizers", PythonValue::Dict(named(adam.collect()))),
     ]);
-    Made::Dict(root).file()
+    PythonValue::Dict(root).file()
 }
 
 struct ResultFolder(tempfile::TempDir);
@@ -195,9 +203,9 @@ fn model_without_velocities_is_static_with_any_sh_degree() {
 fn bare_file(splats: &Splats, prefix: &'static str) -> Vec<u8> {
     let tensors = splats.iter().enumerate().map(|(k, (name, row, values))| {
         let name: &'static str = Box::leak(format!("{prefix}{name}").into_boxed_str());
-        (name, Made::Tensor(tensor(k, &[&[COUNT], &row[..]].concat(), values)))
+        (name, PythonValue::Tensor(tensor(k, &[&[COUNT], &row[..]].concat(), values)))
     });
-    Made::Dict(named(vec![("splats", Made::Ordered(named(tensors.collect())))])).file()
+    PythonValue::Dict(named(vec![("splats", PythonValue::Ordered(named(tensors.collect())))])).file()
 }
 
 #[test]

@@ -75,7 +75,7 @@ pub(super) trait ProxyRule: MotionModel {
     }
 
     /// Returns the duration of the model in its own time unit.
-    fn span(&self) -> f64 {
+    fn duration(&self) -> f64 {
         1.0
     }
 }
@@ -222,12 +222,12 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
         if self.model.motion_model().varying().is_empty() { TimeOrigin::Numbered } else { TimeOrigin::Continuous }
     }
 
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Given
     }
 
-    fn span(&self) -> f64 {
-        self.model.motion_model().span()
+    fn duration(&self) -> f64 {
+        self.model.motion_model().duration()
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {

@@ -278,7 +278,7 @@ impl ProxyRule for Native {
         )]
     }
 
-    fn span(&self) -> f64 {
+    fn duration(&self) -> f64 {
         self.given_period.unwrap_or(1.0)
     }
 }

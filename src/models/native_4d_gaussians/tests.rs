@@ -5,7 +5,7 @@ use glam::{DMat3, DMat4, DVec4};
 
 use super::*;
 use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, ReferenceFrame};
-use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
+use crate::files::checkpoint::made::{PickledTensor, PythonValue, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
@@ -49,8 +49,8 @@ fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
 
 /// Returns the values of the tuple that the trainer saves in a checkpoint (capture tuple) of a test model. `turns`
 /// states whether Gaussians have a 4D rotation.
-fn capture(turns: bool) -> Vec<Made> {
-    let mut parts = vec![Made::None; CAPTURE_LENGTH_4D];
+fn capture(turns: bool) -> Vec<PythonValue> {
+    let mut parts = vec![PythonValue::None; CAPTURE_LENGTH_4D];
     let mut state = Vec::new();
     for (k, (i, tensor)) in parameters(turns).into_iter().enumerate() {
         let adam = |seed: f64, storage: usize| PickledTensor {
@@ -58,21 +58,21 @@ fn capture(turns: bool) -> Vec<Made> {
             ..self::tensor(0, &tensor.shape, &noise(tensor.bytes.len() / 4, seed))
         };
         let of_state = named(vec![
-            ("step", Made::Int(3)),
-            ("exp_avg", Made::Tensor(adam(11.0 + k as f64, 20 + k))),
-            ("exp_avg_sq", Made::Tensor(adam(31.0 + k as f64, 40 + k))),
+            ("step", PythonValue::Int(3)),
+            ("exp_avg", PythonValue::Tensor(adam(11.0 + k as f64, 20 + k))),
+            ("exp_avg_sq", PythonValue::Tensor(adam(31.0 + k as f64, 40 + k))),
         ]);
-        state.push((Made::Int(k as i64), Made::Dict(of_state)));
-        parts[i] = Made::Parameter(tensor);
+        state.push((PythonValue::Int(k as i64), PythonValue::Dict(of_state)));
+        parts[i] = PythonValue::Parameter(tensor);
     }
-    parts[0] = Made::Int(3);
-    parts[7] = Made::Tensor(tensor(60, &[COUNT], &noise(COUNT, 50.0)));
-    (8..11).for_each(|i| parts[i] = Made::Tensor(tensor(60 + i, &[COUNT, 1], &noise(COUNT, i as f64))));
-    let groups = named(vec![("state", Made::Dict(state)), ("param_groups", Made::List(vec![]))]);
-    parts[11] = Made::Dict(groups);
-    parts[12] = Made::Float(2.5);
-    parts[16] = Made::Bool(turns);
-    parts[18] = Made::Int(2);
+    parts[0] = PythonValue::Int(3);
+    parts[7] = PythonValue::Tensor(tensor(60, &[COUNT], &noise(COUNT, 50.0)));
+    (8..11).for_each(|i| parts[i] = PythonValue::Tensor(tensor(60 + i, &[COUNT, 1], &noise(COUNT, i as f64))));
+    let groups = named(vec![("state", PythonValue::Dict(state)), ("param_groups", PythonValue::List(vec![]))]);
+    parts[11] = PythonValue::Dict(groups);
+    parts[12] = PythonValue::Float(2.5);
+    parts[16] = PythonValue::Bool(turns);
+    parts[18] = PythonValue::Int(2);
     parts
 }
 
@@ -89,11 +89,14 @@ impl CheckpointFolder {
 
     /// Writes a model folder whose checkpoint has the values `parts` in its capture tuple. Returns the path of the
     /// folder.
-    fn put(&self, parts: Vec<Made>) -> PathBuf {
+    fn put(&self, parts: Vec<PythonValue>) -> PathBuf {
         let root = self.path("model");
         fs::create_dir_all(&root).unwrap();
-        fs::write(root.join("chkpnt30000.pth"), Made::Tuple(vec![Made::Tuple(parts), Made::Int(30_000)]).file())
-            .unwrap();
+        fs::write(
+            root.join("chkpnt30000.pth"),
+            PythonValue::Tuple(vec![PythonValue::Tuple(parts), PythonValue::Int(30_000)]).file(),
+        )
+        .unwrap();
         fs::write(root.join("cfg_args"), "Namespace(white_background=True, source_path='data')").unwrap();
         root
     }
@@ -250,7 +253,7 @@ fn written_proxies_and_deltas_read_back() {
     for (i, mut tensor) in parameters(true) {
         let width = tensor.bytes.len() / COUNT;
         tensor.bytes.copy_within(0..width, width);
-        parts[i] = Made::Parameter(tensor);
+        parts[i] = PythonValue::Parameter(tensor);
     }
     let model = open(&folder.put(parts));
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.6), (1, 0.4)] };
@@ -286,8 +289,8 @@ fn static_capture_is_read_as_static_model() {
     let folder = CheckpointFolder::new();
     let moving = capture(false);
     let order = [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12];
-    let mut parts: Vec<Made> = order.iter().map(|&i| moving[i].clone()).collect();
-    parts[3] = Made::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
+    let mut parts: Vec<PythonValue> = order.iter().map(|&i| moving[i].clone()).collect();
+    parts[3] = PythonValue::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
     let root = folder.put(parts);
     let model = models::open(&root, &OpenOptions::default()).unwrap();
     assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
@@ -303,7 +306,7 @@ fn captures_without_an_optimizer_are_read_and_written() {
     let folder = CheckpointFolder::new();
     let expected = states(&*open(&folder.put(capture(true))));
     let mut parts = capture(true);
-    parts[11] = Made::None;
+    parts[11] = PythonValue::None;
     let model = open(&folder.put(parts));
     assert_eq!(states(&*model), expected);
     let left = open(&folder.written(&*model, &CompressedModel::pruned(vec![1, 4], &rule())));
@@ -320,8 +323,8 @@ fn half_precision_and_strides_in_captures_are_read() {
     let bytes = stored.flat_map(|x| half::bf16::from_f32(x).to_le_bytes()).collect();
     let strided =
         PickledTensor { class: "BFloat16Storage", width: 2, bytes, stride: vec![6, 1], ..tensor(0, &[COUNT, 3], &[]) };
-    parts[1] = Made::Parameter(strided);
-    parts[14] = Made::Parameter(PickledTensor {
+    parts[1] = PythonValue::Parameter(strided);
+    parts[14] = PythonValue::Parameter(PickledTensor {
         class: "HalfStorage",
         width: 2,
         bytes: [0xBC00u16; COUNT].iter().flat_map(|half| half.to_le_bytes()).collect(),
@@ -330,8 +333,8 @@ fn half_precision_and_strides_in_captures_are_read() {
     let model = open(&folder.put(parts));
     let mut same = capture(true);
     let rounded: Vec<f32> = values.iter().map(|&x| half::bf16::from_f32(x).to_f32()).collect();
-    same[1] = Made::Parameter(tensor(0, &[COUNT, 3], &rounded));
-    same[14] = Made::Parameter(tensor(7, &[COUNT, 1], &[-1.0; COUNT]));
+    same[1] = PythonValue::Parameter(tensor(0, &[COUNT, 3], &rounded));
+    same[14] = PythonValue::Parameter(tensor(7, &[COUNT, 1], &[-1.0; COUNT]));
     assert_eq!(states(&*model), states(&*open(&folder.put(same))));
 }
 
@@ -357,21 +360,27 @@ fn best_or_requested_checkpoint_is_read() {
 #[test]
 fn errors_name_the_tensor_and_the_problem() {
     let folder = CheckpointFolder::new();
-    let error_message = |change: &dyn Fn(&mut Vec<Made>)| {
+    let error_message = |change: &dyn Fn(&mut Vec<PythonValue>)| {
         let mut parts = capture(true);
         change(&mut parts);
         open_as(&folder.put(parts), false).err().expect("must be refused").to_string()
     };
-    type Wrong = fn(&mut Vec<Made>);
+    type Wrong = fn(&mut Vec<PythonValue>);
     let cases: [(Wrong, &[&str]); 7] = [
-        (|parts| parts[4] = Made::None, &["capture[4] (scaling)", "None"]),
-        (|parts| parts[4] = Made::Parameter(tensor(3, &[5, 3], &noise(15, 0.0))), &["(scaling)", "[6, 3]", "[5, 3]"]),
-        (|parts| parts[13] = Made::Parameter(tensor(6, &[COUNT], &noise(COUNT, 0.0))), &["(t)", "[6, 1]", "[6]"]),
+        (|parts| parts[4] = PythonValue::None, &["capture[4] (scaling)", "None"]),
         (
-            |parts| parts[3] = Made::Parameter(tensor(2, &[COUNT, 7, 3], &noise(21 * COUNT, 0.0))),
+            |parts| parts[4] = PythonValue::Parameter(tensor(3, &[5, 3], &noise(15, 0.0))),
+            &["(scaling)", "[6, 3]", "[5, 3]"],
+        ),
+        (
+            |parts| parts[13] = PythonValue::Parameter(tensor(6, &[COUNT], &noise(COUNT, 0.0))),
+            &["(t)", "[6, 1]", "[6]"],
+        ),
+        (
+            |parts| parts[3] = PythonValue::Parameter(tensor(2, &[COUNT, 7, 3], &noise(21 * COUNT, 0.0))),
             &["(features_rest)", "33"],
         ),
-        (|parts| parts[16] = Made::Int(1), &["(rot_4d)", "True or False", "1"]),
+        (|parts| parts[16] = PythonValue::Int(1), &["(rot_4d)", "True or False", "1"]),
         (
             |parts| {
                 let long = PickledTensor {
@@ -380,7 +389,7 @@ fn errors_name_the_tensor_and_the_problem() {
                     bytes: vec![0; 48 * COUNT],
                     ..tensor(1, &[COUNT, 1, 3], &[])
                 };
-                parts[2] = Made::Parameter(long);
+                parts[2] = PythonValue::Parameter(long);
             },
             &["(features_dc)", "int64"],
         ),

@@ -283,7 +283,7 @@ impl InputModel for SpacetimeGaussians {
         TimeOrigin::Continuous
     }
 
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Given
     }
 

@@ -197,7 +197,7 @@ impl InputModel for SplatvModel {
         TimeOrigin::Continuous
     }
 
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Given
     }
 

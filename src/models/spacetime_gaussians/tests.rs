@@ -113,7 +113,7 @@ fn states_follow_the_formulas_in_both_variants() {
         let model = open_with_frames(root.path());
         assert_eq!(model.kind().contains("full"), is_full);
         assert_eq!(
-            (model.source().info().count, model.clock(), model.background()),
+            (model.source().info().count, model.time_convention(), model.background()),
             (COUNT, TimeConvention::Given, Some([0.0; 3]))
         );
         for (state, time) in states(model.source()).iter().zip(TIMES) {

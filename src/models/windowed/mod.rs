@@ -115,7 +115,7 @@ impl<L: ProxyRule + 'static> InputModel for WindowedModel<L> {
         self.timing
     }
 
-    fn clock(&self) -> TimeConvention {
+    fn time_convention(&self) -> TimeConvention {
         TimeConvention::Given
     }
 

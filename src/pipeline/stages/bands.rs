@@ -3,7 +3,7 @@
 //! Memory: one state of the original, two of the result (a state holds all Gaussians at one frame), and three rendered
 //! views.
 
-use super::field::{COMPARED_VIEWS, least};
+use super::field::{COMPARED_VIEWS, min_psnr};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -64,9 +64,12 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 }
 
 impl Stage for ShDegreeStage {
-    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+    fn estimates(
+        &self,
+        EstimateInput { work, limits, output_fraction, .. }: EstimateInput<'_>,
+    ) -> Vec<ResourceEstimate> {
         // At SH degree 0 there is nothing to drop.
-        (work.sh_degree > 0).then(|| self.need(work, limits, left)).into_iter().collect()
+        (work.sh_degree > 0).then(|| self.resource_estimate(work, limits, output_fraction)).into_iter().collect()
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -95,16 +98,16 @@ impl ShDegreeStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds three states (all Gaussians at one frame) and
-    /// renders of them. `left`: number of Gaussians in the result divided by that in the input.
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    /// renders of them. `output_fraction`: number of Gaussians in the result divided by that in the input.
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let (whole, reader, held) =
             (work.state_bytes(Attributes::all()), work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
-            ("kept", bytes_of_survivors(left, 24)),
-            ("states", whole + bytes_of_survivors(left, 2 * whole)),
-            ("result", bytes_of_survivors(left, work.input.reduced)),
-            ("readers", reader + bytes_of_survivors(left, reader)),
-            ("held", held + bytes_of_survivors(left, held)),
+            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("states", whole + bytes_of_survivors(output_fraction, 2 * whole)),
+            ("result", bytes_of_survivors(output_fraction, work.input.reduced)),
+            ("readers", reader + bytes_of_survivors(output_fraction, reader)),
+            ("held", held + bytes_of_survivors(output_fraction, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
@@ -112,7 +115,7 @@ impl ShDegreeStage {
             stage: NAME,
             seconds: work.reading_seconds(work.gaussian_count(), 2.0 * pictures as f64)
                 + work.render_seconds(pictures as f64, work.gaussian_count(), RENDER_COST)
-                + work.render_seconds(2.0 * pictures as f64, left * work.gaussian_count(), RENDER_COST),
+                + work.render_seconds(2.0 * pictures as f64, output_fraction * work.gaussian_count(), RENDER_COST),
             reads: 2.0 * work.scattered_full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.block_buffer_memory(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
@@ -148,7 +151,7 @@ impl ShDegreeStage {
         // A lower degree is tried only if the last one was accepted.
         while sh_degree > 0 && tried.len() == all - sh_degree {
             let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &pictures)?;
-            found = [result, least(result, self.margin)];
+            found = [result, min_psnr(result, self.margin)];
             tried.push((sh_degree - 1, apart));
             sh_degree -= usize::from(apart >= found[1]);
         }

@@ -33,7 +33,7 @@ const VIEWS_PER_BATCH: usize = 4;
 
 /// Bytes of memory per Gaussian for the merged clusters, which are in memory twice during the comparison, and for
 /// reading their members.
-pub(crate) const CLUSTERED: u64 = 125;
+pub(crate) const BYTES_PER_GAUSSIAN: u64 = 125;
 
 /// Stage that chooses between merging and pruning alone.
 #[derive(Debug, Clone)]
@@ -51,8 +51,11 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 }
 
 impl Stage for Choose {
-    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits, left)]
+    fn estimates(
+        &self,
+        EstimateInput { work, limits, output_fraction, .. }: EstimateInput<'_>,
+    ) -> Vec<ResourceEstimate> {
+        vec![self.resource_estimate(work, limits, output_fraction)]
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -67,18 +70,18 @@ impl Stage for Choose {
 
 impl Choose {
     /// Returns the resource estimate of the stage. Its memory holds the merged and the pruned model, two states (all
-    /// Gaussians at one frame), and rendered views. `left`: number of Gaussians in the result divided by that in the
-    /// input.
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    /// Gaussians at one frame), and rendered views. `output_fraction`: number of Gaussians in the result divided by
+    /// that in the input.
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         // The trajectories of proxies, which replace merged clusters, are computed from all members.
-        let merging = if work.input.reduced > 0 { left } else { 1.0 };
+        let merging = if work.input.reduced > 0 { output_fraction } else { 1.0 };
         let (reader, held) = (work.input.reader, work.kept_frames_bytes(limits, Attributes::all()));
         let per_gaussian = vec![
-            ("alternatives", bytes_of_survivors(left, 8)),
-            ("clusters", CLUSTERED),
-            ("states", whole + bytes_of_survivors(left, whole)),
-            ("result", bytes_of_survivors(left, work.input.reduced)),
+            ("alternatives", bytes_of_survivors(output_fraction, 8)),
+            ("clusters", BYTES_PER_GAUSSIAN),
+            ("states", whole + bytes_of_survivors(output_fraction, whole)),
+            ("result", bytes_of_survivors(output_fraction, work.input.reduced)),
             ("readers", reader + bytes_of_survivors(merging, reader)),
             ("held", held + bytes_of_survivors(merging, held)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),

@@ -44,7 +44,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for Degree {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits)]
+        vec![self.resource_estimate(work, limits)]
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -61,7 +61,7 @@ impl Stage for Degree {
 
 impl Degree {
     /// Returns the resource estimate of the stage, which runs one refinement for every SH degree.
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let need = self.refine.resource_estimate(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
@@ -109,7 +109,7 @@ impl Degree {
                 format!("{} Gaussians of degree {}: {psnr}", fit.gaussians, fit.sh_degree)
             };
             let tried = tried.iter().map(line).collect::<Vec<_>>().join(", ");
-            let count = targets.split().apart.len();
+            let count = targets.split().validation.len();
             journal.notes.push(format!(
                 "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a \
                  fifth of the optimization steps, dB: {tried}",

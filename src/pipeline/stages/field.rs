@@ -46,8 +46,11 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 }
 
 impl Stage for FieldPrecisionStage {
-    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits, left)]
+    fn estimates(
+        &self,
+        EstimateInput { work, limits, output_fraction, .. }: EstimateInput<'_>,
+    ) -> Vec<ResourceEstimate> {
+        vec![self.resource_estimate(work, limits, output_fraction)]
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -70,15 +73,15 @@ impl FieldPrecisionStage {
     }
 
     /// Returns the resource estimate of the stage. Its memory holds two states (all Gaussians at one frame), rendered
-    /// views, and a second copy of the deformation field. `left`: number of Gaussians in the result divided by that in
-    /// the input.
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    /// views, and a second copy of the deformation field. `output_fraction`: number of Gaussians in the result divided
+    /// by that in the input.
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let per_gaussian = vec![
-            ("kept", bytes_of_survivors(left, 24)),
-            ("states", whole + bytes_of_survivors(left, whole)),
-            ("result", bytes_of_survivors(left, 2 * work.input.reduced)),
-            ("readers", work.input.reader + bytes_of_survivors(left, work.input.reader)),
+            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("states", whole + bytes_of_survivors(output_fraction, whole)),
+            ("result", bytes_of_survivors(output_fraction, 2 * work.input.reduced)),
+            ("readers", work.input.reader + bytes_of_survivors(output_fraction, work.input.reader)),
             ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
@@ -86,7 +89,7 @@ impl FieldPrecisionStage {
             stage: NAME,
             seconds: work.reading_seconds(work.gaussian_count(), 4.0 * pictures as f64)
                 + work.render_seconds(2.0 * pictures as f64, work.gaussian_count(), RENDER_COST)
-                + work.render_seconds(2.0 * pictures as f64, left * work.gaussian_count(), RENDER_COST),
+                + work.render_seconds(2.0 * pictures as f64, output_fraction * work.gaussian_count(), RENDER_COST),
             reads: work.full_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
@@ -122,7 +125,7 @@ impl FieldPrecisionStage {
             false => Some(closeness(scene, [scene.source(), &*exact], &pictures)?),
         };
         drop((exact, half));
-        let least = result.map_or(MAX_USEFUL_PSNR, |result| least(result, self.margin));
+        let least = result.map_or(MAX_USEFUL_PSNR, |result| min_psnr(result, self.margin));
         let found = FieldSummary { pictures: pictures.len(), rounding, result, least, half: rounding >= least };
         let fits = found.half;
         if !fits {
@@ -135,7 +138,7 @@ impl FieldPrecisionStage {
 
 /// Returns the minimum PSNR, dB, that renders of a coarser version of a result must have against renders of the result:
 /// `result` + `margin`, but at most [`MAX_USEFUL_PSNR`]. `result`: PSNR of the result against the original, dB.
-pub(crate) fn least(result: f64, margin: f64) -> f64 {
+pub(crate) fn min_psnr(result: f64, margin: f64) -> f64 {
     MAX_USEFUL_PSNR.min(result + margin)
 }
 

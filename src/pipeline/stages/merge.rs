@@ -115,14 +115,14 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
         _ => "refinement gives better quality at the same count (--no-refine merges instead)",
     };
     match has_passes {
-        true => stages.leave_out_stage(what, why, move |work, limits| stage.need(work, limits)),
+        true => stages.leave_out_stage(what, why, move |work, limits| stage.resource_estimate(work, limits)),
         false => stages.leave_out(what, why),
     }
 }
 
 impl Stage for MergeStage {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits)]
+        vec![self.resource_estimate(work, limits)]
     }
 
     fn parameters(&self) -> String {
@@ -145,7 +145,7 @@ impl Stage for MergeStage {
 impl MergeStage {
     /// Returns the resource estimate of the stage. Its memory holds the pairs that are measured at the same time, all
     /// Gaussians that may survive, and the proxies.
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Only base colors are compared. There is at most one proxy for every two Gaussians, held before and after a
         // pass, and then once with all SH coefficients.

@@ -2,9 +2,9 @@
 //! nor to choose anything. It also measures the time of rendering a view of the original and of the result.
 //!
 //! If the cameras have a test split, test views are measured: at most [`MOST_VIEWS`], spread over frames and views, and
-//! fewer in a short run ([`SHARE`]). Without a test split, the PSNR on the validation views of refinement is reported.
-//! It is labeled as such, because these views were used to choose the best state of refinement. Without test and
-//! validation views, training views are measured.
+//! fewer in a short run ([`MAX_TIME_FRACTION`]). Without a test split, the PSNR on the validation views of refinement
+//! is reported. It is labeled as such, because these views were used to choose the best state of refinement. Without
+//! test and validation views, training views are measured.
 //!
 //! Memory: one state (all Gaussians at one frame) of each model, two views per thread, and the scores.
 
@@ -36,7 +36,7 @@ const MOST_VIEWS: usize = 60;
 /// Minimum number of views on which quality is measured, however short the run is.
 const FEWEST_VIEWS: usize = 4;
 /// Fraction of the run's estimated processor time that measuring quality may take.
-const SHARE: f64 = 0.02;
+const MAX_TIME_FRACTION: f64 = 0.02;
 /// Maximum number of times that the frames of the measured views are read: for the original, for the result (whose
 /// frames are computed from the same input) and for the timed views.
 const READS: f64 = 2.5;
@@ -76,8 +76,11 @@ pub(in crate::pipeline) fn leave_out(stages: &mut StageList) {
 }
 
 impl Stage for QualityStage {
-    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits, left)]
+    fn estimates(
+        &self,
+        EstimateInput { work, limits, output_fraction, .. }: EstimateInput<'_>,
+    ) -> Vec<ResourceEstimate> {
+        vec![self.resource_estimate(work, limits, output_fraction)]
     }
 
     fn is_optional(&self) -> bool {
@@ -100,13 +103,15 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
-    /// Returns the resource estimate of the stage, which renders views of the original and of the result. `left`:
-    /// number of Gaussians in the result divided by that in the input.
-    fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    /// Returns the resource estimate of the stage, which renders views of the original and of the result.
+    /// `output_fraction`: number of Gaussians in the result divided by that in the input.
+    fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
         let of_views = view_selection::render_estimate(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
-        let result =
-            vec![("kept", bytes_of_survivors(left, 24)), ("result", bytes_of_survivors(left, 2 * work.input.reduced))];
+        let result = vec![
+            ("kept", bytes_of_survivors(output_fraction, 24)),
+            ("result", bytes_of_survivors(output_fraction, 2 * work.input.reduced)),
+        ];
         ResourceEstimate {
             // The number of views is derived from the estimated time of all other stages; see `view_count`.
             seconds: 0.0,
@@ -158,18 +163,23 @@ impl QualityStage {
     }
 
     /// Returns the number of views on which quality is measured: [`MOST_VIEWS`], or fewer if these would take more than
-    /// the fraction [`SHARE`] of the time of the run, but at least [`FEWEST_VIEWS`]. Times are estimates for a
-    /// reference machine, so that the number of views is the same on every machine.
+    /// the fraction [`MAX_TIME_FRACTION`] of the time of the run, but at least [`FEWEST_VIEWS`]. Times are estimates
+    /// for a reference machine, so that the number of views is the same on every machine.
     fn view_count(&self, run: &RunState<'_>) -> usize {
         let scene = run.scene;
         let work = Workload { throughput: Throughput::UNKNOWN, ..scene.workload() };
-        let left = run.result.len() as f64 / work.gaussian_count().max(1.0);
-        let input = EstimateInput { work: &work, limits: &Limits::NONE, left, measured: MeasuredOnArrival::default() };
+        let output_fraction = run.result.len() as f64 / work.gaussian_count().max(1.0);
+        let input = EstimateInput {
+            work: &work,
+            limits: &Limits::NONE,
+            output_fraction,
+            measured: MeasuredOnArrival::default(),
+        };
         let seconds: f64 = run.stages.all().flat_map(|stage| stage.estimates(input)).map(|need| need.seconds).sum();
-        let per_view = work.render_seconds(1.0, (1.0 + left) * work.gaussian_count(), RENDER_COST)
+        let per_view = work.render_seconds(1.0, (1.0 + output_fraction) * work.gaussian_count(), RENDER_COST)
             + work.reading_seconds(work.gaussian_count(), 2.0)
             + 2.0 * SCORE_SECONDS_PER_PIXEL * work.pixels as f64;
-        ((SHARE * seconds / per_view.max(1e-9)) as usize).clamp(FEWEST_VIEWS, MOST_VIEWS)
+        ((MAX_TIME_FRACTION * seconds / per_view.max(1e-9)) as usize).clamp(FEWEST_VIEWS, MOST_VIEWS)
     }
 }
 

@@ -35,7 +35,7 @@ impl Stage for RefineStage {
     /// changes renders. `hardly_seen` is the fraction of such Gaussians. The result may then be close enough to the
     /// original without refinement.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
-        input.left >= 1.0 - hardly_seen
+        input.output_fraction >= 1.0 - hardly_seen
     }
 
     fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {

@@ -72,7 +72,7 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for Rounds {
     fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.need(work, limits)]
+        vec![self.resource_estimate(work, limits)]
     }
 
     fn parameters(&self) -> String {
@@ -115,7 +115,7 @@ impl Rounds {
 
     /// Returns the resource estimate of the stage. Its memory holds the ranking, the measured removal errors, and the
     /// buffers for rendering all survivors (Gaussians left by pruning).
-    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn resource_estimate(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.view_pass_memory(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);

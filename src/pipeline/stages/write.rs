@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::bounds;
-use super::choose::CLUSTERED;
+use super::choose;
 use crate::TOOL;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -87,8 +87,11 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 }
 
 impl Stage for WriteStage {
-    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        vec![self.resource_estimate(work, limits, left)]
+    fn estimates(
+        &self,
+        EstimateInput { work, limits, output_fraction, .. }: EstimateInput<'_>,
+    ) -> Vec<ResourceEstimate> {
+        vec![self.resource_estimate(work, limits, output_fraction)]
     }
 
     fn check(&self, scene: &Scene) -> Result<()> {
@@ -186,14 +189,16 @@ impl WriteStage {
         self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
-    /// Returns the resource estimate of the stage. Its memory holds the result and write buffers. `left`: number of
-    /// Gaussians in the result divided by that in the input.
-    pub fn resource_estimate(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    /// Returns the resource estimate of the stage. Its memory holds the result and write buffers. `output_fraction`:
+    /// number of Gaussians in the result divided by that in the input.
+    pub fn resource_estimate(&self, work: &Workload, limits: &Limits, output_fraction: f64) -> ResourceEstimate {
         let whole = work.state_bytes(Attributes::all());
         let is_solved = work.input.reduced > 0;
-        let mut per_gaussian =
-            [scored_memory(limits), vec![("kept", 40), ("result", bytes_of_survivors(left, work.input.reduced))]]
-                .concat();
+        let mut per_gaussian = [
+            scored_memory(limits),
+            vec![("kept", 40), ("result", bytes_of_survivors(output_fraction, work.input.reduced))],
+        ]
+        .concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
         let mut fixed = if within.is_empty() { work.write_buffers() } else { within };
         match self.kind {
@@ -203,7 +208,7 @@ impl WriteStage {
                 let waiting = work.kept_frames_bytes(&Limits::NONE, Attributes::all())
                     + FRAME_BLOCK as u64 * work.state_bytes(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
-                per_gaussian.push(("members", CLUSTERED));
+                per_gaussian.push(("members", choose::BYTES_PER_GAUSSIAN));
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
             }
             OutputKind::Gseq => (),
@@ -211,14 +216,14 @@ impl WriteStage {
             // is computed from.
             _ => {
                 // The trajectories of proxies are computed from all members of their clusters.
-                let merging = if is_solved { left } else { 1.0 };
+                let merging = if is_solved { output_fraction } else { 1.0 };
                 per_gaussian.push(("readers", bytes_of_survivors(merging, work.input.reader)));
                 per_gaussian
                     .push(("held", bytes_of_survivors(merging, work.kept_frames_bytes(limits, Attributes::all()))));
-                let rows = bytes_of_survivors(left, work.threads * (work.input.file + 2 * whole));
+                let rows = bytes_of_survivors(output_fraction, work.threads * (work.input.file + 2 * whole));
                 per_gaussian.push(("files", work.input.file + rows));
-                per_gaussian.push(("members", CLUSTERED));
-                per_gaussian.push(("encoded", bytes_of_survivors(left, self.kind.encoding_bytes(whole))));
+                per_gaussian.push(("members", choose::BYTES_PER_GAUSSIAN));
+                per_gaussian.push(("encoded", bytes_of_survivors(output_fraction, self.kind.encoding_bytes(whole))));
             }
         }
         if self.kind == OutputKind::Model {

@@ -8,7 +8,7 @@ use crate::model::{Attributes, Camera, Gaussians, StatisticRows, ViewSchedule};
 use crate::passes::GAUSSIANS_PER_BLOCK;
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
-use crate::statistics::{BlockScan, ScanPlan, wanted};
+use crate::statistics::{BlockScan, ScanPlan, attributes_to_read};
 
 /// Data that the scans of all blocks of Gaussians share.
 pub(crate) struct BlockScans<'a> {
@@ -42,7 +42,7 @@ impl<'a> BlockScans<'a> {
     /// Returns the attributes that must be read at frame `frame`: all attributes at frame 0, and after it only the
     /// attributes that may have changed since the previous frame.
     pub(crate) fn changed(&self, frame: usize) -> Attributes {
-        wanted(frame, self.source.info().varying)
+        attributes_to_read(frame, self.source.info().varying)
     }
 
     /// Returns a scan of block `block` that has not read any frame yet, and a buffer for the attributes of the block at

@@ -44,7 +44,8 @@ impl Scores {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// Quantity that the term normalizes.
-    pub of: ScoredQuantity,
+    #[serde(rename = "of")]
+    pub quantity: ScoredQuantity,
     /// Normalization of the quantity, from its percentiles over all Gaussians.
     pub norm: Norm,
 }
@@ -157,9 +158,9 @@ struct Summation<'a> {
 }
 
 impl Summation<'_> {
-    /// Adds `weight` · norm(`value(i)`) to `total[i]` for every Gaussian i whose statistics are finite. Appends the
-    /// quantity `of` and its normalization to the list of terms. Does nothing if the weight is 0.
-    fn add(&mut self, total: &mut [f64], of: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
+    /// Adds `weight` · norm(`value(i)`) to `total[i]` for every Gaussian i whose statistics are finite. Appends
+    /// `quantity` and its normalization to the list of terms. Does nothing if the weight is 0.
+    fn add(&mut self, total: &mut [f64], quantity: ScoredQuantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
@@ -170,7 +171,7 @@ impl Summation<'_> {
                 *total += weight * norm.apply(value(i));
             }
         }
-        self.terms.push(Term { of, norm });
+        self.terms.push(Term { quantity, norm });
     }
 }
 
@@ -220,7 +221,7 @@ mod tests {
             assert!((scores.score[i] - expected).abs() < 1e-12, "{i}: got {}, expected {expected}", scores.score[i]);
             assert!((scores.static_norm[i] - norm(i, 1.0)).abs() < 1e-7);
         }
-        let names: Vec<&str> = scores.terms.iter().map(|term| term.of.name()).collect();
+        let names: Vec<&str> = scores.terms.iter().map(|term| term.quantity.name()).collect();
         assert_eq!(names, ["C", "E", "D", "kappa", "V", "Life", "S_static", "S_dynamic"]);
     }
 
@@ -230,7 +231,10 @@ mod tests {
         rows.e = vec![f64::NAN; 100];
         let scores = score(&rows, 100, &preset("default"));
         assert!(
-            scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(ScoredQuantity::By).contains(&term.of))
+            scores
+                .terms
+                .iter()
+                .all(|term| ![Statistic::E, Statistic::Life].map(ScoredQuantity::By).contains(&term.quantity))
         );
         assert!(scores.score.iter().all(|s| s.is_finite()));
     }
@@ -268,7 +272,8 @@ mod tests {
         for name in ["paper", "default"] {
             let scores = score(&rows, 300, &preset(name));
             assert!(scores.dynamic_score.iter().chain(&scores.dynamic_norm).all(|&s| s == 0.0));
-            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.has_spread()).map(|t| t.of.name()).collect();
+            let inactive: Vec<_> =
+                scores.terms.iter().filter(|t| !t.norm.has_spread()).map(|t| t.quantity.name()).collect();
             assert_eq!(inactive, ["D", "kappa", "V", "S_dynamic"]);
         }
     }
@@ -300,8 +305,9 @@ mod tests {
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));
         let weighed = score(&rows, 100, &recipe::ScoreParams { weigh_motion_by_life: true, ..preset("paper") });
-        let d =
-            |scores: &Scores| scores.terms.iter().find(|t| t.of == ScoredQuantity::By(Statistic::D)).unwrap().norm.p99;
+        let d = |scores: &Scores| {
+            scores.terms.iter().find(|t| t.quantity == ScoredQuantity::By(Statistic::D)).unwrap().norm.p99
+        };
         assert_eq!(d(&weighed), 0.5 * d(&plain));
     }
 }

@@ -17,9 +17,9 @@ pub fn memory_limits() -> MemoryLimits {
 /// Reads the memory limits of this process from the system files below the folder `root`, which stands for `/`.
 fn limits_under(root: &Path) -> MemoryLimits {
     let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
-    let mut around = Vec::from_iter(machine_limit(&read));
-    add_groups(&read, &mut around);
-    MemoryLimits { around, own: process_limits(&read) }
+    let mut shared = Vec::from_iter(machine_limit(&read));
+    add_groups(&read, &mut shared);
+    MemoryLimits { shared, process: process_limits(&read) }
 }
 
 /// Returns the physical memory of the machine as a limit. `read` returns the text of a system file.
@@ -160,8 +160,8 @@ mod tests {
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, text).unwrap();
         }
-        let MemoryLimits { around, own } = limits_under(root.path());
-        let stated = around.into_iter().chain(own).filter(|limit| (1..UNLIMITED_BYTES).contains(&limit.bytes));
+        let MemoryLimits { shared, process } = limits_under(root.path());
+        let stated = shared.into_iter().chain(process).filter(|limit| (1..UNLIMITED_BYTES).contains(&limit.bytes));
         stated.min_by_key(|limit| limit.bytes).map(|limit| (limit.bytes, limit.source)).unwrap()
     }
 

@@ -17,7 +17,7 @@ use crate::{LimitSource, MemoryLimit, MemoryLimits};
 pub fn memory_limits() -> MemoryLimits {
     let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
     let job = job_bytes().into_iter().map(|bytes| MemoryLimit { bytes, source: LimitSource::JobObject });
-    MemoryLimits { around: machine.into_iter().chain(job).collect(), own: Vec::new() }
+    MemoryLimits { shared: machine.into_iter().chain(job).collect(), process: Vec::new() }
 }
 
 /// Returns the physical memory of the machine in bytes, or `None` if the system gives no answer.

@@ -48,7 +48,7 @@ impl StatisticsRows {
     ///
     /// # Errors
     /// Fails if the file cannot be created or written.
-    pub(crate) fn aside(rows: StatisticRows, folder: &Path) -> Result<StatisticsRows> {
+    pub(crate) fn spill(rows: StatisticRows, folder: &Path) -> Result<StatisticsRows> {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {
             match statistic.accessors() {
@@ -142,7 +142,7 @@ mod tests {
                 vis: column(0.3),
                 flags: (0..count).map(|i| AnomalyFlags::from_bits_retain(i as u8)).collect(),
             };
-            let statistics = StatisticsRows::aside(rows.clone(), folder.path()).unwrap();
+            let statistics = StatisticsRows::spill(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);
             let StatisticsRows::Spilled(spilled) = &statistics else { panic!("the rows are not spilled") };
             let without = if peak { 0 } else { Statistic::W.bytes() };
@@ -154,7 +154,7 @@ mod tests {
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         }
         let message =
-            StatisticsRows::aside(StatisticRows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
+            StatisticsRows::spill(StatisticRows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
         assert!(message.contains("nowhere"), "{message}");
     }
 }
