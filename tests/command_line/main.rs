@@ -2,6 +2,8 @@
 
 mod benchmark_tables;
 mod beside_others;
+#[path = "../browser/mod.rs"]
+mod browser;
 mod cli;
 mod defects;
 mod docs;
@@ -10,6 +12,7 @@ mod inputs;
 mod long;
 mod memory;
 mod parts;
+mod playcanvas;
 mod players;
 mod resume;
 mod runs;

@@ -19,7 +19,7 @@ const COUNT: usize = 60;
 
 /// Returns Gaussians without any symmetry: each axis has another range of positions and other scales, and every SH
 /// coefficient is different.
-fn asymmetrical(degree: usize) -> Gaussians {
+pub(crate) fn asymmetrical(degree: usize) -> Gaussians {
     let mut made = Gaussians::zeros(COUNT, degree);
     let fill = |values: &mut [f32], seed: usize, middle: f32, width: f32| {
         values.iter_mut().enumerate().for_each(|(k, x)| {
@@ -41,7 +41,7 @@ fn asymmetrical(degree: usize) -> Gaussians {
 }
 
 /// Returns the folder with the packages of other programs.
-fn modules() -> PathBuf {
+pub(crate) fn modules() -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_NODE_MODULES").expect("SPLATSIEVE_NODE_MODULES names a node_modules");
     PathBuf::from(folder)
 }
@@ -111,7 +111,7 @@ fn quaternion(gaussians: &Gaussians, i: usize) -> DQuat {
 const REVERSED_YZ: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
 /// Returns the Gaussians with the y and z axes reversed.
-fn reversed(gaussians: &Gaussians) -> Gaussians {
+pub(crate) fn reversed(gaussians: &Gaussians) -> Gaussians {
     let mut turned = gaussians.clone();
     for axis in [1, 2] {
         turned.position.plane_mut(axis).iter_mut().for_each(|x| *x = -*x);
@@ -224,7 +224,7 @@ fn fourdgs_reads_our_4dgs_files() {
 }
 
 /// Returns the Gaussians of a frame: every Gaussian moves at its own speed, and none passes another in x.
-fn moved(gaussians: &Gaussians, frame: usize) -> Gaussians {
+pub(crate) fn moved(gaussians: &Gaussians, frame: usize) -> Gaussians {
     let mut moved = gaussians.clone();
     for axis in [1, 2] {
         let plane = moved.position.plane_mut(axis);
