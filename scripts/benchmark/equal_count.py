@@ -2,7 +2,7 @@
 """Measures the quality of several methods at the same number of Gaussians: docs/benchmarks/equal_count.csv.
 
     cargo build --release
-    python3 scripts/benchmark/equal_count.py target/release/splatsieve DATA [--models A,B]
+    python3 scripts/benchmark/equal_count.py target/release/splatsieve DATA [--models A,B] [--methods A,B]
 
 PSNR and SSIM are means over the test views of 15 frames, against renders of the unpruned model. The methods are those
 of `splatsieve sweep`; none but `default` changes the Gaussians that stay, apart from `paper` and `no-refine`, which
@@ -19,14 +19,14 @@ METHODS = "default,no-refine,paper,paper-prune,visible,projected,opacity,scale,r
 
 
 def main():
-    args = arguments(__doc__)
+    args = arguments(__doc__, ("--methods", {"default": METHODS, "help": "methods of `sweep`, separated by commas"}))
     columns = ["model", "gaussians_before", "method", "kept", "gaussians", "psnr_db", "ssim", "temporal"]
     results = Results("equal_count", args.program, columns)
     with tempfile.TemporaryDirectory() as scratch:
         for model in chosen(args, scratch):
             output = Path(scratch) / f"{model.name}_sweep"
             run(
-                args.program, "sweep", model.path, "--cameras", model.cameras, *model.options, "--methods", METHODS,
+                args.program, "sweep", model.path, "--cameras", model.cameras, *model.options, "--methods", args.methods,
                 "--fractions", ",".join(KEPT), "--max-frames", 15, "-o", output, "--quiet",
             )  # fmt: skip
             found = json.loads((output / "sweep.json").read_text())
